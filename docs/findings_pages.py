@@ -35,8 +35,8 @@ from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E4
 import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis, explain  # noqa: E402
 from px4fuse.comparison.comparison import compare  # noqa: E402
-from px4fuse.ekf2.aids import judge_aids  # noqa: E402
-from px4fuse.filter.heading import HeadingPart, turned  # noqa: E402
+from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
+from px4fuse.filter.heading import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import NAMES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.causes import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
@@ -130,16 +130,16 @@ def examples() -> dict[str, Example]:
         HeadingPart(2.0 * n, 2.0 * n + 2.0, at, 1.0) for n, at in enumerate((-36.0, -20.0, -9.0))
     ]
     still = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
-    drifts = replace(still, heading=turned(tuple(parts), 1e-9, "positions"))
+    drifts = replace(still, heading=combine_heading_parts(tuple(parts), 1e-9, "positions"))
     keep(source_frame.detect(drifts), "an estimate that was made up")
     flight = aisle_flight(duration_s=60.0)
-    silent = aid_log(meant=steps((0.0, 1.0)))
+    silent = aid_log(enabled=steps((0.0, 1.0)))
     silent = replace(silent, samples=outage_free(silent, 20.0, 41.0))
     changed = aid_log()
     changed.samples.loc[35.0:, "innovation_east"] -= 0.7
     aids = {"gnss_pos": silent, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
             "mag_heading": changed}  # fmt: skip
-    judged = judge_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
+    judged = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
     keep(find_aids(judged), "innovations that were made up")
     for fault in FAULTS:
         if fault.id in made:

@@ -18,45 +18,50 @@ from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.estimates import (
     Progress,
     Tuning,
+    estimate_frame_rotation,
     noises_and_clock,
     silent,
-    size,
-    turned_frame,
+    value_or_bound,
 )
-from px4fuse.comparison.events import Events, happened
-from px4fuse.comparison.interventions import Intervention, interventions, to_try
+from px4fuse.comparison.events import Events, collect_events
+from px4fuse.comparison.interventions import Intervention, interventions, planned_variants
 from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.comparison.preparation import no_source, prepare
-from px4fuse.comparison.remedy import asked_of_ekf2
-from px4fuse.comparison.why import to_walk, why_ekf2_differs
-from px4fuse.display import brief
-from px4fuse.ekf2.aids import AidResult, judge_aids
+from px4fuse.comparison.preparation import explain_missing_source, prepare
+from px4fuse.comparison.remedy import ml_ekf2_parameters
+from px4fuse.comparison.why import explain_ekf2_difference, explanation_variants
+from px4fuse.display import one_line_repr
+from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
-from px4fuse.ekf2_parameters import check
+from px4fuse.ekf2_parameters import check_parameters
 from px4fuse.errors import LogError, MissingDataError, SettingsError
-from px4fuse.filter.causes import AFTER_STEP_S, Explained, explained
+from px4fuse.filter.causes import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, bias_scale_jump_fit
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.coloured import Coloured, Smoothing, against_truth, hanging_together
+from px4fuse.filter.coloured import (
+    SourceLowPass,
+    TimeCorrelatedNoise,
+    fit_time_correlation_to_truth,
+    time_correlation_fit,
+)
 from px4fuse.filter.heading import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
-from px4fuse.reading import shown
-from px4fuse.record import lacking
+from px4fuse.reading import display_name
+from px4fuse.record import missing_data
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
 # Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
-REPORTED = (HORIZONTAL, "down")
+REPORTED_AXES = (HORIZONTAL, "down")
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -99,7 +104,7 @@ class Analysis(Comparison):
     @cached_property
     def events(self) -> Events:
         """What is marked on every time axis."""
-        return happened(self)
+        return collect_events(self)
 
     @property
     def others(self) -> list[AxisComparison]:
@@ -110,102 +115,115 @@ class Analysis(Comparison):
     def causes(self) -> tuple[Intervention, ...]:
         """What was changed, each by itself, and what that explains of each discrepancy."""
         model = self.ekf2_model
-        tried = interventions(self, self.tuning, self.clock, self.heading, self.explained, model)
+        tried = interventions(
+            self, self.tuning, self.clock, self.heading, self.bias_scale_jump_fit, model
+        )
         if isinstance(model, Model):  # most of its memory; what is asked for later is made again
             model.runs.clear()
             model.intervals.clear()
         return tried
 
     @cached_property
-    def explained(self) -> Explained | Unavailable:
+    def bias_scale_jump_fit(self) -> BiasScaleJumpFit | Unavailable:
         """Biases, scale and jumps that explain the innovations better than noise."""
-        found = self._horizontally()
+        found = self._horizontal_estimate()
         if isinstance(found, Unavailable):
             return found
         axes, tuned, offset_s = found
-        return explained(
+        return bias_scale_jump_fit(
             self.flight,
             axes,
             self.settings,
-            sigma_a_m_s2=size(tuned.filter_sigma_a, self.settings.sigma_a_m_s2),
-            sigma_z_m=size(tuned.sigma_z, self.settings.sigma_z_m),
+            sigma_a_m_s2=value_or_bound(tuned.filter_sigma_a, self.settings.sigma_a_m_s2),
+            sigma_z_m=value_or_bound(tuned.sigma_z, self.settings.sigma_z_m),
             outlier_time_s=tuned.outlier_time_s,
             clock_offset_s=offset_s,
         )
 
     @cached_property
-    def hanging_together(self) -> tuple[Smoothing | Unavailable, Coloured | Unavailable]:
+    def time_correlation_fit(
+        self,
+    ) -> tuple[SourceLowPass | Unavailable, TimeCorrelatedNoise | Unavailable]:
         """A low pass and a slow error of the source, jumps taken out."""
-        found = self._horizontally()
-        if isinstance(found, Unavailable):
-            return found, found
-        axes, tuned, offset_s = found
-        jumps = self.explained.jumps if isinstance(self.explained, Explained) else ()
+        horizontal = self._horizontal_estimate()
+        if isinstance(horizontal, Unavailable):
+            return horizontal, horizontal
+        axes, axis_tuning, offset_s = horizontal
+        jumps = (
+            self.bias_scale_jump_fit.jumps
+            if isinstance(self.bias_scale_jump_fit, BiasScaleJumpFit)
+            else ()
+        )
         # when exactly a jump was is not known
-        time_s, left_out = axes[0].measurement_time_s, tuned.outlier_time_s
+        time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
         for jump in jumps:
-            near = (time_s >= jump.time_s) & (time_s < jump.time_s + AFTER_STEP_S)
-            left_out = np.union1d(left_out, time_s[near])
-        together = hanging_together(
-            self.flight, axes, self.settings, tuned.noises, outlier_time_s=left_out,
-            clock_offset_s=offset_s, jumps=jumps,
-        )  # fmt: skip
-        if isinstance(together, Unavailable):
-            return together, together
-        smooth, slow = together
+            near = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
+            excluded_s = np.union1d(excluded_s, time_s[near])
+        correlation_fit = time_correlation_fit(
+            self.flight,
+            axes,
+            self.settings,
+            axis_tuning.noises,
+            outlier_time_s=excluded_s,
+            clock_offset_s=offset_s,
+            jumps=jumps,
+        )
+        if isinstance(correlation_fit, Unavailable):
+            return correlation_fit, correlation_fit
+        smooth, slow = correlation_fit
         truths = [self.axes[axis.name].truth for axis in axes]
         known = [truth for truth in truths if not isinstance(truth, Unavailable)]
         if len(known) == len(axes):
-            slow = against_truth(axes, known, left_out, offset_s, jumps, slow)
+            slow = fit_time_correlation_to_truth(axes, known, excluded_s, offset_s, jumps, slow)
         return smooth, slow
 
     @property
-    def smoothing(self) -> Smoothing | Unavailable:
+    def smoothing(self) -> SourceLowPass | Unavailable:
         """A low pass in the source."""
-        return self.hanging_together[0]
+        return self.time_correlation_fit[0]
 
     @property
-    def coloured(self) -> Coloured | Unavailable:
+    def coloured(self) -> TimeCorrelatedNoise | Unavailable:
         """A slow error of the source, where something makes successive errors hang together."""
-        return self.hanging_together[1]
+        return self.time_correlation_fit[1]
 
     @cached_property
     def aids(self) -> Mapping[str, AidResult] | Unavailable:
         """Every aid that EKF2 can fuse, judged by its own innovations."""
-        return judge_aids(self.flight)
+        return evaluate_aids(self.flight)
 
-    def _horizontally(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
+    def _horizontal_estimate(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
         """The horizontal axes, their noises and outliers, and a clock offset beyond doubt."""
         clock, offset_s = self.clock, 0.0
         if isinstance(clock, ClockOffset) and clock.determinable:
-            offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.chance_s else 0.0
+            offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
         for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
             tuned = self.tuning.get(name)
             if isinstance(tuned, AxisTuning) and self.axes.keys() >= set(group):
                 return tuple(self.axes[each].axis for each in group), tuned, offset_s
-        return lacking("noises_unknown")
+        return missing_data("noises_unknown")
 
 
 @dataclass(frozen=True)
-class AidsAlone:
+class AidsOnlyAnalysis:
     """A flight without a position for our filter: what EKF2 fused is judged all the same.
 
     Attributes
     ----------
     flight : Flight
     aids : mapping from PX4's name to AidResult
-    lacking : Unavailable
+    missing_data : Unavailable
         Why there is no comparison, and what would make one.
     """
 
     flight: Flight
     aids: Mapping[str, AidResult]
-    lacking: Unavailable
+    missing_data: Unavailable
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-def bad_verdicts(found: Analysis | AidsAlone) -> dict[str, str]:
+def failed_checks(found: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
     """What a test rig stops at: EKF2's axes and aids whose verdict is bad, with it.
 
     What is overstated, idle or has too few samples is not; nor is our own filter.
@@ -220,9 +238,9 @@ def bad_verdicts(found: Analysis | AidsAlone) -> dict[str, str]:
     return bad | {aid.label: aid.verdict for aid in aids.values() if aid.is_bad}
 
 
-def run_or_judge_aids(
+def run_or_evaluate_aids(
     request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
-) -> Analysis | AidsAlone:
+) -> Analysis | AidsOnlyAnalysis:
     """As :func:`run`; without a position source the aids of EKF2 alone.
 
     Raises
@@ -231,16 +249,16 @@ def run_or_judge_aids(
         As of :func:`run`; the flight has neither a position nor aids that can be judged.
     """
     flight = flight or read_flight(request, progress)
-    given = request.position_source is not None
-    if given or any(track.origin.automatic for track in flight.positions):
+    has_named_source = request.position_source is not None
+    if has_named_source or any(track.origin.is_automatic for track in flight.positions):
         return run(request, progress, flight)
-    no_position, aids = no_source(flight), judge_aids(flight)
+    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
             raise MissingDataError.of("not_flown", log=flight.log.name, reason=aids.reason)
         neither = f"{no_position.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
         raise MissingDataError(f"{flight.log.name}: {neither}", no_position.remedy)
-    return AidsAlone(flight, aids, no_position)
+    return AidsOnlyAnalysis(flight, aids, no_position)
 
 
 def run(
@@ -273,7 +291,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
         A file cannot be read, or does not belong to the flight.
     """
     log = Path(request.log)
-    progress(f"reading {shown(log)}")
+    progress(f"reading {display_name(log)}")
     flight = read_log(log, system=request.system if request.mavlink is None else None)
     # scipy.signal and scipy.ndimage cost a fifth of a second: only where something is placed
     if request.mavlink is not None:
@@ -286,13 +304,13 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
-    from px4fuse.alignment.placement import place  # noqa: PLC0415
+    from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
     units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
     file = read_position_csv(Path(position.path), columns=position.columns, **units)
     clock_offset_s = None if isinstance(offset, str) else offset
-    return place(
+    return align_position_file(
         flight, file, frame=position.frame, yaw_deg=position.yaw_deg, clock_offset_s=clock_offset_s
     )
 
@@ -304,19 +322,19 @@ def run_comparison(
 
     Arguments and errors are those of :func:`run`.
     """
-    prepared = run_preparation(request, progress, flight)
+    prepared = prepare_comparison(request, progress, flight)
     return compare_prepared(prepared, lambda name: progress(f"filtering {name}"))
 
 
-def run_preparation(
+def prepare_comparison(
     request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Comparison:
     """Read a flight and choose what is compared, which is all that tuning and clock need.
 
     Arguments and errors are those of :func:`run`.
     """
-    asked = request.clock_offset_s
-    _check_finite(start_s=request.start_s, end_s=request.end_s, clock_offset_s=asked)
+    clock_offset = request.clock_offset_s
+    _check_finite(start_s=request.start_s, end_s=request.end_s, clock_offset_s=clock_offset)
     flight = flight or read_flight(request, progress)
     settings = Settings(
         sigma_a_m_s2=request.sigma_a_m_s2,
@@ -324,17 +342,19 @@ def run_preparation(
         dt_s=request.dt_s,
         input=request.input or "imu",
         # that of a position file is spent on placing it
-        clock_offset_s=asked if isinstance(asked, float) and request.position is None else 0.0,
+        clock_offset_s=clock_offset
+        if isinstance(clock_offset, float) and request.position is None
+        else 0.0,
     )
-    alike = ("heading_deg", "position_source", "source_kind", "height", "start_s", "end_s")
-    choices: dict[str, Any] = {name: getattr(request, name) for name in alike}
+    field_names = ("heading_deg", "position_source", "source_kind", "height", "start_s", "end_s")
+    choices: dict[str, Any] = {name: getattr(request, name) for name in field_names}
     choices |= {
         "input_required": request.input == "imu",
         "sigma_z_given": request.sigma_z_m is not None,
         "axes": request.axes or None,
     }
     prepared = prepare(flight, settings, **choices)
-    if asked != AUTO or request.position is not None:
+    if clock_offset != AUTO or request.position is not None:
         return prepared
     _, clock = noises_and_clock(prepared, progress)
     if isinstance(clock, Unavailable) or not clock.determinable:
@@ -368,7 +388,7 @@ def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
     from px4fuse.loop.tracks import read_source  # noqa: PLC0415
 
     _check_finite(start_s=request.start_s, end_s=request.end_s)
-    progress(f"reading {shown(Path(request.source))}")
+    progress(f"reading {display_name(Path(request.source))}")
     system, reference = request.system, None
     source = read_source(request.source, frame=request.frame, system=system)
     if request.reference is not None:
@@ -377,7 +397,7 @@ def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
 
 
 @dataclass(frozen=True)
-class Counterfactual:
+class WhatIfAnalysis:
     """EKF2 with other parameters.
 
     Attributes
@@ -403,7 +423,7 @@ class Counterfactual:
     why: Mapping[str, Why | Unavailable]
     without: Mapping[str, float] = field(default_factory=dict)
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
     def first(self) -> int:
@@ -413,7 +433,7 @@ class Counterfactual:
 
 def run_what_if(
     request: WhatIfRequest, progress: Progress = silent, flight: Flight | None = None
-) -> Counterfactual:
+) -> WhatIfAnalysis:
     """Read a flight and replay its EKF2 with other parameters; arguments as of :func:`run`.
 
     Raises
@@ -422,7 +442,7 @@ def run_what_if(
         A file cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
         the log, or a parameter is unknown or out of PX4's range.
     """
-    changes, swept = check(request.changes), request.sweep
+    changes, swept = check_parameters(request.changes), request.sweep
     values: list[float] = []
     if swept is not None:
         values = sweep_values(swept.parameter, swept.low, swept.high, swept.count)
@@ -434,32 +454,32 @@ def run_what_if(
     model = open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
-    asked = not changes and swept is None and not request.without
+    is_default_change = not changes and swept is None and not request.without
     why: Mapping[str, Why | Unavailable] = {}
     compared = None
     try:
         if model.agreement.good:
             compared = compare(flight, axes=("north", "east", AISLE), sigma_z_given=False)
     except MissingDataError:  # EKF2 can be replayed all the same
-        if asked:
+        if is_default_change:
             raise
     if compared is not None:
         tuning, clock = noises_and_clock(compared, progress)
-        why = why_ekf2_differs(compared, model, clock)
-        if asked:
-            changes = asked_of_ekf2(compared, model, tuning, clock)
+        why = explain_ekf2_difference(compared, model, clock)
+        if is_default_change:
+            changes = ml_ekf2_parameters(compared, model, tuning, clock)
             if not changes:
-                raise MissingDataError(_nothing_asked(compared, model))
+                raise MissingDataError(_explain_missing_change(compared, model))
     settings = [changes] if changes or request.without else []
     settings += [{**changes, swept.parameter: value} for value in values] if swept else []
     progress("replaying with other parameters")
     found = what_if(model, settings, request.without)
     if isinstance(found, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {found.what}: {found.reason}", found.remedy)
-    return Counterfactual(flight, found, changes, asked, why, request.without)
+    return WhatIfAnalysis(flight, found, changes, is_default_change, why, request.without)
 
 
-def _nothing_asked(compared: Comparison, model: Model) -> str:
+def _explain_missing_change(compared: Comparison, model: Model) -> str:
     source, why = compared.source, "the data do not tell the noise and the delay of what EKF2 fused"
     if source.origin.is_gnss or source.origin.may_drift:
         why = (
@@ -479,22 +499,27 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
     progress : callable
         Told what is being done.
     """
-    names = REPORTED if {"north", "east"} <= {line.name for line in comparison.lines} else None
+    names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = noises_and_clock(comparison, progress, names)
-    heading = turned_frame(comparison, tuning, clock, progress)
+    heading = estimate_frame_rotation(comparison, tuning, clock, progress)
     progress("replaying EKF2")
 
-    def asked(inputs: Inputs) -> list[Variant]:
-        tried = to_try(comparison, tuning, clock, heading, inputs)
-        return [*to_walk(comparison, inputs), *tried]
+    def requested_variants(inputs: Inputs) -> list[Variant]:
+        tried = planned_variants(comparison, tuning, clock, heading, inputs)
+        return [*explanation_variants(comparison, inputs), *tried]
 
-    model = open_model(comparison.flight, asked)
-    why = why_ekf2_differs(comparison, model, clock)
+    model = open_model(comparison.flight, requested_variants)
+    why = explain_ekf2_difference(comparison, model, clock)
     progress("looking for a loop")
-    from px4fuse.loop.analysis import loop_in  # noqa: PLC0415 (tune and sync have none)
+    from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 (tune and sync have none)
 
-    loop = loop_in(comparison.flight, progress)
+    loop = analyse_flight_loop(comparison.flight, progress)
     return Analysis(
-        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, why=why, loop=loop,
+        **vars(comparison),
+        tuning=tuning,
+        clock=clock,
+        ekf2_model=model,
+        why=why,
+        loop=loop,
         heading=heading,
-    )  # fmt: skip
+    )

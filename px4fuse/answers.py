@@ -62,10 +62,10 @@ Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overstated", "understated"]
 # A number, or the updates of a list, as they are asked for; None is left blank
-Quantified = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
+QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
-class Claim(Record, frozen=True):
+class ClaimedMistake(Record, frozen=True):
     """One mistake that a student names.
 
     Attributes
@@ -120,30 +120,32 @@ class Answers(Record, frozen=True, kw_only=True):
     verdict_ours, verdict_ekf2 : str
         On the innovation variance, one of :data:`VERDICTS`.
     quantities : tuple of (float, tuple of float, or None)
-        In the order of :func:`asked`; a tuple where a list of updates was asked for.
+        In the order of :func:`draw_questions`; a tuple where a list of updates was asked for.
     """
 
     log_sha256: Sha256
-    mistakes: Annotated[tuple[Claim, ...], Meta(max_length=MOST_MISTAKES)] = ()
+    mistakes: Annotated[tuple[ClaimedMistake, ...], Meta(max_length=MOST_MISTAKES)] = ()
     verdict_ours: VerdictWord = ""
     verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_DID))] = ()
-    quantities: Annotated[tuple[Quantified, ...], Meta(max_length=10)] = ()
+    quantities: Annotated[tuple[QuantityAnswer, ...], Meta(max_length=10)] = ()
 
     @property
-    def says_none(self) -> bool:
+    def claims_no_mistake(self) -> bool:
         """Whether it says that nothing is wrong."""
         return [claim.kind for claim in self.mistakes] == [NONE]
 
 
-AskedKind = Literal["gain", "variance", "innovation", "nis", "silence", "gate"]
+QuestionKind = Literal["gain", "variance", "innovation", "nis", "silence", "gate"]
 # One of each pair is asked
-_DRAWN: tuple[tuple[AskedKind, AskedKind], ...] = (
-    ("gain", "variance"), ("innovation", "nis"), ("silence", "gate"),
-)  # fmt: skip
+_QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
+    ("gain", "variance"),
+    ("innovation", "nis"),
+    ("silence", "gate"),
+)
 
 
-class AskedNumber(Record, frozen=True):
+class FormQuestion(Record, frozen=True):
     """A number that no report prints, asked at settings of each log's own.
 
     Attributes
@@ -158,7 +160,7 @@ class AskedNumber(Record, frozen=True):
         Seconds of silence, or the gate in standard deviations.
     """
 
-    kind: AskedKind
+    kind: QuestionKind
     update: int
     sigma_a_m_s2: float
     sigma_z_m: float
@@ -167,28 +169,28 @@ class AskedNumber(Record, frozen=True):
     @property
     def words(self) -> str:
         """The question."""
-        what = _FORM.questions[self.kind].format(asked=self, last=self.update + GATED)
+        what = _FORM.questions[self.kind].format(question=self, last=self.update + GATE_UPDATES)
         return f"{what}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
 # Updates that a question about the gate goes over
-GATED = 20
+GATE_UPDATES = 20
 
 
-def asked(log_sha256: str) -> tuple[AskedNumber, ...]:
+def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
     """Three quantities, which follow from the log and differ between logs."""
-    drawn = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
+    random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
     def between(low: float, high: float, decimals: int) -> float:
-        return round(low + (high - low) * next(drawn) / 255.0, decimals)
+        return round(low + (high - low) * next(random_bytes) / 255.0, decimals)
 
     settings = (between(0.2, 0.45, 2), between(0.06, 0.14, 3))
-    early, late, last = (pair[next(drawn) % 2] for pair in _DRAWN)
+    early, late, last = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
     extra = between(1.0, 4.0, 1) if last == "silence" else between(1.3, 2.0, 1)
     return (
-        AskedNumber(early, 2 + next(drawn) % 7, *settings),
-        AskedNumber(late, 20 + next(drawn) % 130, *settings),
-        AskedNumber(last, 20 + next(drawn) % 100, *settings, extra),
+        FormQuestion(early, 2 + next(random_bytes) % 7, *settings),
+        FormQuestion(late, 20 + next(random_bytes) % 130, *settings),
+        FormQuestion(last, 20 + next(random_bytes) % 100, *settings, extra),
     )
 
 
@@ -211,19 +213,19 @@ def read_answers(path: Path) -> Answers:
     return answers
 
 
-def _as_record(given: dict[str, Any]) -> dict[str, Any]:
+def _as_record(form: dict[str, Any]) -> dict[str, Any]:
     """The file's own shape as that of :class:`Answers`: what is blank is left out.
 
     Claims stand under "mistake", and numbers under the names of their questions.
     """
-    filled = _without_blanks(given)
-    claims = filled.pop("mistake", ())
-    numbers = msgspec.convert(filled.pop("quantities", {}), dict[str, Any])
-    names = [f"q{number}" for number in range(1, len(asked("")) + 1)]
-    if unknown := sorted({*numbers, *({"mistakes"} & filled.keys())} - set(names)):
+    filled_form = _without_blanks(form)
+    claims = filled_form.pop("mistake", ())
+    numbers = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
+    names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
+    if unknown := sorted({*numbers, *({"mistakes"} & filled_form.keys())} - set(names)):
         raise ValueError(f"{unknown[0]} is not one of mistake, {', '.join(names)}")
     return {
-        **filled,
+        **filled_form,
         "mistakes": claims,
         "quantities": tuple(numbers.get(name) for name in names),
     }
@@ -252,8 +254,8 @@ def check(answers: Answers) -> None:
             raise ValueError(f"kind {name!r} stands there twice: give each mistake once")
     if NONE in kinds and len(kinds) > 1:
         raise ValueError('kind "none" stands beside a mistake: give one or the other')
-    for said in answers.ekf2_did:
-        _one_of("ekf2_did", said, EKF2_DID)
+    for behaviour in answers.ekf2_did:
+        _one_of("ekf2_did", behaviour, EKF2_DID)
     for claim in answers.mistakes:
         mistake = MISTAKES[claim.kind]
         for field, known in (
@@ -269,8 +271,10 @@ def check(answers: Answers) -> None:
         size = claim.size_in_first_unit()
         if size is not None and not low <= size <= high:
             unit = next(iter(mistake.units))
-            raise ValueError(f"of {claim.kind}: size {size:g} {unit} is none that it can have: "
-                             f"{low:g} to {high:g} {unit}")  # fmt: skip
+            raise ValueError(
+                f"of {claim.kind}: size {size:g} {unit} is none that it can have: "
+                f"{low:g} to {high:g} {unit}"
+            )
 
 
 def _one_of(field: str, value: str, known: Any) -> None:
@@ -293,7 +297,7 @@ def form_text(log_name: str, log_sha256: str) -> str:
     template = Template(files("px4fuse").joinpath("answers.toml").read_text(encoding="utf-8"))
     questions = [
         f'# {one.words}\nq{number} = ""{"    # such as [61, 64]" * (one.kind == "gate")}'
-        for number, one in enumerate(asked(log_sha256), start=1)
+        for number, one in enumerate(draw_questions(log_sha256), start=1)
     ]
     kinds = (f"{name:13} {one.words}{_units(one.units)}" for name, one in MISTAKES.items())
     return template.substitute(
@@ -315,21 +319,34 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     yield "Variance of EKF2", answers.verdict_ekf2 or BLANK
     yield "What EKF2 did", ", ".join(answers.ekf2_did) or BLANK
     for claim in answers.mistakes:
-        ends = (("from", claim.from_s), ("until", claim.until_s))
-        value = _number_words(claim.value, claim.value_unit, CURES.get(claim.parameter, {}))
-        said = (
-            _number_words(claim.size, claim.unit, MISTAKES.get(claim.kind, NamedMistake("")).units),
-            claim.when or " ".join(f"{name} {at:g} s" for name, at in ends if at is not None),
+        time_limits = (("from", claim.from_s), ("until", claim.until_s))
+        value = _format_number_with_unit(
+            claim.value, claim.value_unit, CURES.get(claim.parameter, {})
+        )
+        details = (
+            _format_number_with_unit(
+                claim.size, claim.unit, MISTAKES.get(claim.kind, NamedMistake("")).units
+            ),
+            claim.when
+            or " ".join(f"{name} {at:g} s" for name, at in time_limits if at is not None),
             f"seen in {claim.panel}" if claim.panel else "",
             f"{claim.parameter} {value}".strip(),
         )
-        yield claim.kind, "; ".join(filter(None, said)) or BLANK
-    for quantity, given in zip(asked(answers.log_sha256), answers.quantities, strict=False):
-        numbers = given if isinstance(given, tuple) else [] if given is None else [given]
+        yield claim.kind, "; ".join(filter(None, details)) or BLANK
+    for quantity, quantity_answer in zip(
+        draw_questions(answers.log_sha256), answers.quantities, strict=False
+    ):
+        numbers = (
+            quantity_answer
+            if isinstance(quantity_answer, tuple)
+            else []
+            if quantity_answer is None
+            else [quantity_answer]
+        )
         yield quantity.words, ", ".join(f"{number:g}" for number in numbers) or BLANK
 
 
-def _number_words(number: float | None, unit: str, units: Mapping[str, float]) -> str:
+def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:
     return "" if number is None else f"{number:g} {unit or next(iter(units), '')}".rstrip()
 
 

@@ -28,11 +28,19 @@ Pathlike = str | Path
 Progress = Callable[[str], None]
 # Columns of table() and their types: fields of FilterSummary and AgainstTruth, and nis_band in two
 COLUMNS = {
-    "count": "Int64", "nis_mean": "float64", "nis_low": "float64", "nis_high": "float64",
-    "verdict": "object", "sigma_factor": "float64", "innovation_std_m": "float64",
-    "sqrt_s_median_m": "float64", "sigma_p_median_m": "float64", "position_rmse_m": "float64",
-    "velocity_rmse_m_s": "float64", "nees_position_mean": "float64",
-}  # fmt: skip
+    "count": "Int64",
+    "nis_mean": "float64",
+    "nis_low": "float64",
+    "nis_high": "float64",
+    "verdict": "object",
+    "sigma_factor": "float64",
+    "innovation_std_m": "float64",
+    "sqrt_s_median_m": "float64",
+    "sigma_p_median_m": "float64",
+    "position_rmse_m": "float64",
+    "velocity_rmse_m_s": "float64",
+    "nees_position_mean": "float64",
+}
 
 
 def compare(

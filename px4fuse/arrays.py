@@ -11,7 +11,7 @@ BoolArray = NDArray[np.bool_]
 
 def cumulative_integral(values: Array, time_s: Array) -> Array:
     """Integral up to each time by the trapezoidal rule, along the first axis, from zero."""
-    made = np.zeros_like(values)
+    integral = np.zeros_like(values)
     length = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
-    np.cumsum((values[1:] + values[:-1]) / 2.0 * length, axis=0, out=made[1:])
-    return made
+    np.cumsum((values[1:] + values[:-1]) / 2.0 * length, axis=0, out=integral[1:])
+    return integral

@@ -6,21 +6,23 @@ from typing import Any
 MAX_TEXT = 60  # characters of a text
 
 
-def brief(result: Any) -> str:
+def one_line_repr(result: Any) -> str:
     """Write a record on one line, its tables and arrays by their shapes.
 
     >>> import pandas as pd
     >>> from px4fuse.flight import Truth
-    >>> brief(Truth("mocap", pd.DataFrame({"north_m": [0.0, 1.0]})))
+    >>> one_line_repr(Truth("mocap", pd.DataFrame({"north_m": [0.0, 1.0]})))
     "Truth(name='mocap', samples=<2 × 1>)"
     """
     names = getattr(result, "__struct_fields__", None) or result.__dataclass_fields__
     values = ((name, getattr(result, name)) for name in names)
-    said = ", ".join(f"{name}={_short(value)}" for name, value in values if value is not None)
-    return f"{type(result).__name__}({said})"
+    field_texts = ", ".join(
+        f"{name}={_format_value(value)}" for name, value in values if value is not None
+    )
+    return f"{type(result).__name__}({field_texts})"
 
 
-def _short(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, str):

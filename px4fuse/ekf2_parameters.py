@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from px4fuse.errors import SettingsError, did_you_mean
+from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
 
 
@@ -68,11 +68,11 @@ class Aid:
     bit: int | None = None
 
     @property
-    def own(self) -> frozenset[str]:
+    def own_parameters(self) -> frozenset[str]:
         """Names of parameters that concern its measurements alone."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
-    def in_log(self, logged: Mapping[str, float]) -> dict[str, float]:
+    def logged_parameters(self, logged: Mapping[str, float]) -> dict[str, float]:
         """Its parameters among those of a log, and what switches it."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged[name]) for name in names if name in logged}
@@ -81,6 +81,8 @@ class Aid:
 AID_MASK = "EKF2_AID_MASK"
 # Since main of 2026 EKF2 takes a fix's own time of measurement, where the driver knows it
 GNSS_MODE = "EKF2_GPS_MODE"
+# Relative; half of the last digit of a float32 is 6e-8
+FLOAT32_ERROR = 1e-6
 # Age of a fix since v1.17, of the first receiver: EKF2 then takes the stamp with it taken off
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
@@ -103,6 +105,18 @@ class Parameter:
     minimum: float
     maximum: float
 
+    def outside(self, value: float) -> str:
+        """Return the fault of a finite value outside the range; empty if it is inside.
+
+        Logs hold float32, in which the end 0.01 is 0.0099999998.
+        """
+        low = self.minimum - FLOAT32_ERROR * abs(self.minimum)
+        high = self.maximum + FLOAT32_ERROR * abs(self.maximum)
+        if low <= value <= high:
+            return ""
+        unit = f" {self.unit}" if self.unit else ""
+        return f" {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
+
 
 TABLE = table(__file__, "ekf2_parameters.toml", dict)
 AIDS, DISTURBANCES = (
@@ -114,6 +128,8 @@ EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
     ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
 )
 PARAMETERS = msgspec.convert(TABLE["parameters"], dict[str, Parameter])
+# Those of the model and all others of a log with which px4fuse computes
+RANGES = PARAMETERS | msgspec.convert(TABLE["logged"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Up to v1.13, ekf2_params.c
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
@@ -133,12 +149,12 @@ def settings_in_force(
     aid, *others : Aid
         What EKF2 fused: those of other aids are left out.
     """
-    used = {one.switch for one in (aid, *others)}
+    used = {fused_aid.switch for fused_aid in (aid, *others)}
     of_others = {
         name
         for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
         if other.switch not in used
-        for name in (*other.own, *other.place, *(FIELD_NOISES if other == MAG else ()))
+        for name in (*other.own_parameters, *other.place, *(FIELD_NOISES if other == MAG else ()))
     }
     defaults = {
         name: parameter.default for name, parameter in PARAMETERS.items() if name not in of_others
@@ -153,7 +169,41 @@ def fuses_by_mask(logged: Mapping[str, float]) -> bool:
     return AID_MASK in logged and EV_POS.switch not in logged
 
 
-def check(chosen: Mapping[str, float]) -> dict[str, float]:
+def valid_parameters(logged: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Replace each parameter of a log that is not finite or outside PX4's range by its default.
+
+    Returns
+    -------
+    valid : dict
+        The same parameters; without those that are not finite and have no default here.
+    notes : tuple of str
+        One per parameter that was replaced or left out.
+
+    Examples
+    --------
+    >>> valid_parameters({"EKF2_EVP_GATE": 0.0, "SYS_AUTOSTART": 4001.0})[0]
+    {'EKF2_EVP_GATE': 5.0, 'SYS_AUTOSTART': 4001.0}
+    """
+    valid, notes = {}, []
+    defaults = {name: known.default for name, known in RANGES.items()}
+    if fuses_by_mask(logged):
+        defaults |= OLD_DEFAULTS
+    for name, value in logged.items():
+        known = RANGES.get(name)
+        finite = math.isfinite(value)
+        fault = "" if known is None else known.outside(value)
+        if finite and not fault:
+            valid[name] = value
+        elif known is None:
+            notes.append(f"{name} is not a finite number and is not used.")
+        else:
+            valid[name] = defaults[name]
+            said = fault if finite else " is not a finite number"
+            notes.append(f"{name}{said}; the default {valid[name]:g} is used.")
+    return valid, tuple(notes)
+
+
+def check_parameters(chosen: Mapping[str, float]) -> dict[str, float]:
     """The same parameters, each known to the model and within PX4's range.
 
     Raises
@@ -163,7 +213,7 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
 
     Examples
     --------
-    >>> check({"EKF2_EVP_NOISE": 0.2})
+    >>> check_parameters({"EKF2_EVP_NOISE": 0.2})
     {'EKF2_EVP_NOISE': 0.2}
     """
     for name, value in chosen.items():
@@ -171,7 +221,7 @@ def check(chosen: Mapping[str, float]) -> dict[str, float]:
         if known is None:
             raise SettingsError(
                 f"{name}: the model of EKF2 does not have this parameter",
-                f"{did_you_mean(name, PARAMETERS)}It knows {', '.join(PARAMETERS)}.",
+                f"{suggest_name(name, PARAMETERS)}It knows {', '.join(PARAMETERS)}.",
             )
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Self
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def suggest_name(name: str, known: Iterable[str]) -> str:
     """The known name that a mistyped one is nearest to, as a question; empty where none is near.
 
-    >>> did_you_mean("EKF2_EVP_NOIS", ["EKF2_EVP_GATE", "EKF2_EVP_NOISE"]), did_you_mean("x", ["y"])
+    >>> suggest_name("EKF2_EVP_NOIS", ["EKF2_EVP_GATE", "EKF2_EVP_NOISE"]), suggest_name("x", ["y"])
     ('Did you mean EKF2_EVP_NOISE? ', '')
     """
     import difflib  # noqa: PLC0415 - where something is wrong only
@@ -33,19 +33,19 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"Did you mean {near[0]}? " if near else ""
 
 
-def on_one_line(text: str) -> str:
+def to_one_line(text: str) -> str:
     r"""A text without what would break or rewrite the line on which it is printed.
 
     File names may hold line feeds and a terminal's escape sequences.
 
-    >>> on_one_line("a\nb\x1b[2J")
+    >>> to_one_line("a\nb\x1b[2J")
     'a b?[2J'
     """
     return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
 
 
 @cache
-def _refusals() -> Mapping[str, list[str]]:
+def _error_texts() -> Mapping[str, list[str]]:
     """Reason, and remedy where there is one, of every case."""
     import tomllib  # noqa: PLC0415 - where something is wrong only
 
@@ -64,7 +64,7 @@ class Px4FuseError(Exception):
     """
 
     def __init__(self, reason: str, remedy: str = "") -> None:
-        text, self.remedy = on_one_line(reason), on_one_line(remedy)
+        text, self.remedy = to_one_line(reason), to_one_line(remedy)
         self.reason = text.removesuffix(".")
         super().__init__(f"{self.reason}. {self.remedy}" if remedy else text)
 
@@ -75,7 +75,7 @@ class Px4FuseError(Exception):
         >>> str(SettingsError.of("no_column", path="class.csv")).partition(". ")[0]
         'class.csv: no column tells who a student is'
         """
-        return cls(*(text.format_map(facts) for text in _refusals()[case]))
+        return cls(*(text.format_map(facts) for text in _error_texts()[case]))
 
 
 class LogError(Px4FuseError):

@@ -20,10 +20,10 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.origin import Origin
-from px4fuse.record import NotNegative, Record, Vector, lacking
+from px4fuse.record import NotNegative, Record, Vector, missing_data
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - for everybody
 from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 
@@ -56,9 +56,14 @@ class Columns:
     BODY_FIELD: Final = [f"body_field_{axis}_gauss" for axis in ("forward", "right", "down")]
     FIELD_INNOVATION: Final = [f"innovation_{axis}_gauss" for axis in ("forward", "right", "down")]
     DELAYED_STATE: Final = [
-        *QUATERNION, *VELOCITY, *POSITION, *GYRO_BIAS,
-        *ACCELEROMETER_BIAS, *EARTH_FIELD, *BODY_FIELD,
-    ]  # fmt: skip
+        *QUATERNION,
+        *VELOCITY,
+        *POSITION,
+        *GYRO_BIAS,
+        *ACCELEROMETER_BIAS,
+        *EARTH_FIELD,
+        *BODY_FIELD,
+    ]
     DELAYED_VARIANCE: Final = [
         *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
         *VELOCITY_VARIANCE,
@@ -66,7 +71,7 @@ class Columns:
         *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS),
         *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS),
         *(f"{name}2" for name in (*EARTH_FIELD, *BODY_FIELD)),
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)
@@ -166,7 +171,7 @@ class PositionTrack:
         What EKF2 takes a sample to be older than its stamp, as far as that was taken off already.
     barometer : DataFrame or None
         ``down_m`` by the barometer, at times of its own, where that is what "down" is to be.
-    place_m : tuple of float
+    lever_arm_m : tuple of float
         Where EKF2 takes the sensor to be in the body (forward, right, down); the positions are the
         sensor's.
     notes : tuple of str
@@ -187,21 +192,31 @@ class PositionTrack:
     velocity: pd.DataFrame | None = None
     age_s: float = 0.0
     barometer: pd.DataFrame | None = None
-    place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     def aid(self, axis: str) -> Aid | None:
         """What EKF2 takes it as along an axis; None where EKF2 never fuses it."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
-    def about(self) -> dict[str, Any]:
+    def description_fields(self) -> dict[str, Any]:
         """What is written of it, and of where it comes from, by the names in results."""
-        names = ("name", "kind", "passage", "description", "frame", "clock", "reconstructed",
-                 "topics", "log", "alignment")  # fmt: skip
-        whose = {name: self.origin if hasattr(self.origin, name) else self for name in names}
-        return {name: getattr(whose[name], name) for name in names}
+        names = (
+            "name",
+            "kind",
+            "passage",
+            "description",
+            "frame",
+            "clock",
+            "reconstructed",
+            "topics",
+            "log",
+            "alignment",
+        )
+        owners = {name: self.origin if hasattr(self.origin, name) else self for name in names}
+        return {name: getattr(owners[name], name) for name in names}
 
     @property
     def rate_hz(self) -> float:
@@ -230,11 +245,11 @@ class Reset:
 
 # EKF2_PREDICT_US, ekf2_params.c
 EKF2_STEP_S = 0.010
-BIAS_NOT_LOGGED = lacking("bias_not_logged")
-HORIZON_NOT_LOGGED = lacking("horizon_not_logged")
+BIAS_NOT_LOGGED = missing_data("bias_not_logged")
+HORIZON_NOT_LOGGED = missing_data("horizon_not_logged")
 
 
-RECORD_NOT_LOGGED = lacking("record_not_logged")
+RECORD_NOT_LOGGED = missing_data("record_not_logged")
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
@@ -295,17 +310,19 @@ class FusionRecord:
     height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     states: Mapping[str, pd.Series[float]] = field(default_factory=dict)
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
     def keeps_latitude(self) -> bool:
         """Whether EKF2 keeps its position as latitude and longitude (from v1.16)."""
         return not np.isfinite(self.delayed["north_m"]).any()
 
-    def was(self, state: str, times_s: Array) -> BoolArray:
+    def was_in_state(self, state: str, times_s: Array) -> BoolArray:
         """Whether EKF2 was in one of :attr:`states` then; not where the log does not tell."""
         known = self.states.get(state)
-        return np.zeros(len(times_s), bool) if known is None else at_times(known, times_s) > 0.0
+        return (
+            np.zeros(len(times_s), bool) if known is None else step_values_at(known, times_s) > 0.0
+        )
 
 
 @dataclass(frozen=True)
@@ -323,26 +340,26 @@ class AidLog:
         (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0), of external
         vision's position ``observation_<axis>`` as well. In the aid's unit, variances in its
         square.
-    meant : Series or None
+    enabled : Series or None
         1 while EKF2 means to fuse it, 0 while it does not, a step function; None where the log
         does not tell.
     parameters : mapping
         EKF2's for this aid, by PX4 name, as at the log's start.
-    left_out : int
+    excluded_count : int
         Innovations without a variance near in time, which are not among the samples.
     """
 
     topics: tuple[str, ...]
     axes: tuple[str, ...]
     samples: pd.DataFrame
-    meant: pd.Series[float] | None
+    enabled: pd.Series[float] | None
     parameters: Mapping[str, float] = field(default_factory=dict)
-    left_out: int = 0
+    excluded_count: int = 0
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-def at_times(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
+def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Values of a step function at some times; before its first step that of the first."""
     at = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
     return np.asarray(steps, dtype=np.float64)[at]
@@ -401,7 +418,7 @@ class Ekf2:
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)
@@ -422,10 +439,10 @@ class Truth:
     samples: pd.DataFrame
     attitude: pd.DataFrame | None = None
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-MODES_NOT_LOGGED = lacking("modes_not_logged")
+MODES_NOT_LOGGED = missing_data("modes_not_logged")
 
 
 # equal to itself only: what is made of it is kept by it
@@ -460,7 +477,7 @@ class Flight:
         Files read beside the log.
     modes : tuple of FlightMode, or Unavailable
         In order of time, without overlap.
-    tumbled : tuple of (float, float)
+    tumble_spans : tuple of (float, float)
         Stretches (s) in which PX4's failure detector found roll or pitch beyond their limits.
     barometer : DataFrame or None
         ``down_m`` by the pressure, from a height that is not known.
@@ -479,13 +496,13 @@ class Flight:
     unused: tuple[Unused, ...] = ()
     inputs: tuple[InputFile, ...] = ()
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
-    tumbled: tuple[tuple[float, float], ...] = ()
+    tumble_spans: tuple[tuple[float, float], ...] = ()
     barometer: pd.DataFrame | None = None
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-def best_first(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:
+def sort_by_preference(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:
     """Position tracks in the order in which a comparison prefers them."""
     return tuple(sorted(tracks, key=lambda track: track.origin.preference))
 

@@ -4,7 +4,7 @@ import ctypes
 import sys
 
 
-def give_back() -> None:
+def release_free_memory() -> None:
     """Give freed memory back to the system, where the C library keeps it for later (glibc).
 
     It lies in pieces between what is still used, too small for large arrays.

@@ -24,14 +24,14 @@ class Origin(Record, frozen=True):
         How it got from the sender into the flight.
     aid : Aid or None
         What EKF2 takes it as, with EKF2's parameters for it; None where EKF2 never fuses it.
-    automatic : bool
+    is_automatic : bool
         Whether it may be chosen without being asked for: GNSS only where EKF2 fused it.
     """
 
     kind: PositionKind
     passage: Passage
     aid: Aid | None
-    automatic: bool = True
+    is_automatic: bool = True
 
     @property
     def may_drift(self) -> bool:
@@ -49,7 +49,7 @@ class Origin(Record, frozen=True):
         return self.passage in ("kept by EKF2", "rebuilt from innovations")
 
     @property
-    def as_sent(self) -> bool:
+    def has_all_samples(self) -> bool:
         """Whether it holds the samples of the sender, all of them."""
         return self.passage in ("given file", "as it arrived")
 
@@ -59,7 +59,7 @@ class Origin(Record, frozen=True):
         return self.aid == EV_POS
 
     @property
-    def by_gnss(self) -> bool:
+    def fused_as_gnss(self) -> bool:
         """Whether EKF2 takes it as GNSS."""
         return self.aid == GNSS_POS
 
@@ -79,20 +79,24 @@ class Origin(Record, frozen=True):
         return places.index((self.aid, self.passage))
 
 
-GIVEN_FILE = Origin("file", "given file", EV_POS)
+POSITION_FILE = Origin("file", "given file", EV_POS)
 RECEIVED = Origin("uwb", "as it arrived", EV_POS)
 MOTION_CAPTURE = Origin("mocap", "as it arrived", None)
 ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
-KEPT = Origin("uwb", "kept by EKF2", EV_POS)
-REBUILT = Origin("uwb", "rebuilt from innovations", EV_POS)
-GNSS = Origin("gnss", "as it arrived", GNSS_POS, automatic=False)
+LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
+FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
+GNSS = Origin("gnss", "as it arrived", GNSS_POS, is_automatic=False)
 # In order of preference. A file given by hand is taken to be of the system that was sent to EKF2
-ORIGINS = (GIVEN_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, KEPT, REBUILT, GNSS)
+ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 
 
 def find_origin(kind: str, passage: str) -> Origin:
     """The origin of this kind that got here in this way."""
-    return next(one for one in ORIGINS if (one.kind, one.passage) == (kind, passage))
+    return next(
+        known_origin
+        for known_origin in ORIGINS
+        if (known_origin.kind, known_origin.passage) == (kind, passage)
+    )
 
 
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:

@@ -12,12 +12,12 @@ import msgspec
 from px4fuse.record import table
 
 
-def plain(value: object) -> Any:
+def to_json_types(value: object) -> Any:
     """Records, mappings and tuples as dicts and lists.
 
     What is None or not a finite number is left out of a dict, never written as zero or NaN.
 
-    >>> plain({"rate_hz": float("nan"), "topics": ("a", "b")})
+    >>> to_json_types({"rate_hz": float("nan"), "topics": ("a", "b")})
     {'topics': ['a', 'b']}
     """
     if isinstance(value, msgspec.Struct):
@@ -25,10 +25,10 @@ def plain(value: object) -> Any:
     elif is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, Mapping):
-        made = {str(name): plain(part) for name, part in value.items()}
-        return {name: part for name, part in made.items() if part is not None}
+        fields_by_name = {str(name): to_json_types(part) for name, part in value.items()}
+        return {name: part for name, part in fields_by_name.items() if part is not None}
     if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
+        return [to_json_types(part) for part in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -48,52 +48,52 @@ def utc_time(unix_s: float | None) -> str | None:
         return None
 
 
-def number_words(value: float, digits: int = 3) -> str:
+def format_number(value: float, digits: int = 3) -> str:
     """A number with as many digits as a person reads, never with an exponent.
 
-    >>> [number_words(value) for value in (0.811, 22.41, 3412.0, 4.2e6, 0.0129, 2.9e-05, 0.0)]
+    >>> [format_number(value) for value in (0.811, 22.41, 3412.0, 4.2e6, 0.0129, 2.9e-05, 0.0)]
     ['0.811', '22.4', '3,410', '4,200,000', '0.0129', '0.000029', '0']
     """
     return f"{Decimal(f'{value:.{digits}g}'):,f}"
 
 
-def factor_words(factor: float) -> str:
+def format_factor(factor: float) -> str:
     """A factor with as many digits as a person reads.
 
-    >>> [factor_words(f) for f in (1.18, 9.87, 61.2, 388.0, 3412.0, 5.13e6)]
+    >>> [format_factor(f) for f in (1.18, 9.87, 61.2, 388.0, 3412.0, 5.13e6)]
     ['1.18', '9.9', '61', '390', '3,400', '5,100,000']
     """
-    return number_words(factor, 3 if factor < 2.0 else 2)
+    return format_number(factor, 3 if factor < 2.0 else 2)
 
 
-def capital(text: str) -> str:
+def capitalise_first(text: str) -> str:
     """A text that begins with a capital letter; the rest of it stays as it is."""
     return text[:1].upper() + text[1:]
 
 
-def few_words(names: Sequence[str], most: int, between: str = ", ") -> str:
+def join_first(names: Sequence[str], most: int, between: str = ", ") -> str:
     """The first few of several names, and how many more there are.
 
-    >>> few_words("abcd", 2), few_words("ab", 2)
+    >>> join_first("abcd", 2), join_first("ab", 2)
     ('a, b and 2 more', 'a, b')
     """
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return between.join(names[:most]) + more
 
 
-def p_words(p: float) -> str:
+def format_p_value(p: float) -> str:
     """A p-value as it is read: small is small.
 
-    >>> [p_words(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
+    >>> [format_p_value(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
     ['p 0.43', 'p 0.021', 'p < 0.001', 'p < 0.001', 'p < 0.001']
     """
-    return "p < 0.001" if p < 0.001 else f"p {number_words(p, 2)}"
+    return "p < 0.001" if p < 0.001 else f"p {format_number(p, 2)}"
 
 
-def length_words(metres: float) -> str:
+def format_length(metres: float) -> str:
     """A length as a person says it.
 
-    >>> [length_words(m) for m in (0.0041, 0.0612, 0.336, 1.42, 23.4, 250.0)]
+    >>> [format_length(m) for m in (0.0041, 0.0612, 0.336, 1.42, 23.4, 250.0)]
     ['4 mm', '6 cm', '34 cm', '1.4 m', '23 m', '250 m']
     """
     for limit, unit, scale in ((0.0095, "mm", 1e3), (0.995, "cm", 1e2)):
@@ -102,15 +102,17 @@ def length_words(metres: float) -> str:
     return f"{metres:.{1 if metres < 9.95 else 0}f} m"
 
 
-def excess_words(factor: float) -> str:
+def format_excess(factor: float) -> str:
     """By how much something is too large, from how many times (1 or more) it is.
 
-    >>> [excess_words(f) for f in (1.18, 1.96, 2.4, 24.3)]
+    >>> [format_excess(f) for f in (1.18, 1.96, 2.4, 24.3)]
     ['18 %', '96 %', '2.4 times', '24 times']
     """
-    return f"{factor - 1.0:.0%}".replace("%", " %") if factor < 2.0 else (
-        f"{factor_words(factor)} times"
-    )  # fmt: skip
+    return (
+        f"{factor - 1.0:.0%}".replace("%", " %")
+        if factor < 2.0
+        else (f"{format_factor(factor)} times")
+    )
 
 
 def sentences(beside: str) -> Callable[..., str]:

@@ -25,23 +25,28 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
 # Of two mistakes: that of the motion and one of single samples; a noise would hide another
-BOTH_SEEN = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
-HARDEST = 3
-MOST_SEED = 2**32 - 1
+COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
+HARDEST_LEVEL = 3
+MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
 # Short of a minute, with two turns. A quiet IMU, which SIGMA_A fits: else its own errors would look
 # like those of clock and frame
-FLOWN: dict[str, Any] = {
-    "passes": 3, "speed_m_s": 1.5, "sigma_a_m_s2": 0.05, "accel_bias_sigma_m_s2": 0.005,
-    "gyro_bias_sigma_rad_s": 0.0002, "tilt_error_deg": 0.02, "yaw_error_deg": 0.2,
-}  # fmt: skip
+SCENARIO_VALUES: dict[str, Any] = {
+    "passes": 3,
+    "speed_m_s": 1.5,
+    "sigma_a_m_s2": 0.05,
+    "accel_bias_sigma_m_s2": 0.005,
+    "gyro_bias_sigma_rad_s": 0.0002,
+    "tilt_error_deg": 0.02,
+    "yaw_error_deg": 0.2,
+}
 LENGTH_M = (8.0, 12.0)
 # Of a mistake that has its moment, the finding that says when
 MOMENTS = {"nlos": "source_outliers", "jump": "source_jumps", "dropout": "source_gap"}
 NOISY_UWB = "noisy-uwb"  # not a mistake of the log: the filter's SIGMA_Z does not fit
 
 
-class Trick(Record, frozen=True):
+class HiddenMistake(Record, frozen=True):
     """A mistake that may be hidden in a flight.
 
     Attributes
@@ -70,19 +75,19 @@ class Trick(Record, frozen=True):
     either_sign: bool = False
 
 
-class Tricks(Record, frozen=True):
+class MistakeTable(Record, frozen=True):
     """What may be chosen, with what it stands for, and what may be hidden."""
 
     choices: dict[str, str]
-    tricks: tuple[Trick, ...]
+    tricks: tuple[HiddenMistake, ...]
 
 
-_TABLES = table(__file__, "practice.toml", Tricks)
-CHOICES, TRICKS = _TABLES.choices, _TABLES.tricks
+_TABLES = table(__file__, "practice.toml", MistakeTable)
+CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.tricks
 
 
 @dataclass(frozen=True)
-class Round:
+class PracticeFlight:
     """One flight of a set.
 
     Attributes
@@ -95,7 +100,7 @@ class Round:
     """
 
     scenario: Scenario
-    tricks: tuple[Trick, ...]
+    tricks: tuple[HiddenMistake, ...]
     typed: tuple[str, ...]
 
     @property
@@ -104,7 +109,7 @@ class Round:
         return sorted({trick.choice for trick in self.tricks}) or ["nothing"]
 
 
-def draw(seed: int, level: int = 1, count: int = 10) -> tuple[Round, ...]:
+def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
     """Draw the flights of a set: every choice in turn, in an order by chance.
 
     Parameters
@@ -119,29 +124,33 @@ def draw(seed: int, level: int = 1, count: int = 10) -> tuple[Round, ...]:
     names: list[str] = []
     while len(names) < count:
         names += [str(name) for name in rng.permutation(list(CHOICES))]
-    return tuple(_round(rng, name, level) for name in names[:count])
+    return tuple(_draw_flight(rng, name, level) for name in names[:count])
 
 
-def _round(rng: np.random.Generator, choice: str, level: int) -> Round:
-    tricks = [one for one in TRICKS if one.choice == choice]
+def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeFlight:
+    tricks = [one for one in HIDDEN_MISTAKES if one.choice == choice]
     tricks = [tricks[rng.integers(len(tricks))]] if tricks else []
-    if level == HARDEST and tricks and rng.random() < 0.5:
-        others = [one for one in TRICKS if {one.choice, choice} in BOTH_SEEN]
-        tricks += [others[rng.integers(len(others))]] if others else []
+    if level == HARDEST_LEVEL and tricks and rng.random() < 0.5:
+        second_mistakes = [
+            one for one in HIDDEN_MISTAKES if {one.choice, choice} in COMBINABLE_GROUPS
+        ]
+        tricks += [second_mistakes[rng.integers(len(second_mistakes))]] if second_mistakes else []
     typed = []
     for trick in tricks:
-        minus = "-" if trick.either_sign and rng.random() < 0.5 else ""
-        typed.append(f"{minus}{trick.sizes[level - 1]}")
-    noisy = next((float(t) for one, t in zip(tricks, typed, strict=True)
-                  if one.mistake == NOISY_UWB), SIGMA_Z_M)  # fmt: skip
+        sign = "-" if trick.either_sign and rng.random() < 0.5 else ""
+        typed.append(f"{sign}{trick.sizes[level - 1]}")
+    noise_m = next(
+        (float(t) for one, t in zip(tricks, typed, strict=True) if one.mistake == NOISY_UWB),
+        SIGMA_Z_M,
+    )
     scenario = Scenario(
-        **FLOWN,
+        **SCENARIO_VALUES,
         length_m=round(float(rng.uniform(*LENGTH_M)), 1),
         heading_deg=round(float(rng.uniform(0.0, 359.0)), 0),
-        sigma_uwb_m=noisy,
-        seed=int(rng.integers(MOST_SEED)),
+        sigma_uwb_m=noise_m,
+        seed=int(rng.integers(MAX_SEED)),
     )
-    return Round(scenario, tuple(tricks), tuple(typed))
+    return PracticeFlight(scenario, tuple(tricks), tuple(typed))
 
 
 def practice_text(
@@ -168,15 +177,20 @@ def practice_text(
     data: dict[str, Any] = {}
     for number, one in enumerate(rounds):
         progress(f"flight {number + 1}", number, count)
-        data, script = _flown(one, number)
+        data, script = _flight_data(one, number)
         scripts.append(script)
     return page_text(
-        "\n".join(scripts), [data], command="practice", heading="What is wrong with this flight?",
-        title=f"seed {seed}, level {level}", rounds=count, choices=CHOICES,
-    )  # fmt: skip
+        "\n".join(scripts),
+        [data],
+        command="practice",
+        heading="What is wrong with this flight?",
+        title=f"seed {seed}, level {level}",
+        rounds=count,
+        choices=CHOICES,
+    )
 
 
-def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
+def _flight_data(one: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
     """One flight's data without what gives it away, and its elements with the packed answer."""
     mistakes = [
         f"{trick.mistake}={size}"
@@ -188,11 +202,12 @@ def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     analysis = run(request, flight=flight)
     findings, packer = find(analysis), Packer()
-    data = flight_data(analysis, packer, replays=False)
+    data = flight_data(analysis, packer)
     key = {
         "right": one.right,
         "made": [
-            _made(trick, size, findings) for trick, size in zip(one.tricks, one.typed, strict=True)
+            _describe_mistake(trick, size, findings)
+            for trick, size in zip(one.tricks, one.typed, strict=True)
         ],
         "story": list(story(analysis, findings)),
         "findings": data["findings"],
@@ -203,11 +218,16 @@ def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
     return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{packed}</script>'
 
 
-def _made(trick: Trick, size: str, findings: tuple[Finding, ...]) -> dict[str, Any]:
+def _describe_mistake(
+    trick: HiddenMistake, size: str, findings: tuple[Finding, ...]
+) -> dict[str, Any]:
     """What was done to the flight, in words, and where and when it shows."""
     what = trick.what.format(size=size)
     moments = [one.spans_s[0] for one in findings if one.id == MOMENTS.get(trick.mistake)]
     return {
-        "choice": trick.choice, "what": what, "tell": trick.tell_tale, "view": trick.view,
+        "choice": trick.choice,
+        "what": what,
+        "tell": trick.tell_tale,
+        "view": trick.view,
         "span": list(moments[0]) if moments else None,
-    }  # fmt: skip
+    }

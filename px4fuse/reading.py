@@ -1,5 +1,7 @@
 """Reading the files that a person names: regular ones only, within a limit, and in one line if not.
 
+Every file that is read is registered as an input, which no output replaces.
+
 A device, a named pipe or a socket may never end or may block; a sparse file may be larger than any
 memory. So a file is looked at before it is opened, and no more than its limit is read.
 """
@@ -12,104 +14,106 @@ from contextlib import suppress
 from contextvars import ContextVar
 from pathlib import Path
 
-from px4fuse.errors import LogError, Px4FuseError, did_you_mean, on_one_line
+from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
+from px4fuse.input_files import add_input
 
 #: Largest flight log that is read, in bytes; ``--max-size`` sets it for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
-_LARGER_LOGS = "Cut it to the flight, or allow more with --max-size MB"
+_SIZE_REMEDY = "Cut it to the flight, or allow more with --max-size MB"
 _BYTES_PER_MB = 1_000_000
 
 
-def shown(path: Path) -> str:
+def display_name(path: Path) -> str:
     r"""A path's last part for messages: never empty, and on one line.
 
-    >>> shown(Path("logs/a.ulg")), shown(Path(".")), shown(Path("a\nb"))
+    >>> display_name(Path("logs/a.ulg")), display_name(Path(".")), display_name(Path("a\nb"))
     ('a.ulg', '.', 'a b')
     """
-    return on_one_line(path.name or str(path))
+    return to_one_line(path.name or str(path))
 
 
-def size_of(path: Path, refuse: type[Px4FuseError], name: str = "") -> int:
-    """Size of a regular file in bytes.
+def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
+    """Size of a regular file in bytes; the file is registered as an input.
 
     Parameters
     ----------
     path : Path
         Symbolic links are followed.
-    refuse : type
+    error_type : type
         Error to raise.
     name : str, optional
-        For messages; by default as :func:`shown` shows it.
+        For messages; by default as :func:`display_name` shows it.
 
     Raises
     ------
     Px4FuseError
-        Of type ``refuse``: it is missing, cannot be looked at, or is not a regular file.
+        Of type ``error_type``: it is missing, cannot be looked at, or is not a regular file.
     """
-    name = name or shown(path)
+    name = name or display_name(path)
     try:
         status = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
         near = ""
         with suppress(OSError):  # a folder that may not be looked into has no names to offer
             if isinstance(error, FileNotFoundError):
-                near = did_you_mean(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
-        raise _unreadable(name, error, refuse, near) from error
+                near = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
+        raise _unreadable(name, error, error_type, near) from error
     if stat.S_ISDIR(status.st_mode):
-        raise refuse(f"{name}: is a folder", "Give a file.")
+        raise error_type(f"{name}: is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
-        raise refuse.of("not_regular", name=name)
+        raise error_type.of("not_regular", name=name)
+    add_input(path)
     return status.st_size
 
 
-def read_head(path: Path, count: int, refuse: type[Px4FuseError]) -> bytes:
+def read_head(path: Path, count: int, error_type: type[Px4FuseError]) -> bytes:
     """First bytes of a regular file, at most ``count``.
 
     Raises
     ------
     Px4FuseError
-        Of type ``refuse``.
+        Of type ``error_type``.
     """
-    size_of(path, refuse)
-    return _read(path, count, refuse, shown(path))
+    file_size(path, error_type)
+    return _read(path, count, error_type, display_name(path))
 
 
-def read_whole(
+def read_bytes_limited(
     path: Path,
-    refuse: type[Px4FuseError],
+    error_type: type[Px4FuseError],
     limit_bytes: int,
     *,
     name: str = "",
-    smaller: str = "Cut it to the flight",
-    again: str | None = None,
+    size_remedy: str = "Cut it to the flight",
+    empty_remedy: str | None = None,
 ) -> bytes:
     """All bytes of a regular file that is not too large.
 
     Parameters
     ----------
-    refuse : type
+    error_type : type
         Error to raise.
     name : str, optional
-        For messages; by default as :func:`shown` shows it.
-    smaller : str
+        For messages; by default as :func:`display_name` shows it.
+    size_remedy : str
         What to do where it is too large.
-    again : str, optional
+    empty_remedy : str, optional
         What to do where it is empty; without it an empty file is read as it is.
 
     Raises
     ------
     Px4FuseError
-        Of type ``refuse``.
+        Of type ``error_type``.
     """
-    name = name or shown(path)
-    size = size_of(path, refuse, name)
-    content = b"" if size > limit_bytes else _read(path, size + 1, refuse, name)
+    name = name or display_name(path)
+    size = file_size(path, error_type, name)
+    content = b"" if size > limit_bytes else _read(path, size + 1, error_type, name)
     if len(content) > size:  # it grows, or is one of /proc, which say that they are empty
-        content = _read(path, limit_bytes + 1, refuse, name)
+        content = _read(path, limit_bytes + 1, error_type, name)
     if (least := max(size, len(content))) > limit_bytes:
-        raise refuse(_too_large(name, least, limit_bytes), f"{smaller}.")
-    if again is not None and not content:
-        raise refuse(f"{name}: the file is empty", f"{again}.")
+        raise error_type(_too_large(name, least, limit_bytes), f"{size_remedy}.")
+    if empty_remedy is not None and not content:
+        raise error_type(f"{name}: the file is empty", f"{empty_remedy}.")
     return content
 
 
@@ -121,37 +125,39 @@ def read_log_bytes(path: Path) -> bytes:
     LogError
         It cannot be read, is not a regular file, is empty or too large.
     """
-    limit, again = max_log_bytes.get(), "Copy it from the vehicle again"
-    return read_whole(path, LogError, limit, smaller=_LARGER_LOGS, again=again)
+    limit, empty_remedy = max_log_bytes.get(), "Copy it from the vehicle again"
+    return read_bytes_limited(
+        path, LogError, limit, size_remedy=_SIZE_REMEDY, empty_remedy=empty_remedy
+    )
 
 
 def read_text(
     path: Path,
-    refuse: type[Px4FuseError],
+    error_type: type[Px4FuseError],
     limit_bytes: int,
     *,
     name: str = "",
-    smaller: str = "Cut it",
+    size_remedy: str = "Cut it",
 ) -> str:
     """Text of a regular file in UTF-8, or in UTF-16 as a Windows shell writes it.
 
     Parameters
     ----------
-    path, refuse, limit_bytes, name, smaller
-        As :func:`read_whole` takes them.
+    path, refuse, limit_bytes, name, size_remedy
+        As :func:`read_bytes_limited` takes them.
 
     Raises
     ------
     Px4FuseError
-        Of type ``refuse``.
+        Of type ``error_type``.
     """
-    name = name or shown(path)
-    content = read_whole(path, refuse, limit_bytes, name=name, smaller=smaller)
+    name = name or display_name(path)
+    content = read_bytes_limited(path, error_type, limit_bytes, name=name, size_remedy=size_remedy)
     is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise refuse.of("not_utf8", name=name, error=error) from error
+        raise error_type.of("not_utf8", name=name, error=error) from error
 
 
 def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
@@ -169,9 +175,11 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
     limit = max_log_bytes.get()
     for path in paths:
         if path.is_dir():
-            files = [f for f in files_below(path) if f.is_file() and size_of(f, LogError) <= limit]
-        elif (size := size_of(path, LogError)) > limit:
-            raise LogError(_too_large(shown(path), size, limit), f"{_LARGER_LOGS}.")
+            files = [
+                f for f in files_below(path) if f.is_file() and file_size(f, LogError) <= limit
+            ]
+        elif (size := file_size(path, LogError)) > limit:
+            raise LogError(_too_large(display_name(path), size, limit), f"{_SIZE_REMEDY}.")
         else:
             files = [path]
         for file in files:
@@ -179,7 +187,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                 with file.open("rb") as stream:
                     sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
             except OSError as error:
-                raise _unreadable(shown(file), error, LogError) from error
+                raise _unreadable(display_name(file), error, LogError) from error
             found.setdefault(sha256, file)
     return found
 
@@ -190,32 +198,32 @@ def files_below(folder: Path) -> list[Path]:
     A folder that cannot be looked into is among them.
     """
     found: list[Path] = []
-    left = [folder]
-    while left:
-        place = left.pop()
+    folders_left = [folder]
+    while folders_left:
+        place = folders_left.pop()
         try:
             with os.scandir(place) as entries:
                 for entry in entries:
-                    into = left if entry.is_dir(follow_symlinks=False) else found
+                    into = folders_left if entry.is_dir(follow_symlinks=False) else found
                     into.append(Path(entry.path))
         except OSError:
             found.append(place)
     return sorted(found)
 
 
-def _read(path: Path, count: int, refuse: type[Px4FuseError], name: str) -> bytes:
+def _read(path: Path, count: int, error_type: type[Px4FuseError], name: str) -> bytes:
     try:
         with path.open("rb") as file:
             return file.read(count)
     except OSError as error:
-        raise _unreadable(name, error, refuse) from error
+        raise _unreadable(name, error, error_type) from error
 
 
 def _unreadable(
-    name: str, error: Exception, refuse: type[Px4FuseError], remedy: str = ""
+    name: str, error: Exception, error_type: type[Px4FuseError], remedy: str = ""
 ) -> Px4FuseError:
     reason = getattr(error, "strerror", None) or error
-    return refuse(f"{name}: cannot be read ({reason}).", remedy)
+    return error_type(f"{name}: cannot be read ({reason}).", remedy)
 
 
 def _too_large(name: str, *sizes: int) -> str:

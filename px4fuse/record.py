@@ -29,11 +29,11 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
     Attributes
     ----------
-    written_as : type or None
+    schema_type : type or None
         Of a record that carries arrays or tables too: its base, which has what is written.
     """
 
-    written_as: ClassVar[type[Record] | None] = None
+    schema_type: ClassVar[type[Record] | None] = None
 
 
 class Unavailable(Record, frozen=True):
@@ -63,54 +63,60 @@ class Unavailable(Record, frozen=True):
 T = TypeVar("T")
 A = TypeVar("A")
 if TYPE_CHECKING:
-    Either: TypeAlias = Union[T, A]  # noqa: UP007 - an alias that takes parameters
-    Maybe: TypeAlias = Union[T, Unavailable]  # noqa: UP007
+    RecordOrUnavailable: TypeAlias = Union[T, A]  # noqa: UP007 - an alias that takes parameters
+    OrUnavailable: TypeAlias = Union[T, Unavailable]  # noqa: UP007
 else:
 
-    class Either:
-        """``Either[T, A]``: a record, or the other one, a kind of :class:`Unavailable`.
+    class RecordOrUnavailable:
+        """``RecordOrUnavailable[T, A]``: a record, or the other one, a kind of :class:`Unavailable`.
 
         msgspec decodes a union of two structs only by a tag, which these have not. To msgspec each
-        ``Either[T, A]`` is therefore a type of its own, which :func:`choose` decodes.
+        ``RecordOrUnavailable[T, A]`` is therefore a type of its own, which :func:`decode_record_or_unavailable` decodes.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
-            made = ABCMeta("Or".join(kind.__name__ for kind in kinds), (), {"kinds": kinds})
+            either_type = ABCMeta("Or".join(kind.__name__ for kind in kinds), (), {"kinds": kinds})
             for kind in kinds:
-                made.register(kind)
-            return made
+                either_type.register(kind)
+            return either_type
 
-    class Maybe:
-        """``Maybe[T]``: a record, or :class:`Unavailable`."""
+    class OrUnavailable:
+        """``OrUnavailable[T]``: a record, or :class:`Unavailable`."""
 
         def __class_getitem__(cls, kind: type) -> type:
-            return Either[kind, Unavailable]
+            return RecordOrUnavailable[kind, Unavailable]
 
 
-def choose(either: Any, value: Any) -> Any:
-    """Decode an :class:`Either`, as a ``dec_hook`` of msgspec.
+def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
+    """Decode an :class:`RecordOrUnavailable`, as a ``dec_hook`` of msgspec.
 
     Raises
     ------
     ValueError
         It is none of the two.
     """
-    whole, missing = either.kinds
-    kind = missing if isinstance(value, dict) and {"what", "reason"} <= value.keys() else whole
+    record_type, unavailable_type = union_type.kinds
+    kind = (
+        unavailable_type
+        if isinstance(value, dict) and {"what", "reason"} <= value.keys()
+        else record_type
+    )
     try:
-        return msgspec.convert(value, kind, dec_hook=choose)
+        return msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
     except msgspec.ValidationError as error:
         raise ValueError(str(error)) from error  # so that msgspec adds where this part is
 
 
-def written(value: Any) -> Any:
+def to_serializable(value: Any) -> Any:
     """What is written of a record, without the arrays that it carries, in all its parts."""
     if isinstance(value, Record):
-        kind = value.written_as or type(value)
-        return kind(**{name: written(getattr(value, name)) for name in kind.__struct_fields__})
+        kind = value.schema_type or type(value)
+        return kind(
+            **{name: to_serializable(getattr(value, name)) for name in kind.__struct_fields__}
+        )
     if isinstance(value, Mapping):
-        return {key: written(part) for key, part in value.items()}
-    return tuple(map(written, value)) if isinstance(value, tuple) else value
+        return {key: to_serializable(part) for key, part in value.items()}
+    return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
 
 
 def table(beside: str, name: str, kind: type[T]) -> T:
@@ -128,16 +134,16 @@ def table(beside: str, name: str, kind: type[T]) -> T:
     return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)
 
 
-_LACKING = table(__file__, "lacking.toml", dict[str, Unavailable])
+_MISSING_DATA = table(__file__, "lacking.toml", dict[str, Unavailable])
 
 
-def lacking(name: str, /, **told: object) -> Unavailable:
-    """What was looked for and not found, in the words of ``lacking.toml``.
+def missing_data(name: str, /, **facts: object) -> Unavailable:
+    """What was looked for and not found, in the words of ``missing_data.toml``.
 
     Examples
     --------
-    >>> str(lacking("measurements_few", what="tuning", count=3, least=30)).partition(". ")[0]
+    >>> str(missing_data("measurements_few", what="tuning", count=3, least=30)).partition(". ")[0]
     'tuning: 3 measurements are too few (at least 30)'
     """
-    row = _LACKING[name]
-    return Unavailable(*(text.format(**told) for text in (row.what, row.reason, row.remedy)))
+    row = _MISSING_DATA[name]
+    return Unavailable(*(text.format(**facts) for text in (row.what, row.reason, row.remedy)))

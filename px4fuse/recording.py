@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
 
@@ -145,7 +145,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     damage : tuple of str
         What of the file could not be read, and how much that is: sentences.
     bytes_read : int
-        Of ``bytes``, those of whole messages.
+        Part of ``bytes`` that was read as complete messages.
     ends_in_flight : bool
         Whether the land detector still says "flying" at the end of the data.
     restarts : int or None
@@ -187,7 +187,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     receipt_went_back: Count | None = None
     dropped: Mapping[str, Count] = {}
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
     def has_ulog(self) -> bool:

@@ -58,10 +58,10 @@ class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 _PATHS = ("log", "mavlink", "source", "estimate", "reference")
 
 
-class _Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What all requests share."""
 
-    def recorded(self) -> Self:
+    def without_paths(self) -> Self:
         """The same with the names of files alone, as results record it."""
         paths = {name: getattr(self, name, None) for name in _PATHS}
         changes: dict[str, Any] = {n: _name(path) for n, path in paths.items() if path is not None}
@@ -71,7 +71,9 @@ class _Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return msgspec.structs.replace(self, **changes)
 
 
-class ComparisonRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag="compare"):
+class ComparisonRequest(
+    _RequestBase, frozen=True, kw_only=True, tag_field="command", tag="compare"
+):
     """A flight to compare with EKF2, as ``compare``, ``tune`` and ``sync`` take it.
 
     Attributes
@@ -147,7 +149,7 @@ class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sigma_m: float = 0.10
 
 
-class LoopRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag="loop"):
+class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", tag="loop"):
     """A loop to measure and correct, as ``loop`` takes it.
 
     Attributes
@@ -195,7 +197,7 @@ class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     count: int = 9
 
 
-class WhatIfRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag="whatif"):
+class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", tag="whatif"):
     """A flight whose EKF2 is replayed with other parameters, as ``whatif`` takes it.
 
     Attributes
@@ -222,7 +224,7 @@ class WhatIfRequest(_Asked, frozen=True, kw_only=True, tag_field="command", tag=
     without: dict[str, float] = {}
 
 
-class EvaluationRequest(_Asked, frozen=True, kw_only=True):
+class EvaluationRequest(_RequestBase, frozen=True, kw_only=True):
     """Two trajectories to score, as ``evaluate`` takes them.
 
     Attributes
@@ -321,22 +323,22 @@ def command_line(
         With the paths as they were typed, for the shell of this system; else with the names of
         files alone, as a POSIX shell reads it.
     """
-    given = request if typed else request.recorded()
+    shown_request = request if typed else request.without_paths()
     # what must be given are files, and everything else is an option
-    needed = [field.name for field in msgspec.structs.fields(given) if field.required]
-    files = [_file(getattr(given, name)) for name in needed]
-    words = [command or str(type(given).__struct_config__.tag or "evaluate"), *files]
-    words += [word for pair in _all_options(given) for word in pair if word is not None]
-    if isinstance(given, WhatIfRequest):
-        for name, value in given.changes.items():
-            words += ["--set", f"{name}={_typed(value)}"]
-        if (swept := given.sweep) is not None:
-            ends = f"{_typed(swept.low)}:{_typed(swept.high)}:{swept.count}"
-            words += ["--sweep", f"{swept.parameter}={ends}"]
-        for name in given.without:
+    needed = [field.name for field in msgspec.structs.fields(shown_request) if field.required]
+    files = [_path_argument(getattr(shown_request, name)) for name in needed]
+    words = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
+    words += [word for pair in _all_options(shown_request) for word in pair if word is not None]
+    if isinstance(shown_request, WhatIfRequest):
+        for name, value in shown_request.changes.items():
+            words += ["--set", f"{name}={_option_text(value)}"]
+        if (sweep_range := shown_request.sweep) is not None:
+            ends = f"{_option_text(sweep_range.low)}:{_option_text(sweep_range.high)}:{sweep_range.count}"
+            words += ["--sweep", f"{sweep_range.parameter}={ends}"]
+        for name in shown_request.without:
             words += ["--without", name]
-        for since in {*given.without.values()} - {0.0}:
-            words += ["--from", _typed(since)]
+        for since in {*shown_request.without.values()} - {0.0}:
+            words += ["--from", _option_text(since)]
     join = subprocess.list2cmdline if typed and os.name == "nt" else shlex.join
     return join(["px4fuse", *words])
 
@@ -347,15 +349,15 @@ def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) 
     >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, mavlink="b/c.tlog"))
     '_mavlink-c_sigma-z-0.05'
     """
-    parts = ""
-    for option, value in _all_options(request.recorded()):
+    name_suffix = ""
+    for option, value in _all_options(request.without_paths()):
         is_file = option in ("--mavlink", "--position")
         typed = PurePath(value).stem if is_file and value is not None else value
-        parts += f"_{option[2:]}" + ("" if typed is None else f"-{typed}")
-    return re.sub(r"[^\w.,+-]+", "-", parts)
+        name_suffix += f"_{option[2:]}" + ("" if typed is None else f"-{typed}")
+    return re.sub(r"[^\w.,+-]+", "-", name_suffix)
 
 
-def _file(path: str) -> str:
+def _path_argument(path: str) -> str:
     """A path that is not taken for an option."""
     return f"./{path}" if path.startswith("-") else path
 
@@ -370,17 +372,17 @@ def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
         several = value if field.name in ("axes", "closures", "rpe") else (value,)
         for single in several:
             name = options[field.name].name
-            yield name, None if isinstance(single, bool) else _typed(single)
+            yield name, None if isinstance(single, bool) else _option_text(single)
     if (position := getattr(request, "position", None)) is not None:
         yield from _all_options(position)
 
 
-def _typed(value: Any) -> str:
+def _option_text(value: Any) -> str:
     """A value as it is typed."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.astuple(value)
     if isinstance(value, tuple):
-        return ",".join(_typed(part) for part in value if part is not None)
+        return ",".join(_option_text(part) for part in value if part is not None)
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 

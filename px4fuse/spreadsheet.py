@@ -8,25 +8,25 @@ FORMULA = "=+-@"
 MAX_CHARACTERS = 32_000
 
 
-def neutral(text: str) -> str:
+def neutralise_formulas(text: str) -> str:
     r"""Text that a spreadsheet shows as text, after OWASP's advice on CSV injection.
 
-    >>> neutral("=1+1"), neutral(" \uff0b1"), neutral("a;=1+1"), neutral("3 - 2")
+    >>> neutralise_formulas("=1+1"), neutralise_formulas(" \uff0b1"), neutralise_formulas("a;=1+1"), neutralise_formulas("3 - 2")
     ("'=1+1", "' ＋1", "a;'=1+1", '3 - 2')
     """
     # Where the computer's region says so, Excel splits at semicolons instead, even within quotes
-    parts = (f"'{part}" if _is_formula(part) else part for part in text.split(";"))
-    safe = "".join(map(_fit, ";".join(parts)))
-    return safe if len(safe) <= MAX_CHARACTERS else safe[:MAX_CHARACTERS] + "…"
+    cells = (f"'{cell}" if _is_formula(cell) else cell for cell in text.split(";"))
+    safe_text = "".join(map(_replace_control_character, ";".join(cells)))
+    return safe_text if len(safe_text) <= MAX_CHARACTERS else safe_text[:MAX_CHARACTERS] + "…"
 
 
-def neutral_id(text: str) -> str:
-    """An id as it is where a spreadsheet cannot take it for a formula, else :func:`neutral`.
+def neutralise_id(text: str) -> str:
+    """An id as it is where a spreadsheet cannot take it for a formula, else :func:`neutralise_formulas`.
 
-    >>> neutral_id("0042"), neutral_id("-17"), neutral_id("a.b@c.de"), neutral_id("=1")
+    >>> neutralise_id("0042"), neutralise_id("-17"), neutralise_id("a.b@c.de"), neutralise_id("=1")
     ('0042', '-17', 'a.b@c.de', "'=1")
     """
-    return text if re.fullmatch(r"[+-]\d+|\w[\w.@+-]*", text) else neutral(text)
+    return text if re.fullmatch(r"[+-]\d+|\w[\w.@+-]*", text) else neutralise_formulas(text)
 
 
 def _is_formula(text: str) -> bool:
@@ -41,7 +41,7 @@ def _is_formula(text: str) -> bool:
     return False
 
 
-def _fit(character: str) -> str:
+def _replace_control_character(character: str) -> str:
     if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp"):
         return " " if character.isspace() else "\N{REPLACEMENT CHARACTER}"
     return character

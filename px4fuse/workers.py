@@ -42,7 +42,7 @@ _ENVIRONMENT = {
 
 
 @dataclass(frozen=True)
-class Failed:
+class JobFailure:
     """What stands for the result of a job that gave none, and why: one line for a person."""
 
     reason: str
@@ -54,8 +54,8 @@ class _Worker:
     def __init__(self, function: Callable[[Any], Any], memory_bytes: int | None, job: int) -> None:
         # spawn: the same on Windows and macOS, and no copy of the parent's memory
         context = multiprocessing.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, function, memory_bytes))
+        self.pipe, child_pipe = context.Pipe()
+        self.process = context.Process(target=_serve, args=(child_pipe, function, memory_bytes))
         before = dict(os.environ)
         os.environ.update(_ENVIRONMENT)
         try:
@@ -63,7 +63,7 @@ class _Worker:
         finally:
             os.environ.clear()
             os.environ.update(before)
-        theirs.close()  # so that the pipe ends when the process does
+        child_pipe.close()  # so that the pipe ends when the process does
         self.ready = False
         self.job = job
         self.jobs_done = 0
@@ -83,7 +83,7 @@ def run_bounded(
     processes: int | None = None,
     timeout_s: float = TIMEOUT_S,
     memory_bytes: int | None = MEMORY_BYTES,
-) -> Generator[tuple[int, Result | Failed]]:
+) -> Generator[tuple[int, Result | JobFailure]]:
     """Call a function on every job, in processes of their own, each within bounds.
 
     A job whose process hangs, dies or takes too much memory is lost alone: its process is ended
@@ -105,7 +105,7 @@ def run_bounded(
     Yields
     ------
     (int, object)
-        Index of a job and its result, :class:`Failed` where there is none, in the order in which
+        Index of a job and its result, :class:`JobFailure` where there is none, in the order in which
         they finish.
     """
     waiting = list(range(len(jobs)))[::-1]
@@ -114,20 +114,20 @@ def run_bounded(
         while waiting or workers:
             while waiting and len(workers) < (processes or os.cpu_count() or 1):
                 # given now, sent when the process is ready: a start that fails costs one job
-                started = _Worker(function, memory_bytes, waiting.pop())
-                workers[started.pipe] = started
+                new_worker = _Worker(function, memory_bytes, waiting.pop())
+                workers[new_worker.pipe] = new_worker
             # the latest when somebody's time is up
-            soonest = min(worker.deadline for worker in workers.values())
-            answered = wait(workers, max(0.0, soonest - time.monotonic()))
+            first_deadline = min(worker.deadline for worker in workers.values())
+            ready_pipes = wait(workers, max(0.0, first_deadline - time.monotonic()))
             for pipe, worker in list(workers.items()):
-                if pipe in answered:
-                    sound, result = _received(worker)
-                    if sound and not worker.ready:
+                if pipe in ready_pipes:
+                    is_usable, result = _receive_result(worker)
+                    if is_usable and not worker.ready:
                         worker.ready = True
                     else:
                         yield worker.job, result
                         worker.jobs_done += 1
-                        if not sound or worker.jobs_done >= JOBS_PER_WORKER or not waiting:
+                        if not is_usable or worker.jobs_done >= JOBS_PER_WORKER or not waiting:
                             workers.pop(pipe).end()
                             continue
                         worker.job = waiting.pop()
@@ -138,34 +138,34 @@ def run_bounded(
                 elif time.monotonic() >= worker.deadline:
                     limit = timeout_s if worker.ready else START_S
                     workers.pop(pipe).end()
-                    yield worker.job, Failed(f"it took longer than {limit:g} s and was ended.")
+                    yield worker.job, JobFailure(f"it took longer than {limit:g} s and was ended.")
     finally:
         for worker in workers.values():
             worker.end()
 
 
-def bounded(
+def run_one_bounded(
     function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int = MEMORY_BYTES
-) -> Result | Failed:
+) -> Result | JobFailure:
     """One call in a process of its own, within bounds: see :func:`run_bounded`."""
     work = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
     with closing(work):
         return next(work)[1]
 
 
-def _received(worker: _Worker) -> tuple[bool, Any]:
+def _receive_result(worker: _Worker) -> tuple[bool, Any]:
     """Whether the process can go on, and what it said."""
     try:
-        answer: tuple[bool, Any] = worker.pipe.recv()
+        message: tuple[bool, Any] = worker.pipe.recv()
     except (EOFError, OSError):
         worker.process.join(5)
         how = f"exit code {worker.process.exitcode}"
         when = "" if worker.ready else " before it began"
-        return False, Failed(f"the process that read it ended{when} ({how}).")
+        return False, JobFailure(f"the process that read it ended{when} ({how}).")
     # unpickling runs what the classes of a result define: anything can go wrong
     except Exception as error:  # noqa: BLE001
-        return False, Failed(f"its result could not be read ({type(error).__name__}).")
-    return answer
+        return False, JobFailure(f"its result could not be read ({type(error).__name__}).")
+    return message
 
 
 def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
@@ -184,14 +184,14 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
             message = pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
         except MemoryError:
             # the next job would not find enough memory either
-            why = Failed("it needed more memory than one file may take.")
+            why = JobFailure("it needed more memory than one file may take.")
             message = pickle.dumps((False, why))
         except Exception as error:  # noqa: BLE001 - a job's failure is its result
             # two seconds to import, in every process, for what mostly does not happen
             from px4fuse.results.reading import one_line  # noqa: PLC0415
 
             kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
-            message = pickle.dumps((True, Failed(one_line(f"{kind}{error}", 300))))
+            message = pickle.dumps((True, JobFailure(one_line(f"{kind}{error}", 300))))
         del job
         pipe.send_bytes(message)
 

@@ -58,18 +58,18 @@ MEMORY = "PX4FUSE_TESTS_MEMORY"
 
 def analyse_once(work: job.Job) -> job.Outcome:
     """As the worker does, but what was found in the same log before serves again."""
-    with mock.patch.object(job, "_compared", _remembered):  # the worker is also other tests'
+    with mock.patch.object(job, "_compare_log", _remembered):  # the worker is also other tests'
         return job.analyse(work)
 
 
-_compared = job._compared
+_compare_log = job._compare_log
 
 
 def _remembered(work: job.Job, path: Path, sha256: str) -> job.Outcome:
     known = repr((path.name, sha256, work.request, work.reports))
     kept = Path(os.environ[MEMORY]) / hashlib.sha256(known.encode()).hexdigest()
     if not kept.is_file():
-        outcome = _compared(work, path, sha256)
+        outcome = _compare_log(work, path, sha256)
         kept.with_suffix(f".{os.getpid()}").write_bytes(pickle.dumps(outcome))
         kept.with_suffix(f".{os.getpid()}").replace(kept)
     return pickle.loads(kept.read_bytes())

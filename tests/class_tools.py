@@ -14,7 +14,7 @@ from conftest import REPORT, page_of
 from px4fuse import workers
 from px4fuse.grading import grade as grading
 from px4fuse.grading import records
-from px4fuse.grading.model import Entry, Graded, Item
+from px4fuse.grading.model import Entry, GradedReport, Item
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256, verify
 
@@ -70,13 +70,15 @@ def zipped(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 0, 
     return path
 
 
-def graded(name: str, *points: float, student: str = "", student_id: str = "", **more) -> Graded:
+def graded(
+    name: str, *points: float, student: str = "", student_id: str = "", **more
+) -> GradedReport:
     """A report with items A, B, … of ten points each."""
     items = tuple(
         Item(chr(ord("A") + at), each, 10.0, "Because.") for at, each in enumerate(points)
     )
     values = {"sha256": name, "version": "0.2.0"} | more
-    return Graded(name, student, student_id, VERIFIED, items, **values)
+    return GradedReport(name, student, student_id, VERIFIED, items, **values)
 
 
 def entry(student_id: str, name: str, total: float | None, **more) -> Entry:

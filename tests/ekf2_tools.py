@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from px4fuse.ekf2.inputs import Inputs, Rules
+from px4fuse.ekf2.inputs import FusionRules, Inputs
 from px4fuse.ekf2.intervals import Events
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch
@@ -11,7 +11,7 @@ from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)
 # Of v1.16
-RULES = Rules(0.2, 0.4, 1.0, 5, None, False)
+RULES = FusionRules(0.2, 0.4, 1.0, 5, None, False)
 
 
 def opened(flight: Flight) -> Model:

@@ -13,7 +13,7 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import Intervention
 from px4fuse.comparison.model import FILTERS, AgainstTruth, FilterSummary, UnjudgedFilter
-from px4fuse.filter.causes import Estimate, Explained, Jump
+from px4fuse.filter.causes import BiasScaleJumpFit, Estimate, Jump
 from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
@@ -96,7 +96,8 @@ def analysis(
     usual_flight = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, "airborne": NONE}
     flown = {**usual_flight, **(flight or {})}
     usual = dict.fromkeys(
-        ("clock", "ekf2_model", "loop", "heading", "explained", "smoothing", "coloured"), NONE
+        ("clock", "ekf2_model", "loop", "heading", "bias_scale_jump_fit", "smoothing", "coloured"),
+        NONE,
     )
     by_name = {axis.axis.name: axis for axis in axes}
     return SimpleNamespace(  # type: ignore[return-value]
@@ -199,7 +200,9 @@ def tuned(
 ) -> dict[str, Any]:
     right = Noise(1.0, 0.9, 1.1)
     usual = {"name": "horizontal", "before": NONE, "held_out": NONE, "outlier_time_s": np.array([])}
-    noises = (sigma_z or right).named("sigma_z_m") | (sigma_a or right).named("filter_sigma_a_m_s2")
+    noises = (sigma_z or right).as_fields("sigma_z_m") | (sigma_a or right).as_fields(
+        "filter_sigma_a_m_s2"
+    )
     one = made(AxisTuning, **noises, **{**usual, **parts})
     return {HORIZONTAL: one}
 
@@ -218,5 +221,7 @@ def late(
     )
 
 
-def with_bias(forward: float, sigma: float = 0.01, right: float = 0.0) -> Explained:
-    return made(Explained, forward_bias=Estimate(forward, sigma), right_bias=Estimate(right, 0.0))
+def with_bias(forward: float, sigma: float = 0.01, right: float = 0.0) -> BiasScaleJumpFit:
+    return made(
+        BiasScaleJumpFit, forward_bias=Estimate(forward, sigma), right_bias=Estimate(right, 0.0)
+    )

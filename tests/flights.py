@@ -110,7 +110,7 @@ def aisle_flight(
     dropouts: tuple[Dropout, ...] = (),
     notes: tuple[str, ...] = (),
     damage: tuple[str, ...] = (),
-    tumbled: tuple[Span, ...] = (),
+    tumble_spans: tuple[Span, ...] = (),
 ) -> Flight:
     """Fly along the aisle; None leaves a part out of the log."""
     rng = np.random.default_rng(seed)
@@ -171,7 +171,7 @@ def aisle_flight(
         if truth
         else unavailable("ground truth"),
         airborne=((0.0, duration_s),),
-        tumbled=tumbled,
+        tumble_spans=tumble_spans,
     )
 
 

@@ -12,7 +12,14 @@ from typing import Any
 
 import msgspec
 from pypdf import PdfReader, PdfWriter
-from pypdf.generic import DecodedStreamObject, DictionaryObject, NameObject, NumberObject
+from pypdf.generic import (
+    ArrayObject,
+    DecodedStreamObject,
+    DictionaryObject,
+    FloatObject,
+    NameObject,
+    NumberObject,
+)
 
 from px4fuse.errors import ResultsError
 from px4fuse.reading import files_by_sha256
@@ -116,6 +123,46 @@ def entry(key: str, value: Any) -> Callable[[Any], None]:
         holder[NameObject(key)] = NumberObject(value) if isinstance(value, int) else value
 
     return change
+
+
+def name(word: str) -> NameObject:
+    return NameObject(f"/{word}")
+
+
+def array(*parts: Any) -> ArrayObject:
+    return ArrayObject(parts)
+
+
+def box(*corners: float) -> ArrayObject:
+    return array(*(FloatObject(corner) for corner in corners))
+
+
+def dictionary(**entries: Any) -> DictionaryObject:
+    return DictionaryObject({name(key): value for key, value in entries.items()})
+
+
+def stream(data: bytes, **entries: Any) -> DecodedStreamObject:
+    made = DecodedStreamObject()
+    made.update(dictionary(**entries))
+    made.set_data(data)
+    return made
+
+
+def root(key: str, value: Any) -> Forge:
+    """An entry of the catalogue."""
+    return lambda writer: entry(key, value)(writer.root_object)
+
+
+def titled(**entries: str) -> Forge:
+    """Entries of the document information."""
+    return lambda writer: writer.add_metadata({f"/{key}": held for key, held in entries.items()})
+
+
+def appended(pdf: bytes, change: Forge) -> bytes:
+    """An incremental update, as viewers append one."""
+    writer = PdfWriter(io.BytesIO(pdf), incremental=True)
+    change(writer)
+    return saved(writer)
 
 
 # ------------------------------------------------------------------ reports that verify

@@ -10,7 +10,7 @@ from pypdf import PdfReader
 
 from px4fuse.report import fonts
 from px4fuse.report.page import Block, Page, data
-from px4fuse.report.pdf import compiled
+from px4fuse.report.pdf import compile_pdf
 
 
 def every(blocks: Sequence[Block]) -> Iterator[Block]:
@@ -57,4 +57,4 @@ def set_by_typst(*pages: Page) -> list[str]:
         "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,
         "fonts": [fonts.FONT], "blocks": blocks,
     }  # fmt: skip
-    return [sheet.extract_text() for sheet in PdfReader(io.BytesIO(compiled(report))).pages]
+    return [sheet.extract_text() for sheet in PdfReader(io.BytesIO(compile_pdf(report))).pages]

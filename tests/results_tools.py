@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from px4fuse.loop.model import Closure, Correction, KnownEnd, LoopPart, OdometryNoise
+from px4fuse.loop.model import Closure, Correction, KnownEnd, LoopResult, OdometryNoise
 from px4fuse.record import Unavailable
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_plain
@@ -49,7 +49,7 @@ LOOP = to_plain(
         request=LoopRequest(source="loop.ulg:vio"),
         track=Track("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
         references=(),
-        loop=LoopPart(
+        loop=LoopResult(
             track="loop.ulg:vio",
             kind="vio",
             frame="NED",

@@ -12,8 +12,8 @@ from flights import aisle_flight
 from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
 
-from px4fuse.analysis import AidsAlone, bad_verdicts
-from px4fuse.ekf2.aids import AidResult, judge_aids
+from px4fuse.analysis import AidsOnlyAnalysis, failed_checks
+from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import find_aids
@@ -35,7 +35,7 @@ def steps(*changes: tuple[float, float]) -> pd.Series:
 
 def aid_log(
     *, sigma: float = 0.5, mean: float = 0.0, gate: float = 5.0, own: bool = True,
-    meant: pd.Series | None = None, **parameters: float,
+    enabled: pd.Series | None = None, **parameters: float,
 ) -> AidLog:  # fmt: skip
     """White innovations of a standard deviation, of which EKF2 claims 0.5, R half of S."""
     claimed, axes = 0.5, ("north", "east")
@@ -54,7 +54,7 @@ def aid_log(
     if own:
         columns |= {"fused": 1.0 - beyond, "rejected": beyond}
     frame = pd.DataFrame(columns, index=pd.Index(TIMES, name="time_s"))
-    return AidLog(("a_topic",), axes, frame, meant, parameters)
+    return AidLog(("a_topic",), axes, frame, enabled, parameters)
 
 
 def with_aids(**aids: AidLog) -> Flight:
@@ -63,7 +63,7 @@ def with_aids(**aids: AidLog) -> Flight:
 
 
 def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
-    return judge_aids(with_aids(**{name: log}))[name]
+    return evaluate_aids(with_aids(**{name: log}))[name]
 
 
 @pytest.mark.parametrize(("sigma", "verdict"), [
@@ -88,13 +88,13 @@ def test_a_mean_that_averaging_does_not_take_away_is_a_bias() -> None:
 
 
 def test_times_without_a_fused_sample_count_from_where_it_was_meant() -> None:
-    log = aid_log(meant=steps((0.0, 1.0), (26.0, 0.0), (40.0, 1.0)))
+    log = aid_log(enabled=steps((0.0, 1.0), (26.0, 0.0), (40.0, 1.0)))
     silent = log.samples.loc[:20.0]
     outage = judged(replace(log, samples=pd.concat([silent, log.samples.loc[40.0:]])))
     assert (outage.verdict, outage.longest_without_s) == ("starved", (20.0, 40.0))
     # given up at once: nothing was waited for
-    meant = steps((0.0, 1.0), (20.05, 0.0), (40.0, 1.0))
-    given_up = judged(replace(log, samples=outage_free(log, 20.0, 40.0), meant=meant))
+    enabled = steps((0.0, 1.0), (20.05, 0.0), (40.0, 1.0))
+    given_up = judged(replace(log, samples=outage_free(log, 20.0, 40.0), enabled=enabled))
     assert given_up.verdict == "consistent"
     assert given_up.longest_without == pytest.approx(0.1, abs=0.01)
     assert given_up.intended_share == pytest.approx(40.0 / 60.0, abs=0.02)
@@ -107,11 +107,11 @@ def outage_free(log: AidLog, start_s: float, end_s: float) -> pd.DataFrame:
 
 def test_what_was_never_meant_is_idle_and_few_samples_are_no_verdict() -> None:
     log = aid_log()
-    assert judged(replace(log, meant=steps((0.0, 0.0)))).verdict == "idle"
-    few = judged(replace(log, samples=log.samples.iloc[::80], meant=steps((0.0, 1.0))))
+    assert judged(replace(log, enabled=steps((0.0, 0.0)))).verdict == "idle"
+    few = judged(replace(log, samples=log.samples.iloc[::80], enabled=steps((0.0, 1.0))))
     assert (few.verdict, few.axes) == ("starved", {})
     three_hertz = pd.DataFrame(log.samples.iloc[:9])
-    assert judged(replace(log, samples=three_hertz, meant=steps((0.0, 1.0), (0.9, 0.0)))
+    assert judged(replace(log, samples=three_hertz, enabled=steps((0.0, 1.0), (0.9, 0.0)))
                   ).verdict == "too few samples"  # fmt: skip
 
 
@@ -156,7 +156,7 @@ def test_who_set_the_noise(name: str, parameters: dict[str, float], set_by: str)
 
 def test_an_aid_logged_once_a_second_is_not_starved_by_a_few_rows() -> None:
     """A row of zeros is one that fell between two samples."""
-    log = aid_log(own=False, meant=steps((0.0, 1.0)))
+    log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     thinned = replace(log, samples=log.samples.iloc[::10])
     for silent_s, verdict in ((7.6, "consistent"), (12.0, "starved")):
         samples = outage_free(thinned, 20.0, 20.0 + silent_s)
@@ -165,8 +165,8 @@ def test_an_aid_logged_once_a_second_is_not_starved_by_a_few_rows() -> None:
 
 def test_findings_name_the_aid_its_figures_and_when() -> None:
     log = aid_log()
-    silent = replace(log, samples=outage_free(log, 20.0, 41.0), meant=steps((0.0, 1.0)))
-    found = judge_aids(with_aids(
+    silent = replace(log, samples=outage_free(log, 20.0, 41.0), enabled=steps((0.0, 1.0)))
+    found = evaluate_aids(with_aids(
         gnss_pos=silent, gnss_vel=silent, baro_hgt=aid_log(sigma=1.5), mag=aid_log(mean=-0.4),
         ev_pos=aid_log(sigma=9.0), rng_hgt=log,
     ))  # fmt: skip
@@ -218,7 +218,7 @@ def test_each_release_s_innovations_are_read_once_and_with_everybody_s_sign(gene
     found = log.samples[["innovation_north", "innovation_east"]].to_numpy()
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert (log.samples["variance_north"] == 0.25).all()
-    aid = judge_aids(flight)["gnss_pos"]  # type: ignore[index]
+    aid = evaluate_aids(flight)["gnss_pos"]  # type: ignore[index]
     assert aid.intended_share == 1.0
     assert aid.fused_logged is (generation in ("v1.14", "v1.16"))
     assert aid.verdict == "variance overstated"
@@ -230,7 +230,7 @@ def test_each_release_s_innovations_are_read_once_and_with_everybody_s_sign(gene
 def test_checks_end_a_rig_where_a_verdict_on_ekf2_is_bad(tmp_path, monkeypatch, capsys) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     code, _, err = run_main(monkeypatch, capsys, "compare", log, "--checks", "-o", report)
-    bad = [each.label for each in judge_aids(read_log(log)).values() if each.is_bad]
+    bad = [each.label for each in evaluate_aids(read_log(log)).values() if each.is_bad]
     assert code == (1 if bad else 0)
     assert [line.partition(": ")[0] for line in err.splitlines()] == bad
 
@@ -239,8 +239,8 @@ def test_checks_end_a_rig_where_a_verdict_on_ekf2_is_bad(tmp_path, monkeypatch, 
 def test_what_is_bad_for_a_rig(sigma: float, bad: bool) -> None:
     """Too sure is, too modest is not."""
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
-    alone = AidsAlone(made, judge_aids(made), Unavailable("it", "not there", "Log it."))
-    assert bad_verdicts(alone) == ({"GNSS position": "variance understated"} if bad else {})
+    alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
+    assert failed_checks(alone) == ({"GNSS position": "variance understated"} if bad else {})
 
 
 def test_a_log_without_position_gets_its_aids_judged(tmp_path: Path) -> None:

@@ -15,12 +15,12 @@ from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from px4fuse.alignment.placement import place
+from px4fuse.alignment.placement import align_position_file
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Alignment, Columns, Flight, PositionTrack, Reset
-from px4fuse.origin import GIVEN_FILE
+from px4fuse.origin import POSITION_FILE
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
 from px4fuse.recording import InputFile
@@ -48,10 +48,10 @@ def smooth_step(time_s: Array) -> Array:
 
 def passes(time_s: Array, heading_deg: float, length_m: float, across_m: float = 0.2) -> Array:
     """Passes along the aisle of which no two are alike; shape (n, 3), NED."""
-    along, place_m = 0.0 * time_s, 0.0
+    along, lever_arm_m = 0.0 * time_s, 0.0
     for start_s, share in PASSES.items():
-        along += (share * length_m - place_m) * smooth_step(time_s - start_s)
-        place_m = share * length_m
+        along += (share * length_m - lever_arm_m) * smooth_step(time_s - start_s)
+        lever_arm_m = share * length_m
     across = across_m * np.sin(time_s / 2.3)
     c, s = np.cos(np.radians(heading_deg)), np.sin(np.radians(heading_deg))
     down = -1.5 * smooth_step(time_s)
@@ -99,7 +99,7 @@ def recorded(
 def placed(
     flight: Flight, file: PositionRecording, **options: Any
 ) -> tuple[Alignment, PositionTrack]:
-    track = place(flight, file, **options).positions[0]
+    track = align_position_file(flight, file, **options).positions[0]
     return track.alignment, track
 
 
@@ -222,7 +222,7 @@ def test_an_aisle_at_45_degrees_without_height_does_not_tell_the_frame() -> None
     file = recorded(flight, frame="enu")
     file.samples["z_m"] = np.nan
     with pytest.raises(MissingDataError, match=r"no frame fits .*Give `frame`"):
-        place(flight, file)
+        align_position_file(flight, file)
     alignment, track = placed(flight, file, frame="enu")
     assert off_s(alignment) < 0.03
     assert track.samples["down_m"].isna().all()
@@ -246,10 +246,10 @@ def test_variances_turn_with_the_track(flight: Flight) -> None:
 
 
 def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Flight) -> None:
-    result = place(flight, recorded(flight))
+    result = align_position_file(flight, recorded(flight))
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
-    assert (track.origin, track.frame) == (GIVEN_FILE, "NED")
+    assert (track.origin, track.frame) == (POSITION_FILE, "NED")
     assert track.clock.endswith(" s to the boot clock, matched with EKF2 position")
     assert tuple(others) == flight.positions
     assert result.inputs == (InputFile("uwb.csv", "f" * 64, 1234, "position"),)
@@ -367,7 +367,7 @@ def test_what_stands_still_is_placed_by_a_given_offset_alone() -> None:
     for parts in ({}, {"ekf2": unavailable("EKF2")}):
         said = rf"^uwb\.csv: .*hardly moves; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
         with pytest.raises(MissingDataError, match=said):
-            place(replace(flight, **parts), recorded(flight), frame="enu")
+            align_position_file(replace(flight, **parts), recorded(flight), frame="enu")
     alignment, track = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S)
     assert alignment.misplaced == alignment.warnings == ()
     assert alignment.correlation is None
@@ -380,9 +380,9 @@ def test_no_reference_at_all() -> None:
     file = recorded(flight)
     said = f"no EKF2 position; the log has no acceleration.*{BOTH_SPANS}.*"
     with pytest.raises(MissingDataError, match=said + r"Give `clock_offset_s` and `frame`\.$"):
-        place(flight, file)
+        align_position_file(flight, file)
     with pytest.raises(MissingDataError, match=r"Give `yaw_deg`\.$"):
-        place(flight, file, frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S)
+        align_position_file(flight, file, frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S)
     alignment, track = placed(flight, file, frame="enu", clock_offset_s=OFFSET_S)
     assert alignment.reference == ""
     assert alignment.correlation is alignment.residual_rms_m is None
@@ -394,13 +394,15 @@ def test_files_that_cannot_be_of_the_flight_are_refused(flight: Flight) -> None:
     file = recorded(flight)
     for offset in (0.0, OFFSET_S + 121.0, OFFSET_S - 121.0):
         with pytest.raises(MissingDataError, match="does not overlap the log; " + BOTH_SPANS):
-            place(flight, file, frame="enu", clock_offset_s=offset)
+            align_position_file(flight, file, frame="enu", clock_offset_s=offset)
     stamps = file.samples.index.to_numpy().copy()
     stamps[-1] += 2e5
     with pytest.raises(MissingDataError, match="spans more than a day"):
-        place(flight, replace(file, samples=file.samples.set_axis(pd.Index(stamps))), frame="enu")
+        align_position_file(
+            flight, replace(file, samples=file.samples.set_axis(pd.Index(stamps))), frame="enu"
+        )
     with pytest.raises(MissingDataError, match="9 positions are too few"):
-        place(flight, replace(file, samples=file.samples.iloc[:9]))
+        align_position_file(flight, replace(file, samples=file.samples.iloc[:9]))
 
 
 def test_a_file_of_another_flight_is_refused(flight: Flight) -> None:
@@ -410,7 +412,7 @@ def test_a_file_of_another_flight_is_refused(flight: Flight) -> None:
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1)
 
     with pytest.raises(MissingDataError, match="does not follow the EKF2 position"):
-        place(flight, recorded(flight_along(other)), frame="enu")
+        align_position_file(flight, recorded(flight_along(other)), frame="enu")
 
 
 @pytest.mark.parametrize("yaw", [None, "auto"])
@@ -419,7 +421,7 @@ def test_a_flight_that_repeats_itself_needs_the_offset(yaw: Any) -> None:
     file = recorded(flight)
     said = r"path leaves the clock open: offsets [1-6]0\.\d s apart fit.*"
     with pytest.raises(MissingDataError, match=said + BOTH_SPANS + r".*Give `clock_offset_s`\.$"):
-        place(flight, file, frame="enu", yaw_deg=yaw)
+        align_position_file(flight, file, frame="enu", yaw_deg=yaw)
     alignment, _ = placed(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
 
@@ -444,7 +446,7 @@ def test_a_flight_that_nearly_repeats_itself_is_warned_of() -> None:
 ])  # fmt: skip
 def test_invalid_options(flight: Flight, options: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingsError) as caught:
-        place(flight, recorded(flight), **options)
+        align_position_file(flight, recorded(flight), **options)
     assert str(caught.value) == message
 
 

@@ -10,7 +10,7 @@ from cli_tools import done, refused
 from flights import aisle_flight
 from pypdf import PdfReader
 
-from px4fuse.answers import MISTAKES, Claim, asked, form_text, read_answers
+from px4fuse.answers import MISTAKES, ClaimedMistake, draw_questions, form_text, read_answers
 from px4fuse.assignment.truth import quantity_truth
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
@@ -48,8 +48,8 @@ def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
     assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)
     assert found.verdict_ours == "overstated"
-    assert Claim("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
-    assert Claim("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
+    assert ClaimedMistake("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
+    assert ClaimedMistake("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_nonsense_is_one_line_that_says_where(tmp_path: Path, text: str, said: s
 
 
 def test_quantities_differ_between_logs_and_are_those_of_a_replay() -> None:
-    drawn = {asked(f"{n:064x}") for n in range(200)}
+    drawn = {draw_questions(f"{n:064x}") for n in range(200)}
     assert len(drawn) == 200
     kinds = {quantity.kind for each in drawn for quantity in each}
     assert kinds == {"gain", "variance", "innovation", "nis", "silence", "gate"}
@@ -102,7 +102,9 @@ def test_quantities_differ_between_logs_and_are_those_of_a_replay() -> None:
 def test_silence_is_predicted_step_by_step() -> None:
     """Against the closed form: P grows by F P Fᵀ + Q for each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
-    quantity = next(q for n in range(99) for q in asked(f"{n:064x}") if q.kind == "silence")
+    quantity = next(
+        q for n in range(99) for q in draw_questions(f"{n:064x}") if q.kind == "silence"
+    )
     settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
     run = replay(main.axis, settings)
     at = run.updates.index[quantity.update - 1]
@@ -129,5 +131,5 @@ def test_the_way_of_a_form(tmp_path: Path, sample_log: Path) -> None:
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)
-    assert results.student.answers.says_none  # type: ignore[union-attr]
+    assert results.student.answers.claims_no_mistake  # type: ignore[union-attr]
     assert any("The form, as it was filled in" in page.extract_text() for page in reader.pages)

@@ -18,7 +18,14 @@ from px4fuse.analysis import explain
 from px4fuse.answers import Answers, read_answers
 from px4fuse.assignment import assignment
 from px4fuse.assignment.assignment import assign, fly, key_path
-from px4fuse.assignment.drawing import CHOICES, COUNTS, EASIEST, HARDEST, LOOPS, draw
+from px4fuse.assignment.drawing import (
+    ASSIGNABLE_MISTAKES,
+    COUNTS,
+    EASIEST_DIFFICULTY,
+    HARDEST_DIFFICULTY,
+    LOOP_SHARE,
+    draw,
+)
 from px4fuse.assignment.key import AnswerKey, key_text, read_key
 from px4fuse.assignment.roster import Person
 from px4fuse.comparison.comparison import compare
@@ -41,7 +48,7 @@ FINDINGS = {
     "ekf2-gate": "ekf2_rejecting", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
-CHOICE = {choice.mistake: choice for kind in CHOICES.values() for choice in kind}
+CHOICE = {choice.mistake: choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind}
 
 
 def chosen(drawn):
@@ -103,12 +110,12 @@ class TestDraw:
             found = sum(len(one.typed) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
         names = {choice.mistake for one in flights for choice in chosen(one)}
-        assert names == {choice.mistake for choice in CHOICES[kind]}
+        assert names == {choice.mistake for choice in ASSIGNABLE_MISTAKES[kind]}
 
     def test_a_mixed_class_has_both_kinds_as_each_would_be_drawn_alone(self):
         mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
-        assert kinds["loop"] / 1000 == pytest.approx(LOOPS, abs=0.05)
+        assert kinds["loop"] / 1000 == pytest.approx(LOOP_SHARE, abs=0.05)
         assert all(one == draw(SECRET, f"s{n}", one.scenario.kind) for n, one in enumerate(mixed))
 
     def test_two_go_together_and_lie_within_their_sizes(self):
@@ -119,7 +126,7 @@ class TestDraw:
             assert first.goes_with(second)
             assert second.goes_with(first)
             parse(drawn.typed)
-            ratios = [EASIEST]
+            ratios = [EASIEST_DIFFICULTY]
             for choice, text in zip(chosen(drawn), drawn.typed, strict=True):
                 if choice.limit is None:
                     assert text == choice.mistake
@@ -132,15 +139,15 @@ class TestDraw:
                     at = float(text.rpartition(",")[2].removesuffix("s"))
                     assert choice.at_s[0] <= at <= choice.at_s[1]
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
-            assert EASIEST <= drawn.difficulty <= HARDEST
-        both = {choice.mistake for choice in CHOICES["aisle"] if choice.either_sign}
+            assert EASIEST_DIFFICULTY <= drawn.difficulty <= HARDEST_DIFFICULTY
+        both = {choice.mistake for choice in ASSIGNABLE_MISTAKES["aisle"] if choice.either_sign}
         assert {name for name, positive in signs if not positive} == both
 
     def test_limits_are_the_smallest_sizes_that_are_found(self):
         """tests/studies/rates.csv: at the limit and beyond in 19 flights of 20, below in fewer."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
-        for choice in (choice for kind in CHOICES.values() for choice in kind):
+        for choice in (choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind):
             plain = re.compile(rf"--mistake {choice.mistake}(=([\d.]+)\D*)?$")
             rows = table[(table.finding == FINDINGS[choice.mistake]) & (table.flights >= 10)]
             matches = ((plain.search(row.condition), row) for row in rows.itertuples())
@@ -157,7 +164,7 @@ class TestDraw:
 
     def test_difficulties_are_spread_over_the_band(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
-        counts, _ = np.histogram(each, bins=4, range=(EASIEST, HARDEST))
+        counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 90
 
 
@@ -255,18 +262,23 @@ class TestAssign:
         assert len(read_key(key_file).answers) == 2
         assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
 
-    def test_what_cannot_be_written_leaves_nothing(self, tmp_path):
+    def test_run_with_blocked_folder_goes_on_in_another(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
             assign(CLASS[:1], folder, key_file, SECRET, "aisle", 2)
         blocked = tmp_path / "file"
         blocked.write_bytes(b"")
-        for where, key in ((folder, blocked / "key.json"), (blocked, tmp_path / "k.json")):
+        kept = tmp_path / "k.json"
+        for where, key, secret in (
+            (folder, blocked / "key.json", SECRET),
+            (blocked, kept, None),
+        ):
             with pytest.raises(OutputError, match="cannot be written"):
-                assign(CLASS[:1], where, key, SECRET, "aisle", 2)
+                assign(CLASS[:1], where, key, secret, "aisle", 2)
         assert not any(path.is_file() for path in folder.rglob("*"))
-        assert not (tmp_path / "k.json").exists()
+        assert stat.S_IMODE(kept.stat().st_mode) == 0o600 or os.name == "nt"
+        assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_key(kept), 1)
 
     def test_place_of_the_key(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

@@ -16,6 +16,7 @@ import pytest
 from patience import patience
 from ulog_tools import Log, make_log, position, seconds_of, selector, stamps, take, topic
 
+from px4fuse.analysis import run_or_judge_aids
 from px4fuse.cli import main
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import LogError, Px4FuseError
@@ -23,6 +24,9 @@ from px4fuse.filter.signals import make_axes
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.inspect.inventory import take_inventory
 from px4fuse.readers import ULOG_MAGIC, read_log
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.build import outcome_results
+from px4fuse.results.contract import to_json
 
 
 def outcome(path: Path) -> Flight | Px4FuseError:
@@ -329,6 +333,39 @@ def test_parameters_that_are_no_numbers(tmp_path, parameter, value):
         assert np.isfinite(track.samples.index).all()
 
 
+@pytest.mark.parametrize(
+    ("parameter", "value", "note"),
+    [
+        ("EKF2_GYR_NOISE", 1e30, "1e+30 rad/s is outside PX4's range 0.0001 to 0.1; "
+         "the default 0.015 is used."),
+        ("EKF2_PREDICT_US", -1.0, "-1 µs is outside PX4's range 1000 to 20000; "
+         "the default 10000 is used."),
+        ("EKF2_EVV_GATE", 0.0, "0 SD is outside PX4's range 1 to 1000; the default 3 is used."),
+        ("EKF2_EV_POS_X", 1e30, "1e+30 m is outside PX4's range -100 to 100; "
+         "the default 0 is used."),
+        ("EKF2_ACC_NOISE", np.nan, "is not a finite number; the default 0.35 is used."),
+        ("SDLOG_PROFILE", np.inf, "is not a finite number and is not used."),
+    ],
+)  # fmt: skip
+def test_parameter_out_of_range_becomes_default_with_note(tmp_path, parameter, value, note):
+    log = rich_log()
+    log.parameters[parameter] = value
+    flight = read_of(log, tmp_path)
+    assert [said for said in flight.log.notes if parameter in said] == [f"{parameter} {note}"]
+    assert flight.log.parameters.get(parameter) != value
+    assert flight.ekf2.step_s == 0.01
+    assert all(aid.parameters.get(parameter) != value for aid in flight.ekf2.aids.values())
+
+
+def test_parameter_at_float32_end_of_range_is_kept(tmp_path):
+    log = make_log("v1.16", 2.0)
+    lowest = float(np.float32(0.01))  # 0.0099999998
+    log.parameters |= {"EKF2_EVP_NOISE": lowest, "EKF2_GYR_NOISE": float(np.float32(0.1))}
+    flight = read_of(log, tmp_path)
+    assert flight.log.parameters["EKF2_EVP_NOISE"] == lowest
+    assert flight.log.notes == ()
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_samples_of_everything(tmp_path, count):
     log = make_log("v1.16", 2.0)
@@ -339,6 +376,57 @@ def test_too_few_samples_of_everything(tmp_path, count):
     else:
         assert result.positions == ()
         assert isinstance(result.imu, Unavailable) == (count == 1)
+
+
+def at_last_stamp(log: Log) -> None:
+    log["estimator_status_flags"]["timestamp"][:] = np.uint64(2**64 - 1)
+    log["estimator_status_flags"]["timestamp_sample"][:] = np.uint64(2**64 - 1)
+
+
+def flags_late(log: Log) -> None:
+    log["estimator_status_flags"]["timestamp"] += np.uint64(60_000_000)
+    log["estimator_status_flags"]["timestamp_sample"] += np.uint64(60_000_000)
+
+
+def one_state(log: Log) -> None:
+    log.topics = [take(one, [0]) if one.name == "estimator_states" else one for one in log.topics]
+
+
+def source_frozen(log: Log) -> None:
+    log["estimator_aid_src_ev_pos"]["innovation"][:] = 0.1
+
+
+def truth_impossible(log: Log) -> None:
+    at = stamps(20.0, 10.0)
+    names = ("x", "y", "z", "vx", "vy", "vz")
+    fields = {name: np.full(len(at), 1e30) for name in names}
+    log.add(topic("vehicle_local_position_groundtruth", at, fields))
+
+
+@pytest.mark.parametrize(
+    "damage", [at_last_stamp, flags_late, one_state, source_frozen, truth_impossible],
+    ids=lambda one: one.__name__,
+)  # fmt: skip
+def test_compare_of_damaged_part_writes_finite_results(tmp_path, damage):
+    """Warnings are errors in these tests."""
+    log = make_log("v1.16", 20.0)
+    damage(log)
+    request = ComparisonRequest(log=str(log.write(tmp_path / "made.ulg")))
+    results = outcome_results(request, run_or_judge_aids(request))
+    assert not re.search(r"\b(nan|inf)\b|e\+[23]\d", to_json(results))
+    if damage is truth_impossible:
+        reason = "vehicle_local_position_groundtruth has no sample"
+        assert any(reason in missing.reason for missing in results.missing)
+
+
+def test_info_of_an_aid_with_one_sample_gives_no_rate(tmp_path):
+    log = make_log("v1.16", 20.0)
+    name = "estimator_aid_src_ev_hgt"
+    log.topics = [take(one, [50]) if one.name == name else one for one in log.topics]
+    flight = read_of(log, tmp_path)
+    aids = next(one for one in take_inventory(flight).abilities if one.name == "aids")
+    assert "external vision, height 1 sample" in aids.reason
+    assert "nan" not in aids.reason
 
 
 @pytest.mark.parametrize("command", ["sync", "tune", "loop"])

@@ -35,17 +35,17 @@ from px4fuse import workers
 from px4fuse.cli.outputs import terminal
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import engine, job, run
-from px4fuse.fleet.engine import connected, outcomes
+from px4fuse.fleet.engine import connect_cluster, run_jobs
 from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
-from px4fuse.fleet.rows import COLUMNS, csv_bytes, log_columns, rows_of, table_of
-from px4fuse.fleet.run import Fleet, kept_in
+from px4fuse.fleet.rows import COLUMNS, axis_rows, csv_bytes, fleet_table, log_columns
+from px4fuse.fleet.run import Fleet, load_cached_rows
 from px4fuse.fleet.terminal import summary
 from px4fuse.report.screen import show
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import schema, to_json
 from px4fuse.results.reading import read_results
-from px4fuse.workers import Failed, run_bounded
+from px4fuse.workers import JobFailure, run_bounded
 
 
 @pytest.fixture(autouse=True)
@@ -150,10 +150,10 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
     assert log_columns(results.log)["date"] == first.loc[0, "date"]
     assert log_columns(beyond)["date"] == ""
     # a clock offset is there where it is determinable
-    rows = rows_of(
+    rows = axis_rows(
         structs.replace(results, clock=structs.replace(results.clock, determinable=False))
     )
-    assert first["clock_offset_s"].tolist() == [results.clock.offset_s] * 4
+    assert first["clock_offset_s"].tolist() == pytest.approx([results.clock.offset_s] * 4)
     assert all("clock_offset_s" not in row for row in rows)
 
     twin = of["twin.ulg"].loc[0]
@@ -181,7 +181,7 @@ def test_the_terminal_counts_what_is_wrong_with_whole_logs(capsys):
 
 
 def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
-    table = table_of([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
+    table = fleet_table([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
     assert table["kf_nis_mean"].isna().all()
     assert table["updates"].isna().tolist() == [False, True]
     head, row, _ = csv_bytes(table).decode("utf-8-sig").splitlines()
@@ -189,7 +189,7 @@ def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
     assert values["name"] == "'=1+1.ulg"
     assert (values["updates"], values["kf_nis_mean"]) == ("3", "")
     # a name that is not UTF-8 has its row
-    table = table_of([{"log": os.fsdecode(b"flight-\xff.ulg"), "status": "failed"}])
+    table = fleet_table([{"log": os.fsdecode(b"flight-\xff.ulg"), "status": "failed"}])
     table.to_parquet(tmp_path / "fleet.parquet")
     assert pd.read_parquet(tmp_path / "fleet.parquet")["log"].item() == "flight-?.ulg"
     assert "flight-?.ulg" in csv_bytes(table).decode()
@@ -240,9 +240,9 @@ def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
     fresh = px4fuse.batch(logs)
     assert_same(table.assign(results=""), fresh)
     # as where another run has other settings
-    monkeypatch.setattr(run, "kept_in", lambda *_: iter(()))
+    monkeypatch.setattr(run, "load_cached_rows", lambda *_: iter(()))
     assert "has replaced its rows" in px4fuse.batch(logs / "f1.ulg", output).loc[0, "reason"]
-    monkeypatch.setattr(run, "kept_in", kept_in)
+    monkeypatch.setattr(run, "load_cached_rows", load_cached_rows)
     # other settings are another comparison
     other = px4fuse.batch(logs / "f1.ulg", output, sigma_z_m=0.2)
     assert other.loc[0, "settings"] == "px4fuse compare LOG --sigma-z 0.2"
@@ -300,7 +300,7 @@ def analysed(log: Path | str, max_bytes: int = 10**9) -> job.Outcome:
 def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypatch):
     log = tmp_path / "f.ulg"
     shutil.copy(flights / "f1.ulg", log)
-    compared = job._compared
+    compared = job._compare_log
 
     def grows(work: Job, path: Path, sha256: str) -> job.Outcome:
         outcome = compared(work, path, sha256)
@@ -310,7 +310,7 @@ def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypa
 
     before = analysed(log)
     assert before.rows[0]["status"] == "done"
-    monkeypatch.setattr(job, "_compared", grows)
+    monkeypatch.setattr(job, "_compare_log", grows)
     (row,) = analysed(log).rows
     assert (row["status"], row["log_sha256"]) == ("failed", before.sha256)
     assert row["reason"] == "it changed while it was read"
@@ -444,9 +444,12 @@ def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
 def test_what_a_cluster_lacks_is_one_line(monkeypatch, flights):
     monkeypatch.setattr(engine, "CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
-        with pytest.raises(SettingsError, match="no Dask scheduler answers"), connected(address):
+        with (
+            pytest.raises(SettingsError, match="no Dask scheduler answers"),
+            connect_cluster(address),
+        ):
             pass
-    with connected() as client:
+    with connect_cluster() as client:
         assert client is None  # none of those is the session's own
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(SettingsError, match=r'pip install "px4fuse\[batch\]"'):
@@ -497,14 +500,14 @@ def a_bad_job_is_lost_alone(address):
     jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
     work = partial(run_bounded, bad_jobs.act, timeout_s=5.0, memory_bytes=2 * 10**9)
     expected = [9, "could not be read (ValueError)", "exit code 3", "longer than 5 s", 16]
-    with Client(address) as client, connected() as same:
+    with Client(address) as client, connect_cluster() as same:
         assert same is client
         found = []
-        for one, result in outcomes(client, work, [*jobs, ("square", 5)]):
+        for one, result in run_jobs(client, work, [*jobs, ("square", 5)]):
             if not found:
                 killed = next(iter(client.run(os.getpid).values()))
                 os.kill(killed, signal.SIGKILL)
-            found.append((one, result.reason if isinstance(result, Failed) else result))
+            found.append((one, result.reason if isinstance(result, JobFailure) else result))
     assert dict(found).keys() == {*jobs, ("square", 5)}
     for one, what in zip(jobs, expected, strict=True):
         assert str(what) in str(dict(found)[one])

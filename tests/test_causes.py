@@ -9,7 +9,7 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.findings import NAMES, Finding, causes
-from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, by_cause
+from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, group_by_cause
 from px4fuse.findings.model import WORDS
 from px4fuse.report.words import verdict_notes
 
@@ -79,7 +79,7 @@ UNDERSTATED, REJECTING = "ekf2_variance_understated", "ekf2_rejecting"
     ],
 )  # fmt: skip
 def test_what_a_cause_brings_with_it_is_told_behind_it(given: Any, told: Any) -> None:
-    assert [(each.id, each.severity, each.caused_by) for each in by_cause(given)] == told
+    assert [(each.id, each.severity, each.caused_by) for each in group_by_cause(given)] == told
 
 
 def test_verdicts_that_could_be_misread_have_a_sentence(sample: Analysis) -> None:

@@ -12,9 +12,9 @@ from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.grading.model import Entry, Graded, Item
-from px4fuse.grading.outputs import FIRST, LAST, csv_text
-from px4fuse.spreadsheet import MAX_CHARACTERS, neutral, neutral_id
+from px4fuse.grading.model import Entry, GradedReport, Item
+from px4fuse.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, csv_text
+from px4fuse.spreadsheet import MAX_CHARACTERS, neutralise_formulas, neutralise_id
 from px4fuse.verification.model import Verdict
 
 VERIFIED = Verdict("verified", (), True)
@@ -30,13 +30,13 @@ texts = (
 finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
 
 
-def entry(graded: Graded, **more) -> Entry:
+def entry(graded: GradedReport, **more) -> Entry:
     values = {"total": graded.points, "of": graded.of} | more
     return Entry(graded.student, graded.student_id, graded, **values)
 
 
 def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1.0) -> Entry:
-    one = Graded(
+    one = GradedReport(
         submission=text, student=text, student_id=text,
         verdict=Verdict("cannot verify", (text, text), with_log=False),
         items=(Item(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
@@ -76,35 +76,52 @@ def test_no_cell_is_live_whatever_the_program_splits_at(text: str) -> None:
 @given(st.lists(st.tuples(texts, st.dictionaries(texts, finite, max_size=3)), max_size=4))
 def test_read_back_it_is_what_was_made_safe(rows: list[tuple[str, dict[str, float]]]) -> None:
     head, *rest = cells(csv_text([graded(text, numbers) for text, numbers in rows]))
-    assert tuple(head[: len(FIRST)]) == FIRST
-    assert tuple(head[-len(LAST) :]) == LAST
+    assert tuple(head[: len(FIRST_COLUMNS)]) == FIRST_COLUMNS
+    assert tuple(head[-len(LAST_COLUMNS) :]) == LAST_COLUMNS
     assert len(rest) == len(rows)
     for (text, numbers), row in zip(rows, rest, strict=True):
         assert len(row) == len(head)
-        said = [neutral(text)] * 2 + [neutral_id(text), "cannot verify", "1", "", "2", "", "1"]
-        assert row[: len(FIRST)] == said
-        both = neutral(f"{text} | {text}")
-        said = [neutral(text), "", "", neutral(text), both, neutral(text), both, "ab" * 32]
-        assert row[-len(LAST) :] == said
-        found = sorted(float(cell) for cell in row[len(FIRST) : -len(LAST)] if cell)
+        said = [neutralise_formulas(text)] * 2 + [
+            neutralise_id(text),
+            "cannot verify",
+            "1",
+            "",
+            "2",
+            "",
+            "1",
+        ]
+        assert row[: len(FIRST_COLUMNS)] == said
+        both = neutralise_formulas(f"{text} | {text}")
+        said = [
+            neutralise_formulas(text),
+            "",
+            "",
+            neutralise_formulas(text),
+            both,
+            neutralise_formulas(text),
+            both,
+            "ab" * 32,
+        ]
+        assert row[-len(LAST_COLUMNS) :] == said
+        found = sorted(float(cell) for cell in row[len(FIRST_COLUMNS) : -len(LAST_COLUMNS)] if cell)
         assert found == pytest.approx(sorted([*numbers.values(), 1.0]), rel=1e-9, abs=1e-300)
 
 
 @given(texts)
 def test_what_is_safe_stays_so(text: str) -> None:
-    once = neutral(text)
-    assert neutral(once).replace("'", "") == once.replace("'", "")
+    once = neutralise_formulas(text)
+    assert neutralise_formulas(once).replace("'", "") == once.replace("'", "")
     assert not may_be_formula(once)
 
 
 def test_every_known_trick_is_stopped_and_what_is_harmless_left_alone() -> None:
     for text in DANGEROUS:
-        assert neutral(text) != text
-        assert not may_be_formula(neutral(text)), text
+        assert neutralise_formulas(text) != text
+        assert not may_be_formula(neutralise_formulas(text)), text
     for text in ("Ada", "Zoë", "李雷", "3 - 2", "a@b.nl", "x=1", "O'Neill", "0012", "", "a; b"):
-        assert neutral(text) == text
+        assert neutralise_formulas(text) == text
     for text in ("0042", "-17", "+49", "a.b@c.de", "s1", "x-y", "日本"):
-        assert neutral_id(text) == text
+        assert neutralise_id(text) == text
 
 
 def test_excel_knows_the_encoding_and_the_line_ends() -> None:
@@ -112,11 +129,11 @@ def test_excel_knows_the_encoding_and_the_line_ends() -> None:
     assert made.encode().startswith(b"\xef\xbb\xbffile,student,")
     assert made.count("\r\n") == made.count("\n") == 2
     (_, row) = cells(made)
-    assert row[len(FIRST) : -len(LAST)] == ["0.3", ""]
+    assert row[len(FIRST_COLUMNS) : -len(LAST_COLUMNS)] == ["0.3", ""]
 
 
 def test_late_pending_and_missing_ones_say_so() -> None:
-    one = Graded("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
+    one = GradedReport("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, pending="Run 0.1.1."), total=None)
     head, *rest = cells(csv_text([late, pending, Entry("C", "-17", None, of=4.0)]))
@@ -128,4 +145,4 @@ def test_late_pending_and_missing_ones_say_so() -> None:
         ["-17", "missing", "", "", "", "", "", "", ""],
     ]
     assert len(cells(csv_text([]))) == 1
-    assert len(neutral("=" * 10**6)) <= MAX_CHARACTERS + 1  # what a cell of Excel takes
+    assert len(neutralise_formulas("=" * 10**6)) <= MAX_CHARACTERS + 1  # what a cell of Excel takes

@@ -29,15 +29,28 @@ from scipy.stats import binom, chi2, ttest_ind
 from px4fuse.arrays import Array
 from px4fuse.comparison import estimates
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import MIN_PARTS, noises_and_clock, with_drift
+from px4fuse.comparison.estimates import MIN_PARTS, noises_and_clock, widen_for_drift
 from px4fuse.filter import clock
-from px4fuse.filter.clock import CHANGE_P, ClockOffset, PartOffset
+from px4fuse.filter.clock import MAX_CHANGE_P, ClockOffset, PartOffset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.likelihood import PROFILE_DROP, profile_interval
-from px4fuse.filter.motion import CONSTANT_SIGMA, START_PRECISION, Signals, motion, signals_of
+from px4fuse.filter.motion import (
+    CONSTANT_SIGMA,
+    START_PRECISION,
+    Signals,
+    make_signals,
+    prepare_motion,
+)
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.origin import ALIGNED, GIVEN_FILE, GNSS, KEPT, MOTION_CAPTURE, with_orientation
+from px4fuse.origin import (
+    ALIGNED,
+    GNSS,
+    LOGGED_BY_EKF2,
+    MOTION_CAPTURE,
+    POSITION_FILE,
+    with_orientation,
+)
 from px4fuse.report.clock import clock_advice
 
 DT = SETTINGS.dt_s
@@ -47,7 +60,7 @@ def estimate(flight: Flight, **options: object) -> ClockOffset | Unavailable:
     segment = Segment(-np.inf, np.inf, "all of it")
     noises = Noises(SIGMA_A, SIGMA_Z)
     track = flight.positions[0]
-    return clock.estimate_clock_offset(flight, track, segment, SETTINGS, noises, **options)
+    return clock.estimate_time_offset(flight, track, segment, SETTINGS, noises, **options)
 
 
 def covers(found: ClockOffset, true_s: float) -> bool:
@@ -72,7 +85,7 @@ def felt(
     # of the attitude, only the beginning is used: what EKF2 made of it later must not matter
     spoiled = Rotation.concatenate([logged[:300], heading(np.full(len(time) - 300, -0.3))])
     imu = imu_table(time, still + np.array(force) - GRAVITY, still + np.array([0.0, 0.0, turn]))
-    return signals_of(imu, attitude_table(time, spoiled), (0.5, 19.0))
+    return make_signals(imu, attitude_table(time, spoiled), (0.5, 19.0))
 
 
 def test_a_level_vehicle_at_rest_accelerates_in_no_direction() -> None:
@@ -115,7 +128,7 @@ def test_legs_are_the_way_beyond_what_the_velocity_makes() -> None:
     )
     measured = np.column_stack([stamps, np.full(len(stamps), np.nan)])
     measured[:5, 0] = np.nan
-    moved = motion(flight, stamps, measured, directions=np.eye(3)[:2], dt_s=DT)
+    moved = prepare_motion(flight, stamps, measured, directions=np.eye(3)[:2], dt_s=DT)
     assert len(moved.signals) == 3
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
     positions = moved.positions(np.array([-0.3, 0.0, 0.21]))
@@ -133,7 +146,7 @@ def test_legs_are_the_way_beyond_what_the_velocity_makes() -> None:
         np.testing.assert_allclose(known, 0.25 * np.arange(len(known)), atol=1e-12)
     assert np.all(np.isnan(positions.measurement_m[:, 1]))
     # a third of them, in every stretch
-    some = moved.thinned(len(moved.time_s) // 3)
+    some = moved.downsample(len(moved.time_s) // 3)
     np.testing.assert_array_equal(some.time_s, moved.time_s[::3])
     assert len(some.edges) == 4
 
@@ -260,7 +273,7 @@ def test_the_profile_of_an_offset_is_that_of_the_joint_normal_distribution(exact
 def test_a_parabola_gives_its_vertex_sigma_and_interval() -> None:
     grid = np.linspace(-0.1, 0.3, 41)
     drop = (grid - 0.123) ** 2 / (2.0 * 0.03**2)
-    assert clock._vertex(grid, drop) == pytest.approx((0.123, 0.03))
+    assert clock._minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
     ends = 0.123 - 1.96 * 0.03, 0.123 + 1.96 * 0.03
     assert profile_interval(grid, drop) == pytest.approx(ends, abs=1e-3)
     # what lies beyond was not looked at
@@ -269,7 +282,7 @@ def test_a_parabola_gives_its_vertex_sigma_and_interval() -> None:
     wider = 0.123 - 2 * 1.96 * 0.03, 0.123 + 2 * 1.96 * 0.03
     assert profile_interval(grid, drop, 4.0 * PROFILE_DROP) == pytest.approx(wider, abs=1e-3)
     # without a minimum the standard deviation is all that was looked at
-    found, sigma = clock._vertex(grid, -((grid - 0.1) ** 2))
+    found, sigma = clock._minimum_and_sigma(grid, -((grid - 0.1) ** 2))
     assert found in (grid[0], grid[-1])
     assert sigma == pytest.approx(0.4)
 
@@ -280,15 +293,15 @@ def test_parts_and_change_are_those_of_their_profiles(monkeypatch, offset_s, fac
     """Profiles that are parabolas, about multiples of the grid's step from the whole's offset."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
-    def fitted(grid: Array, *_: object) -> SimpleNamespace:
+    def fit_noises(grid: Array, *_: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
         return SimpleNamespace(by_stretch=lambda: 0.5 * square[None])
 
-    monkeypatch.setattr(clock, "fitted", fitted)
+    monkeypatch.setattr(clock, "fit_noises", fit_noises)
     moved = SimpleNamespace(
         edges=np.arange(5) * 2, time_s=np.arange(8.0), blocks=lambda grid: grid, weight=None
     )
-    parts, p = clock._parts(moved, offset_s, Noises(0.1, 0.1), factor)
+    parts, p = clock._offset_per_part(moved, offset_s, Noises(0.1, 0.1), factor)
     # the last one says too little
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [part.offset_s for part in parts] == pytest.approx(offset_s + shift[:3])
@@ -311,13 +324,13 @@ def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(monkeypatch) 
         np.testing.assert_allclose(variance, 0.1**2)
         return np.arange(measured.shape[1])[None, :]
 
-    monkeypatch.setattr(clock, "paired_products", products)
+    monkeypatch.setattr(clock, "products_by_stretch", products)
     flight, _ = made_flight()
     samples = flight.positions[0].samples[Columns.POSITION]
     time = samples.index.to_numpy()
-    moved = motion(flight, time, samples.to_numpy(), directions=np.eye(3), dt_s=DT)
-    factor = clock._scatter(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
-    size = clock.REPLICATES
+    moved = prepare_motion(flight, time, samples.to_numpy(), directions=np.eye(3), dt_s=DT)
+    factor = clock._variance_inflation(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
+    size = clock.SIMULATION_COUNT
     assert factor == pytest.approx(1.0 + (size**2 - 1) / 12.0 / 40.0)
     error, dp, dv, speed = given
     joined, length = moved.at(0.0).joined, np.diff(moved.time_s)
@@ -371,7 +384,7 @@ def test_what_is_not_determined_says_why() -> None:
 
 def test_a_jump_in_mid_flight_and_a_drift_show_in_the_parts() -> None:
     found = estimate(made_flight(4, duration_s=120.0, jump_s=-0.25)[0])
-    assert found.change_p < CHANGE_P
+    assert found.change_p < MAX_CHANGE_P
     for part in found.parts:
         true_s = -0.25 if part.start_s > 55.0 else 0.0
         if part.end_s < 60.0 or part.start_s > 55.0:
@@ -380,7 +393,7 @@ def test_a_jump_in_mid_flight_and_a_drift_show_in_the_parts() -> None:
     found = estimate(made_flight(6, duration_s=240.0, drift_ppm=1000.0)[0])
     assert found.drift_ppm == pytest.approx(1000.0, abs=3.0 * found.drift_sigma_ppm)
     assert found.drift_sigma_ppm < 200.0
-    assert found.change_p < CHANGE_P
+    assert found.change_p < MAX_CHANGE_P
 
 
 @pytest.mark.parametrize("hole_s", [0.0, 1.0])
@@ -414,7 +427,9 @@ def test_a_step_between_parts_is_students_t_times_the_places() -> None:
     weight = np.full(len(offset), 1e6)
     places = range(MIN_PARTS, len(offset) - MIN_PARTS + 1)
     told = min(ttest_ind(offset[:at], offset[at:]).pvalue for at in places)
-    assert estimates._step_p(offset, weight) == pytest.approx(told * len(places), rel=1e-9)
+    assert estimates._largest_step_p_value(offset, weight) == pytest.approx(
+        told * len(places), rel=1e-9
+    )
     # parts that scatter less than stated count by what is stated: z, with the same freedom
     sure = np.full(len(offset), 100.0)
     t = min(
@@ -422,7 +437,7 @@ def test_a_step_between_parts_is_students_t_times_the_places() -> None:
         / np.sqrt(1.0 / sure[:at].sum() + 1.0 / sure[at:].sum())
         for at in places
     )
-    assert estimates._step_p(offset, sure) == pytest.approx(
+    assert estimates._largest_step_p_value(offset, sure) == pytest.approx(
         min(1.0, 2.0 * stdtr(len(offset) - 2, t) * len(places))
     )
 
@@ -446,7 +461,13 @@ def stated(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7
 
 @pytest.mark.parametrize(
     ("origin", "drifts"),
-    [(GIVEN_FILE, False), (MOTION_CAPTURE, False), (GNSS, False), (ALIGNED, True), (KEPT, True)],
+    [
+        (POSITION_FILE, False),
+        (MOTION_CAPTURE, False),
+        (GNSS, False),
+        (ALIGNED, True),
+        (LOGGED_BY_EKF2, True),
+    ],
 )
 def test_external_vision_with_an_orientation_that_turns_may_drift(origin, drifts) -> None:
     assert with_orientation(origin, turns=True).may_drift is drifts
@@ -456,7 +477,7 @@ def test_external_vision_with_an_orientation_that_turns_may_drift(origin, drifts
 def test_parts_that_scatter_widen_the_interval_and_are_no_change() -> None:
     """As measured on a VIO whose stamps were right throughout."""
     scattered = stated(-0.013, 0.019, 0.076, 0.031, 0.082, 0.107, -0.077, 0.012, -0.007, -0.024)
-    found = with_drift(scattered)
+    found = widen_for_drift(scattered)
     scatter = found.sigma_s / scattered.sigma_s
     assert scatter == pytest.approx(np.std([p.offset_s for p in found.parts], ddof=1) / 0.02)
     low, high = found.interval_s
@@ -466,14 +487,14 @@ def test_parts_that_scatter_widen_the_interval_and_are_no_change() -> None:
 
 
 def test_parts_as_far_apart_as_their_noise_change_nothing() -> None:
-    found = with_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
+    found = widen_for_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 
 
 def test_what_drift_cannot_imitate_and_what_it_hides() -> None:
-    step = with_drift(stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
+    step = widen_for_drift(stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
     assert step.change_p < 1e-3
-    wide = with_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
+    wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
     assert not wide.determinable
     assert "drifts" in wide.reason
-    assert with_drift(stated(0.0, 0.3)).change_p is None  # two parts show no scatter
+    assert widen_for_drift(stated(0.0, 0.3)).change_p is None  # two parts show no scatter

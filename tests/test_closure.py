@@ -79,7 +79,7 @@ def test_a_cameras_world_becomes_forward_right_down() -> None:
     looking_right = Rotation.from_rotvec([0.0, np.pi / 2, 0.0])  # about the camera's y, down
     rotation = Rotation.concatenate([Rotation.identity(), looking_right, looking_right])
     camera = Trajectory("c", "slam", np.arange(3.0), position, rotation, "camera")
-    found = closure.upright(camera)
+    found = closure.to_z_down(camera)
     assert found.frame == "FRD"
     np.testing.assert_allclose(found.position_m[1], [1.0, 2.0, -3.0])
     nose = found.rotation[1].apply([1.0, 0.0, 0.0])
@@ -89,8 +89,8 @@ def test_a_cameras_world_becomes_forward_right_down() -> None:
 def test_east_north_up_becomes_north_east_down() -> None:
     position = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
     given = Trajectory("m", "truth", np.arange(3.0), position, None, "ENU")
-    found = closure.upright(replace(given, position_variance_m2=position**2))
+    found = closure.to_z_down(replace(given, position_variance_m2=position**2))
     np.testing.assert_allclose(found.position_m[1], [2.0, 1.0, -3.0])
     np.testing.assert_allclose(found.position_variance_m2, found.position_m**2)
     assert found.frame == "NED"
-    np.testing.assert_allclose(closure.in_frame(found, "ENU").position_m, position)
+    np.testing.assert_allclose(closure.from_z_down(found, "ENU").position_m, position)

@@ -132,7 +132,7 @@ def test_what_no_log_tells_of_a_source_can_be_said(sample_flight: Flight) -> Non
         assert (origin.kind, origin.may_drift, origin.is_gnss) == (kind, drifts, slow)
         # it is still what EKF2 took as external vision, with the same numbers
         assert origin.is_vision
-        assert not origin.by_gnss
+        assert not origin.fused_as_gnss
         assert said.horizontal == plain.horizontal
 
 

@@ -50,7 +50,9 @@ def test_a_wrong_variance_is_recovered_as_its_factor(factor: float) -> None:
     result = assessed(white(1, 2000) * np.sqrt(variance), factor * variance)
     assert result.sigma_factor == pytest.approx(factor**0.5, rel=0.04)
     assert result.sigma_factor**2 * result.nis_mean == pytest.approx(1.0)
-    assert result.times_off == pytest.approx(max(result.sigma_factor, 1.0 / result.sigma_factor))
+    assert result.sigma_error_factor == pytest.approx(
+        max(result.sigma_factor, 1.0 / result.sigma_factor)
+    )
     assert result.verdict == f"variance {'overstated' if factor > 1 else 'understated'}"
 
 

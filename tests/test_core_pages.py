@@ -56,7 +56,7 @@ def eventful() -> Analysis:
 
 
 def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Analysis) -> None:
-    said = [artist.get_label() for artist in marks.handles(eventful)]
+    said = [artist.get_label() for artist in marks.legend_entries(eventful)]
     assert said == [
         "flight modes, in turn", "on the ground", "source silent", "log dropout", "EKF2 rejected",
         "outlier", "EKF2 reset", "take-off", "landing",
@@ -64,7 +64,7 @@ def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Analysis) -> N
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.plot([6.0, 94.0], [2.0, 3.0])
     limits = axes.get_xlim(), axes.get_ylim()
-    marks.draw(axes, eventful, strip=True)
+    marks.draw_marks(axes, eventful, strip=True)
     axes.autoscale()
     assert (axes.get_xlim(), axes.get_ylim()) == limits
     axes.lines[0].remove()
@@ -76,13 +76,13 @@ def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Analysis) -> N
     assert {text.get_text() for text in axes.texts} == {"Offboard", "Land"}
     # rejected, outliers, resets, take-off, landing
     assert [len(line.get_xdata()) for line in axes.lines[2:]] == [1, 1, 1]
-    assert set(axes.lines[1].get_xdata()) <= set(marks.outliers(eventful))
+    assert set(axes.lines[1].get_xdata()) <= set(marks.outlier_times(eventful))
 
 
 def test_marks_of_a_long_flight_do_not_pile_up() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
-    kept = marks._apart(time_s, 3600.0 * marks.CLOSEST)
-    assert len(kept) <= 1.0 / marks.CLOSEST + 1.0
+    kept = marks._visible_times(time_s, 3600.0 * marks.MIN_MARK_DISTANCE)
+    assert len(kept) <= 1.0 / marks.MIN_MARK_DISTANCE + 1.0
     assert set(kept) <= set(time_s)
 
 
@@ -94,7 +94,7 @@ def test_the_zoom_is_where_the_filter_is_updated() -> None:
     assert ((updates >= start) & (updates <= end)).sum() == flight.ZOOM_UPDATES + 1
     assert end - start < 4.0  # beside the gap in the middle, not across it
     assert abs((start + end) / 2.0 - 60.0) < 12.5
-    assert "In the 20." in panels.sigma_words(unexplained(comparison), comparison.main)
+    assert "In the 20." in panels.sigma_sentence(unexplained(comparison), comparison.main)
 
 
 @pytest.mark.parametrize("count", [3, 40])

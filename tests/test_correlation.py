@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import f
 
 from px4fuse.trajectory.correlation import autocovariance, moments
-from px4fuse.trajectory.offset import RIVAL_RATIO
+from px4fuse.trajectory.offset import MIN_SECOND_PEAK_RATIO
 
 
 @pytest.mark.parametrize("is_complex", [False, True])
@@ -36,4 +36,4 @@ def test_autocovariance_is_the_sum_of_products() -> None:
 
 
 def test_a_rival_is_what_chance_allows_in_one_of_twenty() -> None:
-    assert pytest.approx(0.05, abs=0.005) == f.sf(RIVAL_RATIO**2, 80, 80)
+    assert pytest.approx(0.05, abs=0.005) == f.sf(MIN_SECOND_PEAK_RATIO**2, 80, 80)

@@ -176,3 +176,13 @@ def test_the_index_shows_the_readme_with_absolute_links() -> None:
     links = re.findall(r"\]\(([^)]+)\)", text)
     assert len(links) == len(re.findall(r"\]\(([^)]+)\)", README)) > 20
     assert all(link.startswith("https://") for link in links)
+
+
+def test_source_distribution_includes_every_top_level_document() -> None:
+    import tomllib
+
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    included = settings["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    documents = {path.name for end in ("*.md", "*.cff", "LICENSE") for path in ROOT.glob(end)}
+    assert documents >= {"README.md", "SECURITY.md", "CONTRIBUTING.md", "CITATION.cff", "LICENSE"}
+    assert documents <= set(included)

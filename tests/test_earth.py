@@ -13,7 +13,7 @@ from px4fuse.flight import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import scenario_of
+from px4fuse.simulation.scenario import make_scenario
 
 # Metres of a degree of latitude and of longitude on WGS84, from a table of both
 DEGREE_M = {0.0: (110_574.0, 111_320.0), 45.0: (111_132.0, 78_847.0), 60.0: (111_412.0, 55_800.0)}
@@ -56,7 +56,7 @@ def test_the_earth_turns_eastwards_once_in_a_sidereal_day() -> None:
 
 def test_a_flight_on_gnss_is_replayed_on_the_earth() -> None:
     """In EKF2's metres inside, in those of the tracks outside; simulated ones are on a sphere."""
-    flight = simulate_flight(scenario_of("outdoor", seed=3), parse(()))
+    flight = simulate_flight(make_scenario("outdoor", seed=3), parse(()))
     assert MODEL_NOTE in flight.log.notes
     flat, round_ = opened(flight), opened(replace(flight, log=replace(flight.log, notes=())))
     known = flight.ekf2.record

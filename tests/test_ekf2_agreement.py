@@ -13,18 +13,21 @@ from exchange import replace
 from findings_tools import NONE, made
 
 from px4fuse.ekf2.replay import (
+    VELOCITY_UPDATE_COLUMNS,
     Agreement,
     AxisAgreement,
     Ekf2Replay,
-    _axis,
-    _verdict,
+    _agreement_verdict,
+    _axis_agreement,
+    _heading_off_deg,
+    _velocity,
     agreement_with_log,
+    inside_spans,
     logged_innovations,
-    match,
-    settled,
-    with_obedient,
+    match_updates,
+    with_logged_rejections,
 )
-from px4fuse.flight import Columns, Ekf2, Unavailable
+from px4fuse.flight import AidLog, Columns, Ekf2, FusionRecord, Unavailable
 
 AID = ("estimator_aid_src_ev_pos",)
 
@@ -37,23 +40,23 @@ def replayed(fused_at: list[float], taken: list[float] | None = None) -> pd.Data
 def test_a_logged_innovation_belongs_to_the_sample_of_its_time():
     """An older topic has none, and repeats the last fusion for half a second."""
     times = np.array([0.9, 0.9941, 1.0, 1.1059, 1.1061, 1.2, 1.3])
-    found = match(replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, own=True)
+    found = match_updates(replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, own=True)
     assert found.tolist() == [-1, 0, 0, 1, -1, 2, -1]
     times = np.array([0.9998, 0.99995, 1.0, 1.5, 1.5001, 2.0, 2.4])
-    found = match(replayed([1.0, 2.0], [0.8, 1.8]), times, own=False)
+    found = match_updates(replayed([1.0, 2.0], [0.8, 1.8]), times, own=False)
     assert found.tolist() == [-1, 0, 0, 0, -1, 1, 1]
 
 
 def test_the_first_five_seconds_of_each_stretch_are_not_judged():
-    replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), carried_s=())
+    replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
     judged = replay.judged_s
     assert judged == ((15.0, 30.0), (45.0, 60.0))
     # nor is what flow alone carried, and what follows it
     carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
-                   carried_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
+                   flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
     assert carried.judged_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
-    assert settled(times, judged).tolist() == [False, True, True, False, False, True, False]
+    assert inside_spans(times, judged).tolist() == [False, True, True, False, False, True, False]
 
 
 def agreeing(
@@ -88,7 +91,7 @@ def agreeing(
 ])  # fmt: skip
 def test_when_a_replay_is_believed(axis, logged, replayed_share, good, says):
     for axes in ({"north": axis, "east": agreeing()}, {"north": agreeing(), "east": axis}):
-        found, reason = _verdict(axes, logged, replayed_share)
+        found, reason = _agreement_verdict(axes, logged, replayed_share)
         assert found is good
         assert says in reason
 
@@ -107,7 +110,7 @@ def test_where_much_is_rejected_the_replay_that_obeys_the_log_decides(axis, good
     obedient = replace(one, north=agreeing(), east=axis, decisions_same=1.0,
                        rejected_share_replayed=0.3)  # fmt: skip
     for all_told in (False, True):
-        found = with_obedient(one, obedient, all_told=all_told)
+        found = with_logged_rejections(one, obedient, has_all_decisions=all_told)
         assert found.good is good
         assert found.reason.startswith("with EKF2's own rejections, ")
         assert (found.decisions_same, found.rejected_share_replayed) == (0.9, 0.2)
@@ -124,7 +127,7 @@ def test_what_an_axis_is_compared_by():
     still = pd.DataFrame(0.0, index=index, columns=Columns.STATE)
     off = still.assign(**{Columns.STATE[1]: [3.0, 4.0, 50.0], Columns.STATE[4]: 0.25})
     replay = SimpleNamespace(published=off, judged_s=((15.0, 20.0),))
-    found = _axis("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
+    found = _axis_agreement("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
     assert found.innovation_correlation == pytest.approx(1.0)
     assert found.innovation_rms_difference == pytest.approx(0.5)
     ratios = found.s_ratio_p5, found.s_ratio_median, found.s_ratio_p95
@@ -133,6 +136,24 @@ def test_what_an_axis_is_compared_by():
     assert found.nis_mean_replayed == pytest.approx(np.mean((nu_log + 0.5) ** 2 / s))
     assert found.position_rms_difference_m == pytest.approx(math.sqrt(12.5))
     assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
+
+
+def test_constant_velocity_innovations_have_no_correlation():
+    """np.corrcoef of a constant is NaN, with a warning."""
+    index = pd.Index(10.0 + np.arange(30.0))
+    updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)
+    columns = [f"{of}_{axis}" for of in ("innovation", "variance") for axis in ["north", "east"]]
+    samples = pd.DataFrame(0.1, index=index, columns=[*columns, "innovation_down", "variance_down"])
+    ekf2 = made(Ekf2, aids={"gnss_vel": made(AidLog, samples=samples)})
+    replay = SimpleNamespace(updates=updates, judged_s=((0.0, 99.0),), other_aid_updates={})
+    assert _velocity(ekf2, replay, own=True) == ({}, True)
+
+
+def test_heading_without_a_logged_state_in_judged_time_is_absent():
+    delayed = pd.DataFrame(index=pd.Index([1.0]))
+    ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
+    replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, judged_s=((5.0, 9.0),))
+    assert _heading_off_deg(ekf2, replay) is None
 
 
 def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
@@ -153,9 +174,13 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
         updates[f"innovation_variance_{axis}_m2"] = 0.01
     updates.loc[updates.index[-1], "rejected"] = 1.0
     replay = SimpleNamespace(
-        updates=updates, published=state, judged_s=((14.5, 999.0),), settings={}, besides={},
-        carried_s=(),
-    )  # fmt: skip
+        updates=updates,
+        published=state,
+        judged_s=((14.5, 999.0),),
+        settings={},
+        other_aid_updates={},
+        flow_only_spans_s=(),
+    )
     return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 
 

@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2 import inputs as inputs_module
 from px4fuse.ekf2.inputs import (
+    FusionRules,
     Inputs,
-    Received,
-    Rules,
-    _decisions,
-    _moved,
-    _source,
-    prepare,
+    ReceivedPositions,
+    _logged_decisions,
+    _position_corrections,
+    _vision_track,
+    prepare_inputs,
     read_vision,
 )
 from px4fuse.ekf2.stretches import (
@@ -35,10 +35,24 @@ from px4fuse.ekf2.stretches import (
     step_ends,
 )
 from px4fuse.ekf2.whatif import sweep_values
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, check, fuses_by_mask, settings_in_force
+from px4fuse.ekf2_parameters import (
+    GNSS_POS,
+    PARAMETERS,
+    check_parameters,
+    fuses_by_mask,
+    settings_in_force,
+)
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Reset, Unavailable
-from px4fuse.origin import ALIGNED, GIVEN_FILE, GNSS, KEPT, MOTION_CAPTURE, RECEIVED, Origin
+from px4fuse.origin import (
+    ALIGNED,
+    GNSS,
+    LOGGED_BY_EKF2,
+    MOTION_CAPTURE,
+    POSITION_FILE,
+    RECEIVED,
+    Origin,
+)
 from px4fuse.trajectory.rotation import matrix
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
@@ -66,11 +80,11 @@ def test_parameters_are_px4s():
 ])  # fmt: skip
 def test_both_ends_of_a_range_are_in_it(name, fits, not_fits):
     for value in fits:
-        assert check({name: value}) == {name: value}
+        assert check_parameters({name: value}) == {name: value}
     for value in not_fits:
         unit = {"EKF2_EVP_GATE": " SD", "EKF2_EV_POS_X": " m"}.get(name, "")
         with pytest.raises(SettingsError, match=rf"{unit} \(default|only 0 and 1"):
-            check({name: value})
+            check_parameters({name: value})
 
 
 def test_a_sweep_has_2_to_200_values():
@@ -89,7 +103,9 @@ def test_a_sweep_has_2_to_200_values():
 @pytest.fixture
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
-    monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Received, stamp_s=None))
+    monkeypatch.setattr(
+        inputs_module, "read_vision", lambda *_: made(ReceivedPositions, stamp_s=None)
+    )
     stretch = made(Stretch, field=None)
     monkeypatch.setattr(inputs_module, "find_stretches", lambda *_, **_more: (stretch,))
 
@@ -106,7 +122,9 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
             step_s=0.01, fusing=fusing, aids={},
         )  # fmt: skip
         imu = pd.DataFrame(index=np.delete(interval_s * np.arange(1000), without))
-        return prepare(made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware)))
+        return prepare_inputs(
+            made(Flight, imu=imu, attitude=imu, ekf2=ekf2, log=log(firmware=firmware))
+        )
 
     return prepared
 
@@ -114,11 +132,11 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 def test_rules_of_the_releases(flown):
     """EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h."""
     new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
-    assert new.rules == Rules(0.2, 0.4, 1.0, 5, None, False)
+    assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
     assert (new.step_s, new.horizon_s, new.predict_s, new.max_interval_s) == (0.01, 0.1, 0.01, 0.25)
     old = flown(EKF2_AID_MASK=8.0, per_step_biases=True)
-    assert old.rules == Rules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
+    assert old.rules == FusionRules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
     assert old.settings["EKF2_EV_DELAY"] == 175.0
     assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)
 
@@ -146,18 +164,18 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
 
 
 @pytest.mark.parametrize(("tracks", "expected"), [
-    ([track("file", GIVEN_FILE), track("vehicle_visual_odometry", RECEIVED)],
+    ([track("file", POSITION_FILE), track("vehicle_visual_odometry", RECEIVED)],
      "vehicle_visual_odometry"),
-    ([track("file", GIVEN_FILE), track("gps", GNSS)], "file"),
+    ([track("file", POSITION_FILE), track("gps", GNSS)], "file"),
     ([track("mocap", MOTION_CAPTURE)], None),
     # copies that the logger did not thin: below 0.9 of its interval, and 4 Hz at least
     ([track(ALIGNED_TOPIC, ALIGNED, 0.179)], ALIGNED_TOPIC),
     ([track(ALIGNED_TOPIC, ALIGNED, 0.181)], None),
-    ([track("estimator_aid_src_ev_pos", KEPT, 0.25)], "estimator_aid_src_ev_pos"),
-    ([track("estimator_aid_src_ev_pos", KEPT, 0.26)], None),
+    ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.25)], "estimator_aid_src_ev_pos"),
+    ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.26)], None),
 ])  # fmt: skip
 def test_the_track_that_ekf2_received_whole(tracks, expected):
-    found = _source(made(Flight, positions=tuple(tracks)))
+    found = _vision_track(made(Flight, positions=tuple(tracks)))
     assert getattr(found, "name", None) == expected
 
 
@@ -188,7 +206,7 @@ def test_a_frame_of_its_own_is_turned_with_its_variance():
         spread = [0.0, 0.04, 0.09] if turned else [0.04, 0.0, 0.09]
         assert_allclose(found.variance_m2, [spread] * 30, atol=1e-12)
         assert_allclose(found.arrival_s - time, np.linspace(0.05, 0.15, 30))
-    copy = track("estimator_aid_src_ev_pos", KEPT)
+    copy = track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2)
     found = read_vision(made(Flight, positions=(copy,)), ekf2, record, facing(90.0))
     assert np.all(found.arrival_s == -np.inf)
 
@@ -213,11 +231,11 @@ def test_what_ekf2_did_with_a_sample_is_found_by_its_time():
         "innovations": {"north": logged}, "horizon_s": 0.1, "step_s": 0.01, "resets": resets,
         "innovation_topics": AID,
     }  # fmt: skip
-    rejected, reset = _decisions(made(Ekf2, **parts), record, stamp)
+    rejected, reset = _logged_decisions(made(Ekf2, **parts), record, stamp)
     assert_array_equal(rejected, [1.0, 1.0, 0.0, np.nan, np.nan, 0.0])
     assert reset.tolist() == [True, False, False, False, True, False]
     for other in ({"innovation_topics": ()}, {"horizon_s": NONE}, {"innovations": {"north": NONE}}):
-        rejected, reset = _decisions(made(Ekf2, **{**parts, **other}), record, stamp)
+        rejected, reset = _logged_decisions(made(Ekf2, **{**parts, **other}), record, stamp)
         assert np.isnan(rejected).all()
         assert not reset.any()
 
@@ -237,7 +255,7 @@ def test_a_reset_of_the_position_is_no_fusion():
 
     def moved(*resets: Reset, rejected: Any = some) -> Any:
         ekf2 = made(Ekf2, state=state, resets=resets, horizon_s=0.2, step_s=0.01)
-        return _moved(ekf2, measured_s, rejected, 0.25)
+        return _position_corrections(ekf2, measured_s, rejected, 0.25)
 
     assert_allclose(moved(reset), 0.0, atol=1e-9)
     assert np.nanmax(moved()) > 1.0

@@ -14,7 +14,7 @@ from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
-from px4fuse.ekf2.inputs import Inputs, Received, Rules
+from px4fuse.ekf2.inputs import FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import (
     FUSE,
     IDLE,
@@ -26,9 +26,17 @@ from px4fuse.ekf2.intervals import (
     make_intervals,
 )
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.recursion import Run, Variant, _Fusion, _in_turn, _limit_bias, _settled, run
+from px4fuse.ekf2.recursion import (
+    StretchRun,
+    Variant,
+    _Fusion,
+    _limit_bias,
+    _sequential_update,
+    _settled_correlation,
+    run_stretch,
+)
 from px4fuse.ekf2.recursion import _measurements as measurements
-from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch, with_field
+from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch, add_field_states
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew
@@ -48,7 +56,7 @@ def test_the_variance_of_a_bias_stays_within_px4s_limits():
 
 
 def test_what_counts_as_measurement_and_noise():
-    vision = made(Received, position_m=np.array([[1.0, 2.0, 3.0]]),
+    vision = made(ReceivedPositions, position_m=np.array([[1.0, 2.0, 3.0]]),
                   variance_m2=np.array([[0.04, 0.0001, 0.0]]))  # fmt: skip
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     stretch = made(Stretch, rotation=np.array([np.eye(3), turned]))
@@ -70,10 +78,20 @@ def test_what_counts_as_measurement_and_noise():
 
 
 def deciding(
-    *, action: int = FUSE, startable: bool = False, gated: bool = True, obeys: bool = False,
-    logged: float = np.nan, logged_reset: bool = False, outside: bool = True, silent_s: float = 0.5,
-    stopped: bool = False, left: int = 5, rules: Rules = RULES, velocity_silent_s: float = 0.0,
-) -> tuple[bool, bool, bool, float, bool, int]:  # fmt: skip
+    *,
+    action: int = FUSE,
+    startable: bool = False,
+    gated: bool = True,
+    obeys: bool = False,
+    logged: float = np.nan,
+    logged_reset: bool = False,
+    outside: bool = True,
+    silent_s: float = 0.5,
+    stopped: bool = False,
+    left: int = 5,
+    rules: FusionRules = RULES,
+    velocity_silent_s: float = 0.0,
+) -> tuple[bool, bool, bool, float, bool, int]:
     """What is rejected, taken and reset at 10 s; then last fusion, whether stopped, resets left."""
     fusion = _Fusion(
         rules, 10.0 - silent_s, action=np.array([[action]]), startable=np.array([[startable]]),
@@ -132,7 +150,7 @@ def test_the_horizon_is_the_length_of_the_buffer(settings, by_delay, timing):
 
 def test_a_release_without_delay_max_has_none():
     rules = replace(RULES, horizon_by_delay=True)
-    received = made(Received, own_times=False)
+    received = made(ReceivedPositions, own_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
     model = made(Model, inputs=inputs, flight=flight)
@@ -166,7 +184,7 @@ def test_states_fused_in_turn_keep_the_innovations_of_before():
     P, nu, R = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 6)), np.full((2, 6), 0.5)
     S = np.diagonal(P, axis1=1, axis2=2)[:, 3:9] + R
     taken = np.array([True, False])
-    x, left = _in_turn(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken[:, None])
+    x, left = _sequential_update(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken[:, None])
     expected, state = P[0], np.zeros(15)
     for told, row in ((3, 6), (4, 7)):
         K = expected[:, row] / S[0, told]
@@ -180,7 +198,7 @@ def test_states_fused_in_turn_keep_the_innovations_of_before():
     assert np.linalg.eigvalsh(left[0]).min() > -1e-9
 
 
-def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> Run:
+def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> StretchRun:
     """:func:`at_rest` on GNSS, with the velocity that each fix has too."""
     speed = np.zeros((len(north_m_s), 3))
     speed[:, 0] = north_m_s
@@ -244,7 +262,7 @@ def test_at_rest_tilt_and_bias_are_known_together():
     deviation = np.sqrt(np.diag(P))
     known = (P / deviation[:, None] / deviation)[:2, 12:14]
     stretch.variance[:] = np.diag(P)
-    found = _settled(stretch)
+    found = _settled_correlation(stretch)
     np.testing.assert_allclose(found[:2, 12:14], known, atol=0.03)
     assert np.abs(known).max() > 0.9
     np.testing.assert_allclose(np.diag(found), 1.0)
@@ -300,10 +318,10 @@ def test_with_a_magnetometer_the_heading_is_told_by_it_and_the_height_is_ekf2s_o
 
 
 def at_rest(
-    measured_m: list[float], down_m: float = 0.0, aid: Aid = EV_POS, rules: Rules = RULES,
+    measured_m: list[float], down_m: float = 0.0, aid: Aid = EV_POS, rules: FusionRules = RULES,
     speed_m_s: Any = None, tilt_rad2: float = np.inf, without: Any = None,
     heading_rad: float = 0.0, field_gauss: Any = None, moved_m: Any = None, **settings: float,
-) -> Run:  # fmt: skip
+) -> StretchRun:  # fmt: skip
     """A level vehicle that stands still at the origin, seen at 10 Hz at these places north."""
     count = 10 * (len(measured_m) + 1)
     flat = np.zeros((count, 3))
@@ -321,11 +339,11 @@ def at_rest(
     if field_gauss is not None:
         at, known = np.arange(7, count, 7), np.append(field_gauss, np.zeros(3))
         gauss = np.tile(field_gauss, (len(at), 1))
-        stretch = with_field(stretch, stretch.time_s[at], gauss, 1.0, known, np.full(6, 1e-8))
+        stretch = add_field_states(stretch, stretch.time_s[at], gauss, 1.0, known, np.full(6, 1e-8))
         stretch.variance[2] = 0.01
     stamp = 10.105 + 0.1 * np.arange(len(measured_m))
     north = np.array(measured_m)
-    vision = Received(
+    vision = ReceivedPositions(
         stamp, np.full(len(stamp), -np.inf), np.column_stack([north, 0.0 * north, 0.0 * north]),
         np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
     )  # fmt: skip
@@ -338,7 +356,7 @@ def at_rest(
     )  # fmt: skip
     intervals = make_intervals(inputs, stretch, Timing(0.0, 0.1))
     variant = Variant(inputs.settings, as_logged=True, without=without or {})
-    return run(inputs, stretch, [variant], [intervals])
+    return run_stretch(inputs, stretch, [variant], [intervals])
 
 
 def test_a_vehicle_at_rest_stays_and_its_variance_is_the_kalman_filters():
@@ -404,12 +422,12 @@ def stretch_of(count: int, *, fusing: bool = True) -> Stretch:
     return made(Stretch, time_s=10.0 + 0.01 * np.arange(count + 1), fusing=fusing)
 
 
-def vision_of(stamps: list[float], age_s: float = 0.0) -> Received:
+def vision_of(stamps: list[float], age_s: float = 0.0) -> ReceivedPositions:
     stamp = np.array(stamps)
-    return made(Received, stamp_s=stamp, arrival_s=stamp + age_s)
+    return made(ReceivedPositions, stamp_s=stamp, arrival_s=stamp + age_s)
 
 
-def acting(stamps: list[float], *, fusing: bool = True, rules: Rules = RULES) -> list[int]:
+def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RULES) -> list[int]:
     stretch = stretch_of(500, fusing=fusing)
     taken = np.array(stamps)
     end = np.searchsorted(stretch.time_s, taken - 1e-9)

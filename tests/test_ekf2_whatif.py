@@ -14,10 +14,10 @@ from findings_tools import NONE, made
 from msgspec import structs
 
 from px4fuse.ekf2 import whatif
-from px4fuse.ekf2.inputs import Inputs, Received
+from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
-from px4fuse.ekf2.stretches import Sensed, Stretch
+from px4fuse.ekf2.stretches import SensorSamples, Stretch
 from px4fuse.ekf2.walk import (
     ATTITUDE,
     FIELD,
@@ -27,11 +27,11 @@ from px4fuse.ekf2.walk import (
     SPEED,
     STEPS,
     Why,
-    _coast,
-    on_the_way,
-    walk,
+    _longest_rejection,
+    explain_by_steps,
+    step_variants,
 )
-from px4fuse.ekf2.whatif import AxisSummary, Summary, _longest, _notes, what_if
+from px4fuse.ekf2.whatif import AxisSummary, Summary, _longest_between_fusions, _notes, what_if
 from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
@@ -69,13 +69,13 @@ def test_side_by_side(model):
 
 def test_without_agreement_there_is_no_what_if_and_no_why(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
-    for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), walk(doubtful)):
+    for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), explain_by_steps(doubtful)):
         assert isinstance(result, Unavailable)
         assert "no reason" in result.reason
 
 
 def test_the_bars_add_up_and_little_is_left(model):
-    for axis in walk(model).values():
+    for axis in explain_by_steps(model).values():
         assert axis.coast is None
         assert tuple(step.name for step in axis.steps) == STEPS
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
@@ -95,7 +95,7 @@ def test_the_bars_add_up_and_little_is_left(model):
 
 def test_a_run_of_another_time_is_not_walked_from(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
-    result = walk(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
+    result = explain_by_steps(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
     assert isinstance(result, Unavailable)
     assert "no time in common" in result.reason
 
@@ -105,11 +105,11 @@ def test_a_run_of_another_time_is_not_walked_from(model):
 
 def test_the_walk_changes_one_thing_after_the_other():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
-    received = made(Received)
+    received = made(ReceivedPositions)
     plain = (made(Stretch, flow=None, heights=None),)
     flight = made(Inputs, settings=flown, step_s=0.01, received=received, stretches=plain)
     ours = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
-    found = list(on_the_way(flight, ours).values())
+    found = list(step_variants(flight, ours).values())
     settings = [one.settings for one in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
@@ -121,19 +121,22 @@ def test_the_walk_changes_one_thing_after_the_other():
     assert [one.as_logged for one in found] == [False] * 6 + [True]
     assert [one.stamp_offset_s for one in found] == [-0.05] + [None] * 6
     gnss = made(
-        Inputs, aid=GNSS_POS, step_s=0.01, received=made(Received, velocity_m_s=np.zeros((1, 3))),
+        Inputs,
+        aid=GNSS_POS,
+        step_s=0.01,
+        received=made(ReceivedPositions, velocity_m_s=np.zeros((1, 3))),
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
         stretches=plain,
-    )  # fmt: skip
-    found = list(on_the_way(gnss, ours).values())
+    )
+    found = list(step_variants(gnss, ours).values())
     assert [one.velocity for one in found] == [False] * 6 + [True] * 2
     assert [one.gated for one in found] == [False] * 7 + [True]
     # the delay was taken from the positions of GNSS that ours is given
     assert found[0].stamp_offset_s == pytest.approx(-0.16)
     assert [one.settings["EKF2_GPS_P_NOISE"] for one in found] == [0.2] * 2 + [0.5] * 6
-    flow = (made(Stretch, flow=made(Sensed), heights=None),)
+    flow = (made(Stretch, flow=made(SensorSamples), heights=None),)
     more = {"stretches": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
-    variants = on_the_way(made(Inputs, **{**vars(gnss), **more}), ours)
+    variants = step_variants(made(Inputs, **{**vars(gnss), **more}), ours)
     assert list(variants)[-5:] == [ATTITUDE, FIELD, SPEED, FLOWING, GATE]
     assert ["mag" in one.without for one in variants.values()] == [True] * 6 + [False] * 4
     assert ["optical_flow" in one.without for one in variants.values()] == [True] * 8 + [False] * 2
@@ -151,13 +154,13 @@ def test_the_longest_run_of_rejections_is_said_with_how_far_it_led():
     away.iloc[:, 0] = np.where(time == 26.5, 3.0, 0.0)
     away.iloc[:, 1] = np.where(time == 26.5, -4.0, np.where(time < 24.0, 99.0, 0.0))
     one = made(Ekf2Replay, updates=updates, delayed=away)
-    found = _coast(one, still, (0.0, 99.0), ((0.0, 99.0),))
+    found = _longest_rejection(one, still, (0.0, 99.0), ((0.0, 99.0),))
     assert (found.start_s, found.samples, found.duration_s) == (24.5, 3, 3.0)
     assert found.distance_m == pytest.approx(5.0)
     # what is not judged, and what nobody rejected
-    early = _coast(one, still, (0.0, 22.0), ((0.0, 99.0),))
+    early = _longest_rejection(one, still, (0.0, 22.0), ((0.0, 99.0),))
     assert (early.start_s, early.samples, early.duration_s) == (21.5, 1, 0.0)
-    assert _coast(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
+    assert _longest_rejection(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
 
 def test_errors_to_the_truth_are_of_its_own_span():
@@ -175,9 +178,9 @@ def test_errors_to_the_truth_are_of_its_own_span():
 
 def test_the_longest_time_without_fusion_counts_both_ends():
     judged = ((15.0, 30.0), (40.0, 60.0))
-    assert _longest(np.array([16.0, 29.0, 41.0, 59.0]), judged) == 18.0
-    assert _longest(np.array([40.0]), judged) == 25.0
-    assert _longest(np.array([16.0]), judged) == 44.0
+    assert _longest_between_fusions(np.array([16.0, 29.0, 41.0, 59.0]), judged) == 18.0
+    assert _longest_between_fusions(np.array([40.0]), judged) == 25.0
+    assert _longest_between_fusions(np.array([16.0]), judged) == 44.0
 
 
 def test_a_summary_joins_north_and_east() -> None:
@@ -252,15 +255,15 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(model, monkeypat
     )  # fmt: skip
     runs: list[tuple[float, int]] = []
 
-    def disturbed(model: object, sigma_m: float, seed: int) -> object:
+    def with_position_noise(model: object, sigma_m: float, seed: int) -> object:
         runs.append((sigma_m, seed))
         return model
 
     def judged(changed: Summary) -> bool:
-        monkeypatch.setattr(whatif, "disturbed", disturbed)
+        monkeypatch.setattr(whatif, "with_position_noise", with_position_noise)
         monkeypatch.setattr(whatif, "replay_settings", lambda _, changes, **_more: changes)
-        monkeypatch.setattr(whatif, "_of_replay", lambda *_: changed)
-        (found,) = whatif._steadied(model, [base], ((0.0, 1.0),), {})
+        monkeypatch.setattr(whatif, "_summarise_replay", lambda *_: changed)
+        (found,) = whatif._mark_unpredictable(model, [base], ((0.0, 1.0),), {})
         return found.steady
 
     assert judged(base)
@@ -278,5 +281,8 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(model, monkeypat
         assert judged(structs.replace(base, **changed)) is steady
     few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
     runs.clear()
-    assert [one.steady for one in whatif._steadied(model, [few, many], (), {})] == [True, False]
+    assert [one.steady for one in whatif._mark_unpredictable(model, [few, many], (), {})] == [
+        True,
+        False,
+    ]
     assert runs == []  # nothing to try

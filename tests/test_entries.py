@@ -10,10 +10,10 @@ import pytest
 from class_tools import graded
 from exchange import replace
 
-from px4fuse.answers import Answers, Claim
+from px4fuse.answers import Answers, ClaimedMistake
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
-from px4fuse.grading.class_page import _boxes
+from px4fuse.grading.class_page import _point_boxes
 from px4fuse.grading.entries import (
     Course,
     class_entries,
@@ -24,7 +24,7 @@ from px4fuse.grading.entries import (
     read_overrides,
 )
 from px4fuse.grading.model import Override, Submission
-from px4fuse.grading.outputs import returned_text
+from px4fuse.grading.outputs import feedback_text
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.grading.submissions import origin_of
 from px4fuse.verification.model import Verdict
@@ -115,7 +115,7 @@ def test_what_is_no_report_counts_only_where_nothing_else_is_there() -> None:
 
 
 def of_form(points: float, kind: str, **more):
-    form = Answers(log_sha256="a" * 64, mistakes=(Claim(kind),))
+    form = Answers(log_sha256="a" * 64, mistakes=(ClaimedMistake(kind),))
     return replace(graded("", points, student_id="1"), form=form, **more)
 
 
@@ -141,7 +141,7 @@ def test_what_is_pending_displaces_no_report_that_counts() -> None:
         assert ada.total == 9.0
         assert [one.submission for one in ada.others] == ["z.pdf"]
         assert ada.flags == ("z.pdf is pending, so that another file counts.",)
-    waiting = replace(files["a.pdf"].items[0], waits=True)  # for the points of the text
+    waiting = replace(files["a.pdf"].items[0], awaits_points=True)  # for the points of the text
     files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
     (ada, _), _ = laid_out(files)
     assert ada.counting.submission == "a.pdf"
@@ -221,7 +221,7 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
     assert (ada.counting.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
     told = ("1 has no item 'C'", "2 has no item 'B'", "nobody has the id 3")
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
-    text, reason = returned_text(ada, "Lab"), "Because. Your instructor: A good idea."
+    text, reason = feedback_text(ada, "Lab"), "Because. Your instructor: A good idea."
     assert f"9.5 of 10  A\n    {reason} (Your instructor gave 9.5" in text
     end = "Total    8 of 20\n\nFrom your instructor:\n\nCome and\nsee me.\nAgreed.\n"
     assert text.endswith(end)
@@ -250,7 +250,7 @@ def test_what_was_said_comes_back_from_the_class_page(tmp_path) -> None:
     rows = said(tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown.")
     entries, notes = laid_out({"1.pdf": TWO["1.pdf"]}, overrides=rows)
     again: dict[str, dict[str, Override]] = {}
-    for _, _, owner, boxes, kept in map(_boxes, entries):
+    for _, _, owner, boxes, kept in map(_point_boxes, entries):
         for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
             if points is not None or comment:
                 again.setdefault(owner, {})[item] = Override(points, comment)
@@ -268,7 +268,7 @@ def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> N
 def test_who_handed_in_nothing_can_be_given_points(tmp_path) -> None:
     (_, grace), notes = laid_out({}, overrides=said(tmp_path, "2,Total,5,Shown in class."))
     assert (grace.total, notes) == (5.0, ())
-    assert "Shown in class." in returned_text(grace)
+    assert "Shown in class." in feedback_text(grace)
     (_, grace), notes = laid_out(TWO_OF_ONE, overrides=said(tmp_path, "2,total,50,"))
     assert (grace.total, len(notes)) == (None, 1)
 

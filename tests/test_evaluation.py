@@ -17,7 +17,7 @@ from trajectory_tools import NAMES, PUBLISHED, SHIFT, TURN, flight, moved, publi
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight import Unavailable
-from px4fuse.trajectory.alignment import AlignmentKind, fit
+from px4fuse.trajectory.alignment import AlignmentKind, fit_alignment
 from px4fuse.trajectory.association import Method, associate
 from px4fuse.trajectory.evaluation import choose_alignment, evaluate
 from px4fuse.trajectory.model import Trajectory
@@ -127,7 +127,7 @@ def test_closed_forms_are_the_minimum(kind: AlignmentKind, unknowns: int) -> Non
         scale = np.exp(p[6]) if unknowns == 7 else 1.0
         return float(((y - scale * turn.apply(x) - p[:3]) ** 2).sum())
 
-    got = fit(x, y, kind)
+    got = fit_alignment(x, y, kind)
     assert got.degrees_of_freedom == unknowns
     ours = float(((y - got.apply(x)) ** 2).sum())
     turns = random.uniform(-3, 3, (8, unknowns - 3))
@@ -147,8 +147,8 @@ def test_a_turn_about_the_line_of_motion_is_refused(noise_m: float) -> None:
     x, y = line(noise_m)
     for kind in ("se3", "sim3"):
         with pytest.raises(TrajectoryError, match=r"along a line.*`alignment` yaw"):
-            fit(x, y, kind)  # type: ignore[arg-type]
-    assert fit(x, y, "yaw").rotation.magnitude() < 0.02
+            fit_alignment(x, y, kind)  # type: ignore[arg-type]
+    assert fit_alignment(x, y, "yaw").rotation.magnitude() < 0.02
 
 
 def test_alignments_without_motion_are_refused() -> None:
@@ -158,13 +158,13 @@ def test_alignments_without_motion_are_refused() -> None:
     around = np.column_stack([np.sin(up[:, 2]), np.cos(up[:, 2]), up[:, 2]])
     for x, y in ((up, up), (up + 0.01 * random.normal(size=up.shape), up + still), (up, around)):
         with pytest.raises(TrajectoryError, match=r"yaw cannot be found.*`alignment` none"):
-            fit(x, y, "yaw")
+            fit_alignment(x, y, "yaw")
     for x, y in ((np.ones((9, 3)), up[:9]), (still, still[::-1].copy() + up)):
         with pytest.raises(TrajectoryError, match="sim3 cannot be found"):
-            fit(x, y, "sim3")
+            fit_alignment(x, y, "sim3")
     with pytest.raises(TrajectoryError, match="Only 2 poses"):
-        fit(up[:2], up[:2], "none")
-    assert fit(up[:9], up[:9] + 1.0, "none").translation_m == (0.0, 0.0, 0.0)
+        fit_alignment(up[:2], up[:2], "none")
+    assert fit_alignment(up[:9], up[:9] + 1.0, "none").translation_m == (0.0, 0.0, 0.0)
 
 
 # -- association -----------------------------------------------------------------------------------

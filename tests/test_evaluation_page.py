@@ -15,13 +15,13 @@ from trajectory_tools import flight, moved
 
 from px4fuse.loop.tracks import read_source
 from px4fuse.report.evaluation import (
-    before_words,
-    distance_words,
     draw,
-    growth_words,
-    quarters,
-    time_words,
-    views,
+    path_views,
+    quarter_rmse,
+    quarters_sentence,
+    rpe_growth_sentence,
+    unaligned_sentence,
+    worst_moments_sentence,
 )
 from px4fuse.report.page import Page
 from px4fuse.report.style import report_style
@@ -93,29 +93,29 @@ def test_before_alignment_the_error_is_that_of_evo_without_alignment() -> None:
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data(sync.associate_trajectories(of_evo(true), of_evo(estimate)))
     rmse = ape.get_statistic(metrics.StatisticsType.rmse)
-    words = before_words(score)
+    words = unaligned_sentence(score)
     assert f"{rmse:.3f} m apart (RMSE)" in words
     assert f"Turned by {np.degrees(0.5):.1f}°" in words
     assert "scaled" not in words
     centre = true.position_m.mean(axis=0) - estimate.position_m.mean(axis=0)
     assert f"moved {np.linalg.norm(centre):.3f} m" in words
     half = moved(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
-    assert "scaled 2 times" in before_words(evaluate(half, true, alignment="sim3"))
+    assert "scaled 2 times" in unaligned_sentence(evaluate(half, true, alignment="sim3"))
 
 
 def test_an_error_that_grows_with_distance_has_the_quarters_of_a_ramp() -> None:
     score = wrong_by(across(np.linspace(0.0, 4.0, 2001)))
     ends = np.arange(5.0)  # ∫ x² dx over a quarter
     expected = np.sqrt((ends[1:] ** 3 - ends[:-1] ** 3) / 3.0)
-    np.testing.assert_allclose(quarters(score), expected, rtol=0.01)
-    assert ", ".join(f"{q:.3f}" for q in quarters(score)) in distance_words(score)
+    np.testing.assert_allclose(quarter_rmse(score), expected, rtol=0.01)
+    assert ", ".join(f"{q:.3f}" for q in quarter_rmse(score)) in quarters_sentence(score)
 
 
 @pytest.mark.parametrize(("error", "share"), [
     (np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%"),
 ], ids=["even", "a peak", "none"])  # fmt: skip
 def test_whether_a_few_moments_decide_is_the_share_of_the_worst_tenth(error, share) -> None:
-    words = time_words(wrong_by(across(error.astype(np.float64))))
+    words = worst_moments_sentence(wrong_by(across(error.astype(np.float64))))
     assert f"makes {share} of the squared error" in words
 
 
@@ -128,11 +128,11 @@ def test_the_growth_of_the_rpe_tells_noise_from_drift(kind: str, times: float) -
         "walk": np.cumsum(rng.normal(0.0, 0.01, (n, 3)), axis=0),
         "scale": 0.05 * line(n).position_m,
     }[kind]
-    words = growth_words(wrong_by(error).rpe)
+    words = rpe_growth_sentence(wrong_by(error).rpe)
     found = re.search(r"From 1 to 10 m, 10 times, the RMSE is ([\d.]+) times as large", words)
     assert float(found[1]) == pytest.approx(times, rel=0.1)
     assert "1 is noise of each pose, 3.2 a random walk, 10 a wrong scale" in words
-    assert "A second distance" in growth_words(wrong_by(error).rpe[:1])
+    assert "A second distance" in rpe_growth_sentence(wrong_by(error).rpe[:1])
 
 
 # -- what is drawn ---------------------------------------------------------------------------------
@@ -148,12 +148,12 @@ def test_a_flat_path_is_seen_from_above_and_another_from_the_side_too(frame, axe
     level[:, vertical] *= 0.01
     for position, count in ((spatial.position_m, 2), (level, 1)):
         one = replace(spatial, position_m=position)
-        seen = views(evaluate(one, one, alignment="none"))
+        seen = path_views(evaluate(one, one, alignment="none"))
         assert (seen[0].across, seen[0].up) == axes
         assert len(seen) == count
-    side = views(evaluate(spatial, spatial, alignment="none"))[1]
+    side = path_views(evaluate(spatial, spatial, alignment="none"))[1]
     assert side.up == vertical
-    assert side.down == (frame in ("NED", "FRD", "camera"))
+    assert side.is_down == (frame in ("NED", "FRD", "camera"))
 
 
 def test_what_is_not_done_has_no_panel() -> None:

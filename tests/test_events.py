@@ -12,10 +12,10 @@ from flights import Estimator, Uwb, aisle_flight
 
 from px4fuse.alignment.joining import join
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.events import happened, source_gaps
+from px4fuse.comparison.events import collect_events, source_gaps
 from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
 from px4fuse.readers import read_log
-from px4fuse.readers.parts import stretches_of_modes
+from px4fuse.readers.parts import mode_spans
 from px4fuse.recording import Dropout
 
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
@@ -44,7 +44,7 @@ def test_a_recording_tells_the_same_modes(sample_flight: Flight, sample_log: Pat
 
 def test_stretches_join_what_is_the_same_and_never_overlap() -> None:
     names = pd.Series(["a", "a", "b", "c", "a"], index=[-3.0, 1.0, 2.0, 1.5, 6.0])
-    assert stretches_of_modes(names, 8.0) == (
+    assert mode_spans(names, 8.0) == (
         FlightMode(0.0, 2.0, "a"), FlightMode(2.0, 6.0, "c"), FlightMode(6.0, 8.0, "a"),
     )  # fmt: skip
 
@@ -64,7 +64,7 @@ def test_all_that_happened_is_listed_and_cut_to_the_segment() -> None:
     )  # fmt: skip
     flight = replace(flight, airborne=((20.0, 70.0), (80.0, 99.0)), modes=MODES)
     comparison = compare(flight, start_s=10.0, end_s=90.0)
-    found = happened(comparison)
+    found = collect_events(comparison)
     ((start, end),) = found.gaps
     assert (start, end) == pytest.approx((60.0, 65.0), abs=0.21)
     assert found.dropouts == ((10.0, 11.0), (50.0, 50.5))
@@ -76,7 +76,7 @@ def test_all_that_happened_is_listed_and_cut_to_the_segment() -> None:
 
 def test_rejections_are_of_each_axis() -> None:
     comparison = compare(aisle_flight(ekf2=Estimator(rejected_share=0.2)))
-    found = happened(comparison)
+    found = collect_events(comparison)
     for result in comparison.axes.values():
         frame = result.ekf2_innovations
         assert list(found.rejected_s[result.axis.name]) == list(frame.index[frame["rejected"] > 0])
@@ -86,8 +86,8 @@ def test_rejections_are_of_each_axis() -> None:
 def test_what_is_not_logged_is_not_marked() -> None:
     flight = aisle_flight(ekf2=None)
     absent = Unavailable("land detector", "no topic", "Record it.")
-    found = happened(compare(replace(flight, airborne=absent)))
+    found = collect_events(compare(replace(flight, airborne=absent)))
     assert (found.gaps, found.dropouts, found.ground, found.modes) == ((), (), (), ())
     assert (found.take_off_s, found.resets_s, dict(found.rejected_s)) == ((), (), {})
     never = compare(replace(flight, airborne=()))
-    assert happened(never).ground == ((never.segment.start_s, never.segment.end_s),)
+    assert collect_events(never).ground == ((never.segment.start_s, never.segment.end_s),)

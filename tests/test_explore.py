@@ -22,15 +22,12 @@ from flights import Imu, aisle_flight, unexplained
 
 from px4fuse.analysis import Analysis, run_comparison
 from px4fuse.cli.compare import compare as compare_command
-from px4fuse.cli.inputs import comparison_request, read_person
+from px4fuse.cli.inputs import comparison_request, read_student
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FILTERS, AxisComparison
-from px4fuse.ekf2.model import replay_settings
-from px4fuse.ekf2.whatif import what_if
 from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import within
 from px4fuse.flight import Flight
 from px4fuse.request import ComparisonRequest
 
@@ -113,7 +110,7 @@ def of_command(page: Browser, sample_log: Path) -> ComparisonRequest:
         given = dict(context.params)
         for name in ("output", "json_path", "fail_on", "checks"):
             given.pop(name)
-        read_person(given)
+        read_student(given)
         given.pop("log")
         return comparison_request(sample_log, given)
 
@@ -192,14 +189,11 @@ def test_buttons(page: Browser, explored: tuple[Path, Analysis]) -> None:
 
 
 def test_a_bad_address_or_number_is_refused_in_words(page: Browser) -> None:
-    page.ask(
-        "location.hash = '#sigma-a=-1&sigma-z=0.2&dt=abc&axis=<b>&input=gps&EKF2_EVP_NOISE=0.123"
-        "&view=nowhere'"
-    )
+    page.ask("location.hash = '#sigma-a=-1&sigma-z=0.2&dt=abc&axis=<b>&input=gps&view=nowhere'")
     settle(page)
     said = "document.getElementById('said').textContent"
     assert page.ask(said) == (
-        "The address has no usable sigma-a, dt, axis, input, EKF2_EVP_NOISE, view: left as it was."
+        "The address has no usable sigma-a, dt, axis, input, view: left as it was."
     )
     page.ask(
         "(() => { const n = document.getElementById('sigma-z-value'); n.value = '500';"
@@ -260,51 +254,6 @@ def test_findings_and_buttons_move_all_plots(page: Browser) -> None:
     page.call("Input.dispatchKeyEvent", type="keyDown", key="+", text="+")
     settle(page)
     assert page.ask(span) != whole
-
-
-def test_ekf2_at_a_stop_is_what_whatif_says(page: Browser, explored: tuple[Path, Analysis]) -> None:
-    model = explored[1].ekf2_model
-    changes = {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_DELAY": 200.0, "EKF2_EVP_GATE": 3.0}
-    asked = what_if(model, [changes])
-    (told,) = asked.whatif
-    page.click("#axes input[value=north]")
-    for name, value in changes.items():
-        page.ask(
-            f"(() => {{ const node = document.getElementById('{name}');"
-            f"const stop = [...Array(Number(node.max) + 1).keys()].find((at) => {{ node.value = at;"
-            "node.dispatchEvent(new Event('input'));"
-            f"return parseFloat(node.previousElementSibling.textContent) === {value}; }});"
-            "if (stop === undefined) throw new Error('no such stop'); })()"
-        )
-    settle(page)
-    shown = page.ask(TABLE)
-    north = told.axes["north"]
-    assert shown["Mean NIS (1 is consistent)"][1] == f"{north.nis_mean:.2f}"
-    assert shown["Measurements"][1] == str(told.samples)
-    assert shown["Position: RMS to truth"][1] == f"{north.position_rmse_to_truth_m:.3f} m"
-    said = page.ask("document.getElementById('grid-said').textContent")
-    assert told.rejected_share > 0.05
-    assert said.startswith(f"{100 * told.rejected_share:.1f} % rejected, {told.resets} reset")
-    counts = ask(
-        page,
-        "Explore.then((e) => e.model('strip-source-0').data.row"
-        ".filter((row) => row === 'EKF2 rejected').length)",
-    )
-    (replay,) = replay_settings(model, [changes])
-    segment = explored[1].segment
-    assert counts == within(replay.updates, segment)["rejected"].sum()
-    drawn = ask(
-        page, "Explore.then((e) => Array.from(e.model('innovation:rejected-source-0').data.nu))"
-    )
-    expected = within(replay.updates, segment)
-    nu = expected["innovation_north_m"][expected["rejected"] > 0]
-    np.testing.assert_allclose(drawn, nu, rtol=0.0, atol=6e-4)
-    page.click("#axes input[value=down]")
-    settle(page)
-    assert "no height" in page.ask("document.getElementById('grid-said').textContent")
-    page.click("#other-ekf2")
-    settle(page)
-    assert page.ask(TABLE)["Measurements"][1] != str(told.samples)
 
 
 def test_the_pointer_tells_values_and_the_dark_has_its_colours(page: Browser) -> None:

@@ -18,8 +18,8 @@ from flights import Imu, Uwb, aisle_flight
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
-from px4fuse.explore.data import OFFSET_REACH_S, raw_source, signals_of
-from px4fuse.explore.packing import FINE, Packer
+from px4fuse.explore.data import OFFSET_REACH_S, raw_source, replay_signals
+from px4fuse.explore.packing import FINE_SCALE, Packer
 from px4fuse.filter.kalman import Replay, replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes
@@ -76,7 +76,7 @@ def in_browser(
     engine: Browser, comparison: Comparison, tries: list[tuple[int, Settings]]
 ) -> list[dict[str, dict[str, list[float]]]]:
     packer = Packer()
-    flight = signals_of(comparison, packer)
+    flight = replay_signals(comparison, packer)
     asked = [
         (at, {"sigmaA": one.sigma_a_m_s2, "sigmaZ": one.sigma_z_m, "dt": one.dt_s,
               "input": one.input, "offset": one.clock_offset_s})
@@ -168,7 +168,7 @@ def test_arrays_come_back_as_they_went(engine: Browser) -> None:
     )
     for back, values in zip(made, given, strict=False):
         # half a step, of which very large numbers have fewer
-        step = 1.0 / FINE if np.max(np.abs(values), initial=0.0) < 1e5 else 1e-6
+        step = 1.0 / FINE_SCALE if np.max(np.abs(values), initial=0.0) < 1e5 else 1e-6
         np.testing.assert_allclose(back, values, rtol=0.0, atol=step)
     assert made[-1] == [0.1, 0.2, 123.456789]
 
@@ -176,7 +176,7 @@ def test_arrays_come_back_as_they_went(engine: Browser) -> None:
 def test_too_few_measurements_give_no_replay(engine: Browser) -> None:
     comparison = compare(aisle_flight(duration_s=30.0))
     packer = Packer()
-    flight = signals_of(comparison, packer)
+    flight = replay_signals(comparison, packer)
     flight["segment"] = [flight["segment"][0], flight["segment"][0] + 0.05]
     flight["axes"] = [{"time": [0.0, 1.0, 2.0], "z": [0.0, 0.0, 0.0]}]
     settings = {"sigmaA": 0.5, "sigmaZ": 0.1, "dt": 0.1, "input": "zero", "offset": 0.0}

@@ -13,15 +13,13 @@ from browser import Browser
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis, run, run_comparison
-from px4fuse.comparison.interventions import beyond_claim
-from px4fuse.ekf2.model import replay_settings
+from px4fuse.comparison.interventions import error_beyond_reported_sigma
 from px4fuse.explore.page import html_text
-from px4fuse.filter.kalman import replay, state_at
+from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import within
 from px4fuse.findings import find
 from px4fuse.findings.story import story
-from px4fuse.plain import length_words, number_words
+from px4fuse.plain import format_length, format_number
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -117,7 +115,7 @@ def test_the_words_follow_the_knobs_and_their_cure_was_replayed(
     told = text(page, "live")
     ours = analysis.main.filters["kf"]
     assert told.startswith(
-        f"Along the aisle our filter is {length_words(ours.truth.position_rmse_m)} from the truth "
+        f"Along the aisle our filter is {format_length(ours.truth.position_rmse_m)} from the truth "
         "(RMS) and 9 % too modest; EKF2 is 6 cm from the truth and is honest about it."
     )
     assert told.split("; EKF2")[0].split("our filter is ")[1] == (
@@ -127,12 +125,12 @@ def test_the_words_follow_the_knobs_and_their_cure_was_replayed(
     told = text(page, "live")
     now = Settings(sigma_a_m_s2=0.002, sigma_z_m=0.05)
     nis = nis_with(analysis, now)
-    assert f"{number_words(nis**0.5, 2)} times too sure of itself" in told
+    assert f"{format_number(nis**0.5, 2)} times too sure of itself" in told
     cure = re.search(r"nearest comes SIGMA_A ([\d.]+) \(mean NIS ([\d,]+) → ([\d.]+)\)", told)
-    assert cure[2] == number_words(nis, 2)
+    assert cure[2] == format_number(nis, 2)
     cured = nis_with(analysis, Settings(sigma_a_m_s2=float(cure[1]), sigma_z_m=0.05))
-    assert cure[3] == number_words(cured, 2)
-    assert f"ours {number_words(nis, 2)} (understated" in text(page, "read-0")
+    assert cure[3] == format_number(cured, 2)
+    assert f"ours {format_number(nis, 2)} (understated" in text(page, "read-0")
     hand = page.ask("document.querySelector('#needle-0 .hand.ours').style.left")
     assert hand == "100%"
 
@@ -142,9 +140,9 @@ def test_an_error_that_innovations_hide_is_told_by_what_the_filter_claims(
 ) -> None:
     put(page, offset=0.3)
     shifted = _shifted(explored[1], 0.3)
-    hidden = beyond_claim(shifted.axes["aisle"].filters["kf"])
+    hidden = error_beyond_reported_sigma(shifted.axes["aisle"].filters["kf"])
     assert hidden is not None
-    error, claimed = length_words(hidden.rmse_m), length_words(hidden.claimed_m)
+    error, claimed = format_length(hidden.rmse_m), format_length(hidden.reported_sigma_m)
     assert f"our filter is {error} from the truth (RMS) and claims {claimed};" in text(page, "live")
 
 
@@ -171,48 +169,31 @@ def test_findings_of_the_settings_follow_and_the_others_stay(
     assert browser.complaints() == []
 
 
-def test_ekf2s_knobs_move_its_position_and_its_sigma(
-    page: Browser, explored: tuple[Path, Analysis]
-) -> None:
-    analysis = explored[1]
-    model = analysis.ekf2_model
-    page.ask("location.hash = '#EKF2_EVP_NOISE=0.4&EKF2_EV_DELAY=100&axis=north&view=track'")
-    settle(page)
-    (done,) = replay_settings(model, [{"EKF2_EVP_NOISE": 0.4, "EKF2_EV_DELAY": 100.0}])
-    rows = within(done.updates, analysis.segment)
-    times = rows.index.to_numpy()
-    for view, name, column, expected in (
-        ("track", "position:state", "p",
-         np.interp(times, done.published.index, done.published["north_m"])),
-        ("track", "velocity:state", "v",
-         np.interp(times, done.published.index, done.published["north_m_s"])),
-        ("filter", "sigma_p:variance", "sp", np.sqrt(rows["position_variance_north_m2"])),
-        ("filter", "sigma_v:variance", "sv", np.sqrt(rows["velocity_variance_north_m2_s2"])),
-    ):  # fmt: skip
+def test_ekf2_curves_equal_the_log(page: Browser, explored: tuple[Path, Analysis]) -> None:
+    result = explored[1].main
+    state, variance = result.ekf2_state.dropna(), result.ekf2_variance.dropna()
+    for view, name, column, logged in (
+        ("track", "position:state", "p", state["position_m"]),
+        ("track", "velocity:state", "v", state["velocity_m_s"]),
+        ("filter", "sigma_p:variance", "sp", variance["position_variance_m2"].pow(0.5)),
+        ("filter", "sigma_v:variance", "sv", variance["velocity_variance_m2_s2"].pow(0.5)),
+    ):
         open_view(page, view)
-        data = f"e.model('{name}-source-0').data.{column}"
-        drawn = ask(page, f"Explore.then((e) => Array.from({data}))")
-        np.testing.assert_allclose(drawn, expected, rtol=0.0, atol=3e-3)
-    result = next(one for one in analysis.axes.values() if one.axis.name == "north")
-    ours = replay(result.axis, analysis.settings)
-    shown = page.ask(
-        "[...document.querySelectorAll('#tables tbody tr')].map((row) =>"
-        "[row.cells[0].textContent, row.cells[1].textContent])"
-    )
-    # between ours and this EKF2, no longer the logged one
-    position, _ = state_at(ours, times)
-    apart = position - np.interp(times, done.published.index, done.published["north_m"])
-    told = float(dict(shown)["Position: RMS to EKF2"].split()[0])
-    assert told == pytest.approx(np.sqrt(np.nanmean(apart**2)), abs=2e-3)
-    address = page.ask("location.hash")
-    assert "EKF2_EVP_NOISE=0.4" in address
-    assert "EKF2_EV_DELAY=100" in address
+        data = f"e.model('{name}-source-0').data"
+        lists = f"[Array.from({data}.t), Array.from({data}.{column})]"
+        drawn = ask(page, f"Explore.then((e) => {lists})")
+        assert len(drawn[0]) > 100
+        expected = np.interp(drawn[0], logged.index, logged)
+        np.testing.assert_allclose(drawn[1], expected, rtol=0.0, atol=2e-6)
+    rejected = "e.model('strip-source-0').data.row.filter((row) => row === 'EKF2 rejected').length"
+    count = ask(page, f"Explore.then((e) => {rejected})")
+    assert count == (result.ekf2_innovations["rejected"] > 0).sum()
 
 
 def test_the_address_restores_every_knob(page: Browser, explored: tuple[Path, Analysis]) -> None:
     wanted = (
         "#axis=east&input=zero&sigma-a=0.7&sigma-z=0.07&dt=0.05&clock-offset=-0.1"
-        "&EKF2_EVP_NOISE=0.05&EKF2_EV_DELAY=50&EKF2_EVP_GATE=3&view=step&measurement=17"
+        "&view=step&measurement=17"
     )
     page.ask(f"location.hash = {json.dumps(wanted)}")
     settle(page)
@@ -224,7 +205,6 @@ def test_the_address_restores_every_knob(page: Browser, explored: tuple[Path, An
     assert {*wanted[1:].split("&")} == {*address[1:].split("&")}
     assert page.ask("document.getElementById('sigma-z-value').value") == "0.07"
     assert page.ask("document.querySelector('[name=input][value=zero]').checked")
-    assert text(page, "EKF2_EVP_GATE-value") == "3 SD"
     assert text(page, "now-0").startswith("Measurement 17 of")
 
 
@@ -306,7 +286,7 @@ def test_the_tour_from_end_to_end(page: Browser, explored: tuple[Path, Analysis]
     assert a == 0.002
     told = re.search(r"mean NIS goes from ([\d.]+) to ([\d.,]+)\.", forgotten)
     with_clock = _shifted(analysis, seen[0][4])
-    assert told[2] == number_words(nis_with(with_clock, Settings(a, z)), 2)
+    assert told[2] == format_number(nis_with(with_clock, Settings(a, z)), 2)
     _, _, a, z, _ = seen[3]
     size = re.search(r"NIS from ([\d.]+) to ([\d.]+), a ninth", seen[3][1])
     assert float(size[2]) == pytest.approx(float(size[1]) / 9.0, rel=0.1)

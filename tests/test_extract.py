@@ -23,7 +23,7 @@ from px4fuse.inspect import tables as extraction
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout, InputFile
 from px4fuse.simulation.flights import simulate, to_ulog
-from px4fuse.simulation.scenario import scenario_of
+from px4fuse.simulation.scenario import make_scenario
 
 # As it stands in the documentation: the lesson's Example 1 on one's own flight
 PAGE = (REPOSITORY / "docs" / "python.md").read_text(encoding="utf-8")
@@ -92,7 +92,7 @@ def test_innovations_are_one_tidy_table(written, sample_flight):
 
 def test_those_of_a_flight_on_gnss_are_of_gnss(tmp_path):
     log = tmp_path / "o.ulg"
-    log.write_bytes(to_ulog(simulate(scenario_of("outdoor", passes=1, length_m=10.0))))
+    log.write_bytes(to_ulog(simulate(make_scenario("outdoor", passes=1, length_m=10.0))))
     assert "external vision" not in extract(log, "-o", tmp_path / "o")
     flight = json.loads((tmp_path / "o" / "flight.json").read_text())
     assert flight["streams"]["ekf2_innovations"]["topics"] == ["estimator_aid_src_gnss_pos"]

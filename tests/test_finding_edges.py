@@ -35,10 +35,10 @@ from findings_tools import (
 )
 
 from px4fuse.comparison import remedy as remedies
-from px4fuse.filter.causes import Estimate, Explained
-from px4fuse.filter.coloured import Coloured, Smoothing
+from px4fuse.filter.causes import BiasScaleJumpFit, Estimate
+from px4fuse.filter.coloured import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.heading import HeadingError, HeadingPart
-from px4fuse.filter.heading import turned as together
+from px4fuse.filter.heading import combine_heading_parts as together
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import Noise
@@ -59,9 +59,9 @@ from px4fuse.findings import (
     source_positions,
     source_stamps,
 )
-from px4fuse.findings.model import moments, share_on, spans_at
+from px4fuse.findings.model import fraction_on, moments, spans_at
 from px4fuse.flight import Columns, FusionRecord, Reset, Unavailable
-from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED
+from px4fuse.origin import ALIGNED, FROM_INNOVATIONS, GNSS, LOGGED_BY_EKF2, MOTION_CAPTURE, RECEIVED
 from px4fuse.recording import Dropout
 
 
@@ -92,8 +92,8 @@ def test_when_a_finding_shows(spans: Any, said: str) -> None:
 
 def test_the_share_of_a_step_function_counts_its_first_value_before_it_begins() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
-    assert share_on(flag, whole) == 0.5
-    assert share_on(flag, Segment(25.0, 35.0, "")) == 0.5
+    assert fraction_on(flag, whole) == 0.5
+    assert fraction_on(flag, Segment(25.0, 35.0, "")) == 0.5
     assert spans_at(0.0, flag, whole) == ((30.0, 80.0),)
     assert spans_at(1.0, flag, whole) == ((10.0, 30.0), (80.0, 110.0))
     assert spans_at(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
@@ -166,7 +166,7 @@ UNKNOWN = "the log does not show why"
         (never(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
         (never(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # such a release has no limit
         (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "come every 0.50 s", "10 Hz"),
-        (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=KEPT), UNKNOWN, "Check"),
+        (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2), UNKNOWN, "Check"),
         (never(5.0, parameters={"EKF2_EV_CTRL": 15.0}), UNKNOWN, "Check"),
         (never(age_s=0.29), UNKNOWN, "Check"), (never(age_s=5.0, horizon_s=NONE), UNKNOWN, "Check"),
         (never(age_s=0.31), "arrive 0.31 s after their stamps, and EKF2 keeps no more than 0.20 s",
@@ -269,7 +269,7 @@ def test_what_a_turn_and_shift_of_the_frame_leaves(left: float, frame: bool, dri
 def test_when_the_imu_is_missing(ends: Any, segment: Any, spans: Any) -> None:
     """Inside, at the ends by more than a moment, and not outside the segment."""
     time = np.concatenate([np.arange(ends[0], 40.0, 0.01), np.arange(42.0, ends[1], 0.01)])
-    found = imu._spans(pd.DataFrame(index=time), Segment(*segment, ""))
+    found = imu._gap_spans(pd.DataFrame(index=time), Segment(*segment, ""))
     assert len(found) == len(spans)
     assert not spans or np.allclose(found, spans, atol=0.02)
 
@@ -306,7 +306,7 @@ def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated:
         Unavailable("it", "it was off", "Do.", source="vehicle_visual_odometry"),
     )
     profile = log(parameters={"SDLOG_PROFILE": 2.0})
-    for origin in (ALIGNED, KEPT, REBUILT):
+    for origin in (ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS):
         of = source(name=name, origin=origin, rate_hz=rate_hz)
         found = list(missing.source_as_sent(analysis(source=of, missing=lacks, log=profile)))
         assert [one.id for one in found] == ["source_not_logged", "source_decimated"][
@@ -374,25 +374,29 @@ def test_a_frame_that_is_not_north(until_s: float, expected: str) -> None:
         assert ("the ULog says" in finding.remedy) is has_ulog
 
 
-def turned(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
+def combine_heading_parts(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
     parts = (HeadingPart(10.0 * n, 10.0 * n + 10.0, d, sigma_deg) for n, d in enumerate(degrees))
     return together(tuple(parts), p, "positions")
 
 
 def test_a_turn_is_told_with_its_interval_and_undone_by_its_opposite() -> None:
-    finding = only(source_frame.detect, analysis(heading=turned(20.0, sigma_deg=2.0)))
+    finding = only(
+        source_frame.detect, analysis(heading=combine_heading_parts(20.0, sigma_deg=2.0))
+    )
     assert finding.id == "source_frame_turned"
     assert "turned by +20° ± 4° (clockwise" in finding.message
     assert "Turn the positions by -20°" in finding.remedy
     aligned = source(name="estimator_visual_odometry_aligned")
     for has_ulog in (True, False):
-        one = analysis(heading=turned(20.0), source=aligned, log=log(has_ulog=has_ulog))
+        one = analysis(
+            heading=combine_heading_parts(20.0), source=aligned, log=log(has_ulog=has_ulog)
+        )
         assert only(source_frame.detect, one).id == "ekf2_heading_wrong"
         assert ("EKF2_EV_CTRL bit 3" in only(source_frame.detect, one).remedy) is has_ulog
 
 
 def test_a_heading_that_drifts_is_told_from_end_to_end() -> None:
-    finding = only(source_frame.detect, analysis(heading=turned(2.0, 30.0, p=0.0)))
+    finding = only(source_frame.detect, analysis(heading=combine_heading_parts(2.0, 30.0, p=0.0)))
     assert finding.id == "ekf2_heading_wrong"
     assert "lies at +2° from 0 to 10 s and at +30° from 10 to 20 s" in finding.message
     assert "by the positions and the IMU" in finding.message
@@ -420,35 +424,68 @@ def moved(extent_m: float) -> Any:
 
 FUSED, FRAME = ekf2_not_fusing.detect, source_frame.detect
 EDGES = [
-    (missing.innovations, decimated(75), None), (missing.innovations, decimated(74), "info"),
+    (missing.innovations, decimated(75), None),
+    (missing.innovations, decimated(74), "info"),
     # motion capture; with external vision beside it, it is an independent reference
     (FUSED, beside_vision("vehicle_mocap_odometry", 0.0), "warning"),
     (FUSED, beside_vision("vehicle_mocap_odometry", 1.0), None),
     (FUSED, beside_vision("GPS", 0.0), None),
-    *((hidden_errors.detect, analysis(axes=(hiding(nis, nees),)), expected)
-      for nis, nees, expected in (
-          (1.0, 4.0, "warning"), (1.0, 3.99, None), (1.49, 4.0, "warning"), (1.5, 4.0, None),
-          (1.0, 15.9, "warning"), (1.0, 16.0, "error"), (1.0, None, None))),
-    *((imu.gaps, analysis(axes=(axis(replay=SimpleNamespace(input_gap_s=gap_s)),),
-                          flight={"imu": at_rate(rate_hz)}), expected)
-      for gap_s, rate_hz, expected in (
-        (0.2, 100.0, None), (0.201, 100.0, "warning"), (0.499, 4.0, None),
-        (0.501, 4.0, "warning"))),
-    (source_positions.motion, moved(0.5), None), (source_positions.motion, moved(0.499), "warning"),
-    *((FRAME, analysis(heading=heading), expected) for heading, expected in (
-        (turned(5.0), "warning"), (turned(4.9), None), (turned(14.9), "warning"),
-        (turned(15.0), "error"), (turned(8.0, sigma_deg=2.0), "warning"),
-        (turned(7.9, sigma_deg=2.0), None), (turned(0.0, 14.9, p=0.0), "warning"),
-        (turned(0.0, 15.0, p=0.0), "error"))),
-    (FRAME, analysis(heading=turned(20.0), source=source(origin=KEPT)), None),
-]  # fmt: skip
+    *(
+        (hidden_errors.detect, analysis(axes=(hiding(nis, nees),)), expected)
+        for nis, nees, expected in (
+            (1.0, 4.0, "warning"),
+            (1.0, 3.99, None),
+            (1.49, 4.0, "warning"),
+            (1.5, 4.0, None),
+            (1.0, 15.9, "warning"),
+            (1.0, 16.0, "error"),
+            (1.0, None, None),
+        )
+    ),
+    *(
+        (
+            imu.gaps,
+            analysis(
+                axes=(axis(replay=SimpleNamespace(input_gap_s=gap_s)),),
+                flight={"imu": at_rate(rate_hz)},
+            ),
+            expected,
+        )
+        for gap_s, rate_hz, expected in (
+            (0.2, 100.0, None),
+            (0.201, 100.0, "warning"),
+            (0.499, 4.0, None),
+            (0.501, 4.0, "warning"),
+        )
+    ),
+    (source_positions.motion, moved(0.5), None),
+    (source_positions.motion, moved(0.499), "warning"),
+    *(
+        (FRAME, analysis(heading=heading), expected)
+        for heading, expected in (
+            (combine_heading_parts(5.0), "warning"),
+            (combine_heading_parts(4.9), None),
+            (combine_heading_parts(14.9), "warning"),
+            (combine_heading_parts(15.0), "error"),
+            (combine_heading_parts(8.0, sigma_deg=2.0), "warning"),
+            (combine_heading_parts(7.9, sigma_deg=2.0), None),
+            (combine_heading_parts(0.0, 14.9, p=0.0), "warning"),
+            (combine_heading_parts(0.0, 15.0, p=0.0), "error"),
+        )
+    ),
+    (
+        FRAME,
+        analysis(heading=combine_heading_parts(20.0), source=source(origin=LOGGED_BY_EKF2)),
+        None,
+    ),
+]
 
 
 # ---------------------------------------------------------------- the position source and the IMU
 
 MOVING = positions(np.arange(0.0, 120.0), np.arange(120.0))
 ODOMETRY = {"source": source(orientation=object(), samples=MOVING)}
-MADE_OF_EKF2 = {"source": source(origin=KEPT, samples=MOVING)}
+MADE_OF_EKF2 = {"source": source(origin=LOGGED_BY_EKF2, samples=MOVING)}
 
 
 def bias_of_ekf2(*bias: float) -> dict[str, Any]:
@@ -468,12 +505,14 @@ def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> A
 
 
 def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
-    usual = {"smoothing": Smoothing(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
+    usual = {"smoothing": SourceLowPass(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
     return analysis(**{**usual, **parts})
 
 
-def slow(gain: float, lag: float, slow_m: float = 0.1) -> Coloured:
-    return Coloured(1.0, 1.0, np.inf, slow_m=slow_m, white_m=0.1, gain_nats=gain, lag_nats=lag)
+def slow(gain: float, lag: float, slow_m: float = 0.1) -> TimeCorrelatedNoise:
+    return TimeCorrelatedNoise(
+        1.0, 1.0, np.inf, slow_m=slow_m, white_m=0.1, gain_nats=gain, lag_nats=lag
+    )
 
 
 def repeating(again: int, count: int, moved_m: float = 5.0) -> Any:
@@ -487,12 +526,12 @@ def repeating(again: int, count: int, moved_m: float = 5.0) -> Any:
 
 
 def jumping(*sizes: Any, **parts: Any) -> Any:
-    return analysis(explained=made(Explained, jumps=sizes), **parts)
+    return analysis(bias_scale_jump_fit=made(BiasScaleJumpFit, jumps=sizes), **parts)
 
 
 def scaled(value: float, sigma: float = 0.01, imu_hz: float = 49.1, **parts: Any) -> Any:
-    found = made(Explained, scale=Estimate(value, sigma), jumps=())
-    usual = {"explained": found, "flight": {"imu": at_rate(imu_hz)}, "clock": late(0.0)}
+    found = made(BiasScaleJumpFit, scale=Estimate(value, sigma), jumps=())
+    usual = {"bias_scale_jump_fit": found, "flight": {"imu": at_rate(imu_hz)}, "clock": late(0.0)}
     return analysis(**{**usual, **parts})
 
 
@@ -500,7 +539,7 @@ def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -
     """A source that reports a standard deviation, and has this one."""
     low, high = interval or (0.99 * noise, 1.01 * noise)
     states = source(samples=positions(np.arange(0.0, 120.0), variance_m2=reported**2))
-    usual = {"smoothing": Smoothing(0.0, 0.0, 0.0, noise), "source": states,
+    usual = {"smoothing": SourceLowPass(0.0, 0.0, 0.0, noise), "source": states,
              "tuning": tuned(Noise(noise, low, high), count=100)}  # fmt: skip
     return analysis(**{**usual, **parts})
 
@@ -516,7 +555,11 @@ def no_truth(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 BIAS, JUMPS, SCALE = imu.bias, source_positions.jumps, source_positions.scale
-ARRIVALS, THINNED, CLOCK = source_stamps.arrivals, source_intervals.thinning, source_clock.detect
+ARRIVALS, THINNED, CLOCK = (
+    source_stamps.arrivals,
+    source_intervals.downsampling,
+    source_clock.detect,
+)
 
 
 def wrong_delay(one: Any) -> Any:
@@ -525,13 +568,13 @@ def wrong_delay(one: Any) -> Any:
 
 STATED = source_positions.stated_variance
 SOURCE_EDGES = [
-    *((BIAS, analysis(explained=with_bias(sign * bias, sigma)), expected)
+    *((BIAS, analysis(bias_scale_jump_fit=with_bias(sign * bias, sigma)), expected)
       for sign in (1.0, -1.0)
       for bias, sigma, expected in (
           (0.2, 0.01, "warning"), (0.199, 0.01, None), (0.3, 0.01, "error"),
           (0.299, 0.01, "warning"), (0.25, 0.0625, "warning"), (0.25, 0.0626, None))),
     # EKF2's bias where there is none of ours; horizontally our estimate is the better one
-    *((BIAS, analysis(explained=ours, ekf2=bias_of_ekf2(*bias)), expected)
+    *((BIAS, analysis(bias_scale_jump_fit=ours, ekf2=bias_of_ekf2(*bias)), expected)
       for bias, ours, expected in (
           ((0.2, 0.0, 0.0), NONE, "warning"), ((0.199, 0.0, 0.0), NONE, None),
           ((0.0, 0.0, 0.2), with_bias(0.0), "warning"), ((0.5, 0.5, 0.1), with_bias(0.0), None))),
@@ -567,7 +610,7 @@ SOURCE_EDGES = [
     # errors that hang together without a lag are slow, not smoothed
     *((source_positions.smoothing, low_pass(99.0, 1.0, coloured=slow(99.0, lag)), expected)
       for lag, expected in ((0.9, None), (1.0, "error"))),
-    *((source_noise.slow, analysis(coloured=slow(gain, lag)), expected)
+    *((source_noise.time_correlated_noise, analysis(coloured=slow(gain, lag)), expected)
       for gain, lag, expected in (
           (5.0, 0.9, "warning"), (4.9, 0.0, None), (99.0, 1.0, None))),
     *((source_noise.repeats, repeating(again, count), expected) for again, count, expected in (
@@ -597,7 +640,7 @@ SOURCE_EDGES = [
       for which, of in ((SCALE, partial(scaled, 0.5)),
                         (source_positions.smoothing, partial(low_pass, 99.0, 1.0)))
       for clock, expected in ((NONE, None), (late(0.0, determinable=False), "error"))),
-    (SCALE, scaled(0.5, smoothing=Smoothing(0.5, 1.0, 99.0, 0.1)), None),
+    (SCALE, scaled(0.5, smoothing=SourceLowPass(0.5, 1.0, 99.0, 0.1)), None),
     *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, MADE_OF_EKF2)),
     *((source_positions.outliers,
        analysis(tuning=tuned(outlier_time_s=20.0 + np.arange(outliers), count=count)), expected)
@@ -622,7 +665,7 @@ SOURCE_EDGES = [
           (0.101, 0.001, "error"), (0.0625, 0.0208, "warning"), (0.0625, 0.0209, None))),
     *((CLOCK, analysis(**{"clock": late(0.2), **parts}), None) for parts in (
         {"clock": late(0.2, determinable=False)}, MADE_OF_EKF2, {"ekf2": ages(20, 20)},
-        {"smoothing": Smoothing(0.5, 0.2, 99.0, 0.1)})),
+        {"smoothing": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
     *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
           (30.0, 0.001, "warning"), (29.0, 0.001, None), (40.0, 0.01, "warning"),
@@ -633,7 +676,9 @@ SOURCE_EDGES = [
 
 
 def test_an_accelerometer_bias_is_told_with_its_interval_and_tilt_and_what_ekf2_says() -> None:
-    one = analysis(explained=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0))
+    one = analysis(
+        bias_scale_jump_fit=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0)
+    )
     finding = only(imu.bias, one)
     assert "off by 2.9° does the same" in finding.message  # 0.5 of 9.80665 m/s²
     assert "EKF2 subtracts +0.10 forward, -0.20 right." in finding.message
@@ -663,7 +708,7 @@ def test_stamps_of_arrival_end_at_the_first_true_one() -> None:
 
 def test_the_interval_that_all_are_multiples_of_is_sought_within_its_jitter() -> None:
     def base(intervals: Any) -> float | None:
-        found = source_intervals._base(np.array(intervals))
+        found = source_intervals._base_interval(np.array(intervals))
         return None if found is None else found[0]
 
     assert base([1.0, 1.0, 2.0]) == 1.0

@@ -21,7 +21,7 @@ from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import NAMES, Finding, by_root, find
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, Reset, Unavailable
-from px4fuse.origin import ALIGNED, KEPT
+from px4fuse.origin import ALIGNED, LOGGED_BY_EKF2
 from px4fuse.readers import read_log
 from px4fuse.recording import ClockMap, Dropout
 
@@ -122,7 +122,7 @@ def ekf2(**parts: Any) -> dict[str, Any]:
     return {"ekf2": Estimator(**parts)}
 
 
-ASKED = {"sigma_z_asked_m": about(0.10, 0.2)}
+TUNED_FIELDS = {"sigma_z_asked_m": about(0.10, 0.2)}
 FAULTS = [
     # a recording of its own
     Fault("source_stamps_constant", "error", {"stamps": 600, "distinct": 2},
@@ -140,17 +140,17 @@ FAULTS = [
     Fault("position_file_placement", "warning",
           change=with_source(alignment=given_placement("yaw is known to 5° only"))),
     # the filter's own settings
-    Fault("kf_variance_understated", "error", ASKED, settings={"sigma_z_m": 0.01}),
-    Fault("kf_variance_overstated", "error", ASKED, settings={"sigma_z_m": 1.0}),
+    Fault("kf_variance_understated", "error", TUNED_FIELDS, settings={"sigma_z_m": 0.01}),
+    Fault("kf_variance_overstated", "error", TUNED_FIELDS, settings={"sigma_z_m": 1.0}),
     Fault("process_noise_forgotten", "error", {"relative_growth": pytest.approx(0.01, abs=0.01)},
           settings={"sigma_a_m_s2": 1e-4}),
     # EKF2's
     Fault("accelerometer_bias", "warning", {"bias_m_s2": about(0.3, 0.01)}, change=biased),
-    Fault("ekf2_variance_overstated", "error", {"sigma_factor": about(7.1, 0.15), **ASKED},
+    Fault("ekf2_variance_overstated", "error", {"sigma_factor": about(7.1, 0.15), **TUNED_FIELDS},
           ekf2(nis=0.02, noise_m=0.7)),
     Fault("ekf2_variance_overstated", "warning", {"sigma_factor": about(1.6, 0.15)},
           ekf2(nis=0.4, noise_m=0.15)),
-    Fault("ekf2_variance_understated", "error", {"nis_mean": about(22, 0.2), **ASKED},
+    Fault("ekf2_variance_understated", "error", {"nis_mean": about(22, 0.2), **TUNED_FIELDS},
           ekf2(nis=22.0, noise_m=0.02)),
     Fault("ekf2_not_fusing", "error", {"fusing_share": 0.0, "source_interval_s": about(0.5)},
           {**ekf2(fusing=((0.0, 0.0),)), "uwb": Uwb(rate_hz=2.0),
@@ -177,7 +177,7 @@ FAULTS = [
     Fault("source_not_logged", "warning", {"rate_hz": about(4.0), "sdlog_profile": 1},
           {"uwb": Uwb(name=ALIGNED_TOPIC, origin=ALIGNED, rate_hz=4.0), "parameters": NO_VISION}),
     Fault("source_decimated", "warning", {"rate_hz": about(2.0), "logger_limit_hz": 2.0},
-          {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=KEPT, rate_hz=2.0)}),
+          {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=LOGGED_BY_EKF2, rate_hz=2.0)}),
     Fault("source_frame_not_north", "warning",
           flight={"uwb": Uwb(frame="FRD"), **ekf2(fusing_yaw=0.0)}),
     Fault("source_frame_not_north", "info", flight={"uwb": Uwb(frame="FRD")}),
@@ -247,7 +247,7 @@ MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
      "ekf2_variance_overstated"),
     # innovations are not called decimated where the source is made of them
     ("ekf2_innovations_decimated",
-     {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=KEPT), **ekf2(every=3)}, None),
+     {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=LOGGED_BY_EKF2), **ekf2(every=3)}, None),
 ]  # fmt: skip
 
 

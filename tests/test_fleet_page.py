@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 
 from px4fuse.fleet.page import html_text, logs_of
-from px4fuse.webpage.frame import PAGE_ROWS
+from px4fuse.webpage.frame import MAX_PAGE_ROWS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
 BREAKOUT = "</script ></noscript\n><script>window.alive=2</script><!-- \u2028 & &lt;"
@@ -171,13 +171,13 @@ def test_five_thousand_logs_are_a_hundred_rows(browser: Browser, tmp_path: Path)
     shown(browser, tmp_path, made_up(5000))
     rows = "document.querySelectorAll('.list > tbody > tr').length"
     everything = "document.querySelectorAll('*').length"
-    assert browser.ask(rows) == PAGE_ROWS
+    assert browser.ask(rows) == MAX_PAGE_ROWS
     assert browser.ask(everything) < 8000
     assert browser.ask(COUNT) == "Showing 5000 of 5000"
     browser.click(head("SIGMA_Z"))
     browser.click("#text")
     browser.write("v1.14")
-    assert browser.ask(rows) == PAGE_ROWS
+    assert browser.ask(rows) == MAX_PAGE_ROWS
     browser.click("#all")
     # stepping goes over the end of a page, and back
     browser.click(".list > tbody > tr:last-child .name")
@@ -186,7 +186,7 @@ def test_five_thousand_logs_are_a_hundred_rows(browser: Browser, tmp_path: Path)
     assert browser.ask("document.querySelector('#place').textContent") == "Logs 101 to 200 of 5000"
     browser.press("k", "k")
     assert browser.ask("document.querySelector('tr.open .name').textContent") == name
-    assert browser.ask(rows) == PAGE_ROWS + 1
+    assert browser.ask(rows) == MAX_PAGE_ROWS + 1
     assert browser.complaints() == []
     assert browser.requests() <= {"file", "data"}
 

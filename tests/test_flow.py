@@ -9,17 +9,17 @@ from ekf2_tools import opened
 from exchange import replace
 from ulog_tools import gnss_log, seconds_of, stamps, topic
 
-from px4fuse.ekf2.flow import fuse_flow, with_flow
+from px4fuse.ekf2.flow import add_flow_samples, fuse_flow
 from px4fuse.ekf2.inputs import read_gnss
-from px4fuse.ekf2.magnetometer import Samples, gather
+from px4fuse.ekf2.magnetometer import EventSamples, mean_by_event
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight import Columns, Flight, Reset
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_innovations import with_gnss
+from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import scenario_of
+from px4fuse.simulation.scenario import make_scenario
 
 INTERVAL_S, SHARE = 0.02, 0.1  # of EKF2's low pass, ekf.h
 
@@ -34,7 +34,7 @@ def low_passed(raw: np.ndarray) -> np.ndarray:
 
 @cache
 def model() -> Model:
-    return opened(simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(())))
+    return opened(simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse(())))
 
 
 def true_velocity(times: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
 def flying(noise_m_s: float = 0.3) -> Model:
     """The flight, with flow."""
     inputs = model().inputs
-    stretches = tuple(with_flow(one, flow_of(noise_m_s), 3.0) for one in inputs.stretches)
+    stretches = tuple(add_flow_samples(one, flow_of(noise_m_s), 3.0) for one in inputs.stretches)
     return replace(model(), inputs=replace(inputs, stretches=stretches))
 
 
@@ -108,9 +108,9 @@ def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path)
 def test_flow_tells_the_velocity_at_the_event_after_it(every):
     """Where the body moved since a sample is known from the IMU: corners are no innovations."""
     (stretch,) = model().inputs.stretches
-    told = with_flow(stretch, flow_of(every=every), 3.0)
+    told = add_flow_samples(stretch, flow_of(every=every), 3.0)
     end = next(iter(model().intervals.values()))[0].events.end
-    found = gather(told.flow, end, stretch.gained_m_s)
+    found = mean_by_event(told.flow, end, stretch.gained_m_s)
     seen = found.number > 0.0
     assert found.number.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
     speed = true_velocity(stretch.time_s[end[seen]])
@@ -124,7 +124,7 @@ def test_the_mean_counts_as_often_as_it_has_samples_and_the_gate_is_of_one():
     turn = np.eye(3)[None, :2]
     x, P = np.zeros((1, 15)), np.diag(np.full(15, 1e-9))[None].copy()
     P[0, 3:5, 3:5] = 0.25 * np.eye(2)
-    told = Samples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
+    told = EventSamples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
     after, left = fuse_flow(x, P, told, 3.0)
     # 1/P = 1/P₀ + n/R
     assert left[0, 3, 3] == pytest.approx(1.0 / (1.0 / 0.25 + 10.0 / 0.8), rel=1e-6)
@@ -182,11 +182,11 @@ def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped
 def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused():
     flight = model().flight
     ekf2 = flight.ekf2
-    meant = pd.Series([1.0, 0.0, 1.0], index=[0.0, 50.0, 60.0])
-    aids = {**ekf2.aids, "gnss_pos": replace(ekf2.aids["gnss_pos"], meant=meant)}
-    found = read_gnss(flight, with_gnss(replace(ekf2, aids=aids)), ekf2.record)
-    aids["gnss_pos"] = replace(ekf2.aids["gnss_pos"], meant=None)
-    every = read_gnss(flight, with_gnss(replace(ekf2, aids=aids)), ekf2.record)
+    enabled = pd.Series([1.0, 0.0, 1.0], index=[0.0, 50.0, 60.0])
+    aids = {**ekf2.aids, "gnss_pos": replace(ekf2.aids["gnss_pos"], enabled=enabled)}
+    found = read_gnss(flight, with_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record)
+    aids["gnss_pos"] = replace(ekf2.aids["gnss_pos"], enabled=None)
+    every = read_gnss(flight, with_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record)
     delay_s = ekf2.record.parameters["EKF2_GPS_DELAY"] * 1e-3
     measured_s = every.stamp_s - delay_s  # type: ignore[union-attr]
     kept = (measured_s < 50.0) | (measured_s >= 60.0)
@@ -222,7 +222,7 @@ def test_flights_with_flow_are_replayed(name, shared_logs, model_of):
     if "outage" in name:
         assert agreement.carried_difference_m < 0.5
         assert agreement.doubtful == {}
-        ((lost_s, back_s),) = found.flown.carried_s
+        ((lost_s, back_s),) = found.flown.flow_only_spans_s
         assert lost_s == pytest.approx(42.1, abs=0.2)  # 35.2 s after take-off
         assert back_s == pytest.approx(72.6, abs=1.0)
     else:

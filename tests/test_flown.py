@@ -9,7 +9,7 @@ from flights import with_noises
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.clock import CHANGE_P
+from px4fuse.filter.clock import MAX_CHANGE_P
 from px4fuse.findings import find
 from px4fuse.readers import read_log
 from px4fuse.report.clock import clock_advice
@@ -100,7 +100,7 @@ def test_what_is_said_of_a_flight_with_a_known_fault(shared_logs, name):
         assert clock.offset_s == pytest.approx(flown.offset_s, abs=0.05)
         low, high = clock.interval_s
         assert low <= flown.offset_s <= high
-        assert clock.change_p > CHANGE_P
+        assert clock.change_p > MAX_CHANGE_P
         assert abs(clock.drift_ppm) < 4.0 * clock.drift_sigma_ppm
     if name.endswith("evdelay175"):
         assert not low <= -0.175 <= high

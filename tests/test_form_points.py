@@ -14,20 +14,20 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.answers import CURES, MISTAKES, PANELS, Answers, Claim
+from px4fuse.answers import CURES, MISTAKES, PANELS, Answers, ClaimedMistake
 from px4fuse.assignment.drawing import draw
-from px4fuse.assignment.truth import FormTruth, VerdictTruth, Wrong, truth_of
+from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
-from px4fuse.grading.form_points import PARTS, TABLE, cures, form_points, panels
+from px4fuse.grading.form_points import PART_NAMES, TABLE, cures, form_points, panels
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import Scenario, scenario_of
+from px4fuse.simulation.scenario import Scenario, make_scenario
 
 SHA256 = "a" * 64
 pytestmark = pytest.mark.usefixtures("quick_filter")
-LATE = Wrong("clock-offset", 0.2, 0.17, 0.23)
-GAP = Wrong("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
+LATE = TrueMistake("clock-offset", 0.2, 0.17, 0.23)
+GAP = TrueMistake("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
 TRUTH = FormTruth(
     (LATE, GAP), 0.1, VerdictTruth("understated", 2.0), VerdictTruth("overstated", 1.2),
     ("followed the wrong positions", "coasted, then reset"), ("fused at the wrong time",),
@@ -36,15 +36,25 @@ TRUTH = FormTruth(
 RIGHT = Answers(
     log_sha256=SHA256,
     mistakes=(
-        Claim("clock-offset", 190.0, "ms", "whole flight", None, None, "--clock-offset", -0.2, "s",
-              "clock"),
-        Claim("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
+        ClaimedMistake(
+            "clock-offset",
+            190.0,
+            "ms",
+            "whole flight",
+            None,
+            None,
+            "--clock-offset",
+            -0.2,
+            "s",
+            "clock",
+        ),
+        ClaimedMistake("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
     ),
     verdict_ours="understated",
     verdict_ekf2="overstated",
     ekf2_did=("followed the wrong positions", "coasted, then reset"),
     quantities=(0.505, (3.0, 7.0), -0.2),
-)  # fmt: skip
+)
 CLEAN = FormTruth(
     (), 0.1, VerdictTruth("consistent"), VerdictTruth("consistent"), ("nothing unusual",),
     ("followed the positions",), (0.5, 0.1, 0.2),
@@ -59,31 +69,31 @@ def with_claim(**values: Any) -> Answers:
 
 def with_false(*kinds: str) -> Answers:
     """The right form with more claims."""
-    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(Claim, kinds)))
+    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(ClaimedMistake, kinds)))
 
 
 def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
-    found = form_points(answers, truth).parts
-    return [round(found[name], 2) for name in PARTS]
+    found = form_points(answers, truth).points_by_part
+    return [round(found[name], 2) for name in PART_NAMES]
 
 
 def test_every_mistake_that_a_flight_can_have_can_be_named_seen_and_cured() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
-        offered = cures(Wrong(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
+        offered = cures(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CURES)
         assert max(share for _, _, share in offered) == 1.0
         assert set(panels(name)) > {"cover"}
 
 
 def test_all_right_is_everything_and_a_blank_form_nothing() -> None:
-    assert form_points(RIGHT, TRUTH).parts == FULL
+    assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).named == {"clock-offset": True, "dropout": True}
 
 
-FULL = dict(zip(PARTS, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
+FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
 DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
 GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
 NO_MISTAKES = {"kinds": 0.0, "sizes": 0.0, "when": 0.0, "cure": 0.0}
@@ -102,7 +112,7 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     # each false claim costs ten; three take all
     (with_false("yaw"), {"kinds": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
-    (replace(RIGHT, mistakes=(Claim("none"),)), NO_MISTAKES),
+    (replace(RIGHT, mistakes=(ClaimedMistake("none"),)), NO_MISTAKES),
     (replace(RIGHT, verdict_ours="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 12.5}),
     (replace(RIGHT, ekf2_did=("coasted, then reset",)), {"verdicts": 12.5}),
@@ -113,11 +123,11 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
 
 @pytest.mark.parametrize(("answers", "less"), HALF_RIGHT)
 def test_what_is_half_right(answers: Answers, less: dict[str, float]) -> None:
-    assert form_points(answers, TRUTH).parts == pytest.approx({**FULL, **less}, abs=0.01)
+    assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
 
 
 def test_a_clean_flight() -> None:
-    none = Answers(log_sha256=SHA256, mistakes=(Claim("none"),))
+    none = Answers(log_sha256=SHA256, mistakes=(ClaimedMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).share == 0.4
     whole = replace(
@@ -129,9 +139,9 @@ def test_a_clean_flight() -> None:
 
 
 def test_a_cure_that_needs_no_measurement_counts_with_the_size_alone() -> None:
-    landed = Wrong("open-end", 5.0, 4.25, 5.75, 60.0, None)
+    landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
-    claim = Claim("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
+    claim = ClaimedMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
     guess = Answers(log_sha256=SHA256, mistakes=(claim,))
     assert parts(guess, truth) == [30.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     measured = replace(guess, mistakes=(replace(claim, size=5.1, unit="m"),))
@@ -149,7 +159,7 @@ def test_a_constant_form_does_not_pay_on_loops() -> None:
         drawn = draw(b"constant forms", f"s{number}", "loop")
         sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.typed]
         measured = [size + rng.normal(0.0, 0.4) for size in sizes]
-        wrong = [Wrong("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
+        wrong = [TrueMistake("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
         verdicts = VerdictTruth("overstated", 7.0), VerdictTruth("understated", 1.1)
         truths.append(
             FormTruth(tuple(wrong), 0.01, *verdicts, ("nothing unusual",), (), (0.5, 0.1, ()))
@@ -163,7 +173,7 @@ def test_a_constant_form_does_not_pay_on_loops() -> None:
 def test_the_size_of_an_open_end_is_what_the_odometry_measures() -> None:
     """The drift in it is nothing that a student could know of."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
-    (wrong,) = truth_of(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
+    (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
     assert wrong.size is not None
     assert wrong.low is not None
     assert 0.1 < abs(wrong.size - 5.0) < 1.5
@@ -178,7 +188,7 @@ def simulation_of(typed: str) -> flights.Simulation:
     given = simulate.make_context("simulate", shlex.split(typed)[2:]).params
     names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
     chosen = {name: given[name] for name in names if given.get(name) is not None}
-    scenario = scenario_of(given["kind"], truth=not given["no_truth"], **chosen)
+    scenario = make_scenario(given["kind"], truth=not given["no_truth"], **chosen)
     return flights.simulate(scenario, parse(given["mistake"]))
 
 
@@ -189,7 +199,7 @@ def answers_of(form: dict[str, Any]) -> Answers:
         parameter = one["parameter"] if one["parameter"] in CURES else ""
         unit = one["value_unit"] if one["value_unit"] in CURES.get(parameter, {}) else ""
         claims.append(
-            Claim(
+            ClaimedMistake(
                 one["kind"], one["size"],
                 "" if one["unit"] == next(iter(MISTAKES[one["kind"]].units), "") else one["unit"],
                 "whole flight" if when["text"] == "whole flight" else "", when["from_s"],
@@ -218,7 +228,7 @@ def given(value: Any) -> Any:
 def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
     bank = json.loads((shared_logs.parent / "grading" / "bank.json").read_text(encoding="utf-8"))
     truths = {
-        flight["flight"]: truth_of(simulation_of(flight["simulate"]), SHA256)
+        flight["flight"]: form_truth(simulation_of(flight["simulate"]), SHA256)
         for flight in bank["flights"]
     }
     ours, theirs = [], []
@@ -226,7 +236,7 @@ def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
         known = tuple(given(one["truth"]) for one in form["quantities"])
         truth = truths[form["flight"]]
         made = form_points(answers_of(form), replace(truth, quantities=known))
-        ours.append(sum(made.parts.values()))
+        ours.append(sum(made.points_by_part.values()))
         theirs.append(form["judgement"]["points"])
     assert len(ours) >= 30
     assert np.abs(np.subtract(ours, theirs)).mean() <= 3.0

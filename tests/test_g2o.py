@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import g2o_text, parse_g2o, read_g2o
-from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.graph import lie, solver
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 UNIT_2 = "1 0 0 1 0 1"
@@ -94,6 +94,8 @@ REFUSED = {
     "parts": (f"{EDGE}\n{EDGE.replace('0 1', '5 6', 1)}", "falls into 2 parts: vertex 5 is not"),
     "too small": (PLANE.replace(UNIT_2, "1e-51 0 0 1 0 1"), "line 3: the information matrix has"),
     "smallest": (PLANE.replace(UNIT_2, "1 0 0 5e-324 0 1"), "line 3: the information matrix has"),
+    "far vertex": (PLANE.replace("1 1 0 0\n", "1 1e30 0 0\n"), "line 2: a value beyond 1e+09"),
+    "far edge": (SPACE.replace("QUAT 0 1 1", "QUAT 0 1 -1e9"), "line 3: a value beyond 1e+09"),
     "too large": (PLANE.replace(UNIT_2, "1 0 0 1 0 1e51"), "line 3: the information matrix has an"),
 }
 
@@ -179,3 +181,17 @@ def test_information_of_any_size_that_is_read_gives_numbers(
     code, out, err = run_main(monkeypatch, capsys, "loop", path, "--json", "-", "--robust")
     assert (code, err) == (0, "")
     assert json.loads(out, parse_constant=pytest.fail)["graph"]["solutions"]
+
+
+def test_graph_without_convergence_says_so(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "g.g2o"
+    far = "".join(f"VERTEX_SE2 {number} {number} 3 0\n" for number in range(5))
+    path.write_text(far + SQUARE.format(*[UNIT_2] * 4) + f"EDGE_SE2 0 4 0.1 0.1 6.2 {UNIT_2}\n")
+    assert "Solver" not in run_main(monkeypatch, capsys, "loop", path)[1]
+    monkeypatch.setattr(solver, "_MOST_DAMPING", 0.0)
+    monkeypatch.setattr(solver, "_LEAST_FIDELITY", 1e9)
+    code, out, _ = run_main(monkeypatch, capsys, "loop", path, "--json", tmp_path / "g.json")
+    assert code == 0
+    assert "not converged: pose graph, all closures" in out
+    solutions = json.loads((tmp_path / "g.json").read_text())["graph"]["solutions"]
+    assert not solutions["all"]["converged"]

@@ -17,14 +17,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from ulog_tools import Log, gnss_log, position, seconds_of, stamps, topic
 
 import px4fuse
-from px4fuse.analysis import run_preparation
+from px4fuse.analysis import prepare_comparison
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source, prepare
 from px4fuse.comparison.remedy import filter_errors_m
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.inputs import _rules, read_gnss
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.replay import rms, settled
+from px4fuse.ekf2.replay import inside_spans, rms
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.settings import Settings
@@ -32,11 +32,11 @@ from px4fuse.findings import find, noises
 from px4fuse.flight import Columns, Flight, FusionRecord, PositionTrack, Unavailable
 from px4fuse.origin import GNSS
 from px4fuse.readers import px4_fixes, read_log
-from px4fuse.readers.px4_fixes import rebuilt_fixes
+from px4fuse.readers.px4_fixes import reconstruct_fixes
 from px4fuse.report.clock import clock_advice
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.scenario import scenario_of
+from px4fuse.simulation.scenario import make_scenario
 
 EARTH_M = 6_371_000.0
 ORIGIN = (47.4, 8.5, 488.0)
@@ -147,13 +147,13 @@ def test_the_topic_of_the_newest_main_is_read_alike(tmp_path):
     assert track.topics == ("vehicle_gnss",)
     pd.testing.assert_frame_equal(track.samples, before.samples)
     pd.testing.assert_frame_equal(track.velocity, before.velocity)
-    assert track.place_m == pytest.approx((0.1, 0.0, -0.2))
+    assert track.lever_arm_m == pytest.approx((0.1, 0.0, -0.2))
 
 
 def test_positions_are_those_of_the_vehicle_where_the_antenna_is_elsewhere(tmp_path):
     moved = flight_of(outdoors(EKF2_GPS_POS_X=0.3, EKF2_GPS_POS_Z=-0.2), tmp_path)
     antenna, vehicle = track_of(moved), compare(moved).source
-    assert antenna.place_m == pytest.approx((0.3, 0.0, -0.2))
+    assert antenna.lever_arm_m == pytest.approx((0.3, 0.0, -0.2))
     assert "0.3 m forward" in vehicle.notes[-1]
     at = antenna.samples.index.to_numpy()
     known = moved.attitude.index.to_numpy()
@@ -175,7 +175,7 @@ def test_it_is_chosen_by_itself_where_ekf2_fused_it_and_nothing_else_is_there(tm
     # nothing of external vision is missed
     assert not [part for part in prepared.missing if "vision" in f"{part.reason} {part.remedy}"]
     never = flight_of(outdoors(fused=False), tmp_path)
-    assert not track_of(never).origin.automatic
+    assert not track_of(never).origin.is_automatic
 
 
 @pytest.mark.parametrize(("eph_m", "least_m", "axes", "expected_m"), [
@@ -187,10 +187,10 @@ def test_it_is_chosen_by_itself_where_ekf2_fused_it_and_nothing_else_is_there(tm
 def test_sigma_z_is_what_ekf2_takes(eph_m, least_m, axes, expected_m, tmp_path):
     flight = flight_of(outdoors(eph_m=eph_m, EKF2_GPS_P_NOISE=least_m), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=axes)
-    prepared = run_preparation(request, flight=flight)
+    prepared = prepare_comparison(request, flight=flight)
     assert prepared.settings.sigma_z_m == pytest.approx(expected_m, rel=1e-3)
     asked = ComparisonRequest(log="a.ulg", axes=axes, sigma_z_m=0.3)
-    assert run_preparation(asked, flight=flight).settings.sigma_z_m == 0.3
+    assert prepare_comparison(asked, flight=flight).settings.sigma_z_m == 0.3
 
 
 def test_ekf2_s_innovations_are_those_of_gnss(tmp_path):
@@ -232,7 +232,7 @@ def with_barometer(log: Log, *, fused: bool = True) -> Log:
 def test_down_is_by_the_barometer_where_ekf2_fused_that(tmp_path):
     flight = flight_of(with_barometer(outdoors()), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=("down", "north"))
-    prepared = run_preparation(request, flight=flight)
+    prepared = prepare_comparison(request, flight=flight)
     down, north = prepared.lines
     at = down.measurement_time_s
     np.testing.assert_allclose(at % 0.2, 0.1, atol=1e-6)  # of the barometer, not of the fixes
@@ -242,9 +242,9 @@ def test_down_is_by_the_barometer_where_ekf2_fused_that(tmp_path):
     assert prepared.settings.sigma_z_m == pytest.approx(0.4)  # EKF2_BARO_NOISE
     innovations = prepared.flight.ekf2.innovations["down"]  # type: ignore[union-attr]
     np.testing.assert_allclose(innovations["innovation_m"], -0.2, rtol=1e-6)
-    by_gnss = run_preparation(replace(request, height="gnss"), flight=flight)
-    assert not np.isin(by_gnss.lines[0].measurement_time_s, at).any()
-    assert isinstance(by_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
+    fused_as_gnss = prepare_comparison(replace(request, height="gnss"), flight=flight)
+    assert not np.isin(fused_as_gnss.lines[0].measurement_time_s, at).any()
+    assert isinstance(fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
 
 def test_down_is_by_gnss_unless_ekf2_fused_the_barometer_alone_or_it_is_asked_for(tmp_path):
@@ -255,7 +255,7 @@ def test_down_is_by_gnss_unless_ekf2_fused_the_barometer_alone_or_it_is_asked_fo
     bare = flight_of(outdoors(), tmp_path)
     with pytest.raises(MissingDataError, match="no height by a barometer"):
         prepare(bare, height="barometer")
-    vision = simulate_flight(scenario_of("aisle", seed=1))
+    vision = simulate_flight(make_scenario("aisle", seed=1))
     with pytest.raises(SettingsError, match="`height` is for GNSS"):
         prepare(vision, height="gnss")
 
@@ -319,7 +319,7 @@ def test_a_smaller_r_is_advised_only_where_the_parameter_holds_it_up(
     prepared = prepare(flight_of(log, tmp_path))
     monkeypatch.setattr(findings_tools, "SEGMENT", prepared.segment)
     no_model = Unavailable("replay", "no IMU", "Log it.")
-    words = noises._above_stated(
+    words = noises._noise_above_reported(
         stand_in(source=prepared.source, log=prepared.flight.log, ekf2_model=no_model)
     )
     assert bool(words) is said
@@ -352,7 +352,7 @@ FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
         (None, {"gnss_pos": "variance overstated", "rng_hgt": "variance overstated"}, ""),
 }  # fmt: skip
 # At least so many fixes of their innovations are added to flights with two a second
-REBUILT = {"v1.13.3_gps_profile1": 100, "v1.14.4_gps_magdist": 200}
+FROM_INNOVATIONS = {"v1.13.3_gps_profile1": 100, "v1.14.4_gps_magdist": 200}
 STAMP_S = 0.016  # the simulation steps by 8 ms, from a fix to its stamp and to the filter
 OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
@@ -385,11 +385,11 @@ def test_flights_on_gnss(name, shared_logs):
     assert not reason or re.search(reason, analysis.ekf2_model.reason)
     assert verdicts == {aid: analysis.aids[aid].verdict for aid in verdicts}
     assert as_in_the_log(analysis.aids, truth) >= 2
-    if name in REBUILT:
+    if name in FROM_INNOVATIONS:
         track = track_of(analysis.flight)
         assert "2.0 positions of GNSS a second" in track.notes[0]
         count, exact_m = re.findall(r"^(\d+) positions.*to within ([\d.]+) m", track.notes[1])[0]
-        assert int(count) > REBUILT[name]
+        assert int(count) > FROM_INNOVATIONS[name]
         assert float(exact_m) < 0.1
         assert track.rate_hz > 2.9
 
@@ -490,7 +490,7 @@ def test_the_magnetometer_is_replayed_so_that_the_heading_follows(models):
         assert model.agreement.heading_rms_difference_deg < 0.5
         # held at EKF2's own height
         state, ours = model.flight.ekf2.state["down_m"], model.flown.published["down_m"]
-        state = state[settled(state.index, model.flown.judged_s)]
+        state = state[inside_spans(state.index, model.flown.judged_s)]
         assert rms(np.interp(state.index, ours.index, ours) - state.to_numpy()) < 0.05
     assert turned_deg("delay0", EKF2_GPS_DELAY=200.0) == pytest.approx((4.7, 1.5), abs=0.3)
     # 110 ms of error turn it in proportion, 200 ms were 4.7°
@@ -666,7 +666,7 @@ def test_fixes_between_the_logged_ones_are_rebuilt(recorded, request):
         folder = request.getfixturevalue("shared_logs")
         flight = read_log(folder / "gps" / "v1.16.1_gps_fullrate.ulg")
     else:
-        flight = simulate_flight(scenario_of("outdoor", seed=2, gnss_rate_hz=10.0))
+        flight = simulate_flight(make_scenario("outdoor", seed=2, gnss_rate_hz=10.0))
     track = track_of(flight)
     every = track.samples[track.samples.index > 5.0]
     log = flight.ekf2.aids["gnss_pos"]
@@ -680,11 +680,11 @@ def test_fixes_between_the_logged_ones_are_rebuilt(recorded, request):
         flight.ekf2, aids=dict(flight.ekf2.aids) | {"gnss_pos": replace(log, samples=rows)}
     )
     kept = every.iloc[np.cumsum(np.random.default_rng(1).choice([4, 5, 5, 6], 200))]
-    made, (note,) = rebuilt_fixes(kept, ekf2, 0.11)
+    made, (note,) = reconstruct_fixes(kept, ekf2, 0.11)
 
     def notes_of(samples: pd.DataFrame) -> tuple[str, ...]:
         aids = dict(ekf2.aids) | {"gnss_pos": replace(log, samples=samples)}
-        return rebuilt_fixes(kept, replace(ekf2, aids=aids), 0.11)[1]
+        return reconstruct_fixes(kept, replace(ekf2, aids=aids), 0.11)[1]
 
     assert len(made) > 60
     assert "to within 0.0" in note
@@ -698,9 +698,9 @@ def test_fixes_between_the_logged_ones_are_rebuilt(recorded, request):
     # nor by a row in the step of the fusion, which may be of the fix before
     assert notes_of(rows.set_axis(rows.index - 0.03)) == ()
     unknown = Unavailable("horizon", "not logged", "Log it.")
-    assert rebuilt_fixes(kept, replace(ekf2, horizon_s=unknown), 0.11)[1] == ()
+    assert reconstruct_fixes(kept, replace(ekf2, horizon_s=unknown), 0.11)[1] == ()
     # a fix that is older than the horizon is fused at the horizon
-    assert rebuilt_fixes(kept, replace(ekf2, horizon_s=0.05), 0.11)[1] != (note,)
+    assert reconstruct_fixes(kept, replace(ekf2, horizon_s=0.05), 0.11)[1] != (note,)
 
 
 def test_the_interval_of_a_receiver_is_told_by_those_that_were_kept():

@@ -32,11 +32,11 @@ from px4fuse.explore.data import flight_data
 from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.fleet.page import html_text
-from px4fuse.plain import plain
+from px4fuse.plain import to_json_types
 from px4fuse.report import pdf
 from px4fuse.simulation.flights import answer, simulate
 from px4fuse.simulation.mistakes import MISTAKES, parse
-from px4fuse.simulation.scenario import KINDS, scenario_of
+from px4fuse.simulation.scenario import KINDS, make_scenario
 
 NOTES = """# What I saw
 
@@ -133,7 +133,7 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
         return []
 
     monkeypatch.setattr(pdf, "data", keep)
-    monkeypatch.setattr(pdf, "compiled", lambda report: page_of(None, report["results"]))
+    monkeypatch.setattr(pdf, "compile_pdf", lambda report: page_of(None, report["results"]))
     return blocks
 
 
@@ -166,7 +166,7 @@ def test_a_command_shows_what_it_showed(
 def spread(kind: str, *mistakes: str) -> list[str]:
     """How the fields of a simulated flight's topics are spread, and what its answer holds."""
     size = {} if kind == "outdoor" else {"length_m": 6.0}
-    made = simulate(scenario_of(kind, passes=1, seed=3, **size), parse(mistakes))
+    made = simulate(make_scenario(kind, passes=1, seed=3, **size), parse(mistakes))
     return [
         f"{topic.name} {field} {numbers(part)}"
         for topic in made.topics
@@ -226,4 +226,4 @@ def test_the_plots_to_explore_are_what_they_were(sample_log: Path) -> None:
     lines = [re.sub(r"\bp\d{4,}\b", named, line) for line in of_values(document["roots"])]
     drawn = [rounded(line[:200]) for line in lines if " id" not in line]
     drawn = [re.sub(r"data: H4s.*", "data: packed", line) for line in drawn]
-    agrees("explore", [*drawn, *(line[:200] for line in of_values(plain(data)))])
+    agrees("explore", [*drawn, *(line[:200] for line in of_values(to_json_types(data)))])

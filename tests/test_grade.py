@@ -22,12 +22,12 @@ from px4fuse.assignment.roster import file_names
 from px4fuse.cli.outputs import Interrupted
 from px4fuse.grading.entries import Course
 from px4fuse.grading.grade import GradeOutcome, grade
-from px4fuse.grading.model import Entry, Graded
+from px4fuse.grading.model import Entry, GradedReport
 from px4fuse.grading.rubric import read_rubric
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verdict
-from px4fuse.workers import Failed
+from px4fuse.workers import JobFailure
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
@@ -84,19 +84,22 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")
-def test_pages_that_cannot_be_drawn_hide_in_no_verified_row(tmp_path, monkeypatch) -> None:
+def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> None:
     """As where they take more time or memory than there is for them."""
     folder = tmp_path / "in"
     folder.mkdir()
     (folder / "a.pdf").write_bytes(
         forged(REPORT.read_bytes(), lambda writer: writer.remove_page(7))
     )
-    monkeypatch.setattr(pages, "bounded", lambda *_: Failed("it took longer than 10 s."))
+    monkeypatch.setattr(
+        pages, "run_one_bounded", lambda *_: JobFailure("it took longer than 10 s.")
+    )
     (only,) = grade(
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
     ).graded
-    assert only.status == "verified"
-    assert any("could not be drawn: do not open them" in flag for flag in only.flags)
+    assert only.status == "cannot verify"
+    assert only.pending.startswith("Ask for the PDF as px4fuse wrote it")
+    assert any("cannot be compared within the limits" in flag for flag in only.flags)
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")
@@ -123,16 +126,14 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     assert len(redrawn) == 3
     assert len(set(redrawn)) == 1
     assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 8
-    drawn = [one.name for one in (output / "records").glob("*.png")]
-    assert len(drawn) == 3 * 8
     page = (output / "class.html").read_text(encoding="utf-8")
-    assert all(f"records/{name}" in page for name in drawn)
+    assert all(f"reports/{name}.pdf" in page for name in ("a", "b", "c"))
     # a page away is a flag, and costs nothing
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
-    assert any("Page 8 of the PDF" in flag and "missing" in flag for flag in third.flags)
-    assert not any("of the PDF" in flag for flag in first.flags)
+    assert any("Page 8: it is missing." in flag for flag in third.flags)
+    assert first.flags == ()
     # a second run does nothing again, and says the same
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
     assert again.reused == 3
@@ -177,11 +178,8 @@ def test_another_log_at_hand_verifies_again(tmp_path) -> None:
             [tmp_path / "in"], Course(read_rubric(None), logs=logs), tmp_path / "out", processes=1
         )
         said.append((outcome.graded[0].verdict.status, outcome.reused))
-        # the redrawn pages, or the cover as it was handed in, and nothing of the run before
-        drawn = [one.name for one in (tmp_path / "out" / "records").glob("*.p*")]
-        assert len(drawn) == (9 if logs else 1)
-        page = (tmp_path / "out" / "class.html").read_text(encoding="utf-8")
-        assert all(f"records/{name}" in page for name in drawn if name.endswith(".png"))
+        # the redrawn report, and nothing of the run before
+        assert len([*(tmp_path / "out" / "records").glob("*.p*")]) == len(logs)
     assert said == [
         ("cannot verify", 0), ("verified", 0), ("verified", 1), ("cannot verify", 0)
     ]  # fmt: skip
@@ -210,7 +208,7 @@ def test_what_the_command_says(tmp_path, monkeypatch) -> None:
     """Names on one line each, and of an interrupted run that it can go on."""
     import px4fuse.grading.grade as module
 
-    one = Graded("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
+    one = GradedReport("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
     entry = Entry(one.student, one.student_id, one)
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")

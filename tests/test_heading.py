@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.filter import heading
-from px4fuse.filter.heading import DRIFT_P, HeadingError, HeadingPart, heading_error
+from px4fuse.filter.heading import MAX_DRIFT_P, HeadingError, HeadingPart, estimate_heading_error
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
@@ -32,7 +32,9 @@ def flown(*mistakes: str, seed: int = 3, **scenario: float) -> Flight:
 
 def estimated(flight: Flight, sigma_z_m: float = SIGMA_UWB_M) -> HeadingError | Unavailable:
     track, _ = choose_source(flight)
-    return heading_error(flight, track, choose_segment(flight, track), Settings(), sigma_z_m)
+    return estimate_heading_error(
+        flight, track, choose_segment(flight, track), Settings(), sigma_z_m
+    )
 
 
 def turned(quaternions: pd.DataFrame, turn_deg: np.ndarray) -> pd.DataFrame:
@@ -69,7 +71,7 @@ def test_a_heading_that_wanders_is_followed(by):
     found = estimated(flight)
     assert found.by == by
     assert found.drifts
-    assert found.drift_p < DRIFT_P
+    assert found.drift_p < MAX_DRIFT_P
     for part in found.parts:
         middle = (part.start_s + part.end_s) / 2.0
         expected = -np.interp(middle, flight.attitude.index, turn)
@@ -126,7 +128,9 @@ def test_motion_capture_flights(shared_logs, log, drifts, low, high):
 def test_a_long_flight_whose_positions_are_thinned_still_has_parts() -> None:
     """1,000 measurements over 25 minutes: further apart than a third of a short part."""
     time = np.linspace(0.0, 1500.0, 1000)
-    parts = heading._parts(time, np.radians(np.full(1000, 4.0)), np.radians(np.full(1000, 1.0)))
+    parts = heading._mean_per_part(
+        time, np.radians(np.full(1000, 4.0)), np.radians(np.full(1000, 1.0))
+    )
     assert len(parts) > 100
     assert parts[0].start_s == 0.0
     assert parts[-1].end_s == 1500.0
@@ -137,5 +141,5 @@ def test_a_heading_drifts_where_it_turned_far_enough() -> None:
     for spread, drift_p, drifts in ((1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)):
         turns = (0.0, spread * heading.MIN_DRIFT_DEG)
         parts = tuple(HeadingPart(float(n), n + 1.0, turn, 0.1) for n, turn in enumerate(turns))
-        found = heading.turned(parts, drift_p, "positions")
+        found = heading.combine_heading_parts(parts, drift_p, "positions")
         assert (found.drifts, found.turn_deg) == (drifts, pytest.approx(np.mean(turns)))

@@ -13,30 +13,30 @@ from ekf2_tools import opened
 from exchange import replace
 from findings_tools import made
 
-from px4fuse.analysis import Counterfactual
-from px4fuse.ekf2.heights import HeightFilter, barometer_samples, with_heights
+from px4fuse.analysis import WhatIfAnalysis
+from px4fuse.ekf2.heights import HeightFilter, add_heights, barometer_samples
 from px4fuse.ekf2.model import Model, run_variants
-from px4fuse.ekf2.recursion import Run, Variant
-from px4fuse.ekf2.stretches import Heights, Stretch
+from px4fuse.ekf2.recursion import StretchRun, Variant
+from px4fuse.ekf2.stretches import HeightSamples, Stretch
 from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight import AidLog, Flight
 from px4fuse.readers import read_log
 from px4fuse.report.whatif import rows
-from px4fuse.report.why import agreement_words
+from px4fuse.report.why import format_agreement
 from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json
 from px4fuse.simulation import ekf2 as simulated
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import scenario_of
+from px4fuse.simulation.scenario import make_scenario
 
 BOTH = ("baro_hgt", "gnss_hgt")
 STEP_S, PERIOD_S = 0.01, 0.1
 
 
-def climbing(heights: Heights, count: int = 400, up_m_s2: float = 0.0) -> Stretch:
+def climbing(heights: HeightSamples, count: int = 400, up_m_s2: float = 0.0) -> Stretch:
     force = np.tile([0.0, 0.0, -9.80665 - up_m_s2], (count, 1))
     return made(
         Stretch, time_s=STEP_S * np.arange(count + 1), step_s=np.full(count, STEP_S),
@@ -47,15 +47,15 @@ def climbing(heights: Heights, count: int = 400, up_m_s2: float = 0.0) -> Stretc
 def sampled(
     steps: list[int], down_m: list[float], *, fused: tuple[str, ...] = BOTH,
     reference: str = "gnss_hgt", dead_m: float = 0.0, weight: float = 1.0,
-) -> Heights:  # fmt: skip
+) -> HeightSamples:  # fmt: skip
     step = np.array(steps)
-    return Heights(
+    return HeightSamples(
         fused, reference, (0.0, 1.0), step, STEP_S * step, np.array(down_m),
         np.full(len(step), dead_m), weight,
     )  # fmt: skip
 
 
-def of_baro(steps: list[int], down_m: list[float], **more: float) -> Heights:
+def of_baro(steps: list[int], down_m: list[float], **more: float) -> HeightSamples:
     """Of the barometer alone."""
     return sampled(steps, down_m, fused=("baro_hgt",), reference="baro_hgt", **more)
 
@@ -70,7 +70,7 @@ def fusing(
     return HeightFilter(stretch, samples[..., None], time_s, there, on, knob, np.array([gated]))
 
 
-def standing(of: Heights, count: int = 400, **how: Any) -> tuple[HeightFilter, pd.DataFrame]:
+def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFilter, pd.DataFrame]:
     """A state that nobody moves, and what the barometer told it at each of its samples."""
     end = np.unique(of.step)
     heights = fusing(climbing(of, count), end, **how)
@@ -152,7 +152,7 @@ def test_one_sample_in_the_log_weighs_as_those_that_ekf2_had() -> None:
         heights = fusing(stretch, np.array([10]))
         x, after = heights.fuse(0, np.zeros((1, 9)), P, np.zeros(1), np.ones(1))
         variances.append((after[0, 8, 8], x[0, 8]))
-        assert heights.told[0, 0, 1, 0] == pytest.approx(0.75)
+        assert heights.update_log[0, 0, 1, 0] == pytest.approx(0.75)
     assert variances[0] == pytest.approx(variances[1])
 
 
@@ -181,7 +181,7 @@ def outdoors(baro_noise_m: float = 0.4) -> Flight:
     noise = {"EKF2_BARO_NOISE": baro_noise_m}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulated, "parameters", lambda *of: usual(*of) | noise)
-        return simulate_flight(scenario_of("outdoor", seed=3, passes=3), parse(()))
+        return simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse(()))
 
 
 @cache
@@ -223,7 +223,7 @@ def test_a_height_that_would_be_rejected_for_long_is_not_predicted() -> None:
     jump.loc[40.0:50.0, "down_m"] += 3.0
     model = opened_once()
     ekf2, other = model.flight.ekf2, replace(flight, barometer=jump)
-    stretches = with_heights(other, ekf2, ekf2.record, model.inputs.stretches)
+    stretches = add_heights(other, ekf2, ekf2.record, model.inputs.stretches)
     jumping = replace(model, inputs=replace(model.inputs, stretches=stretches))
     found = what_if(jumping, [{"EKF2_BARO_GATE": gate} for gate in (3.0, 50.0)])
     assert [one.steady for one in found.whatif] == [False, True]
@@ -239,8 +239,8 @@ def test_a_height_that_does_not_agree_is_named_and_the_rest_stands() -> None:
     assert set(agreement.doubtful) == {"baro_hgt"}
     assert "correlate by" in agreement.doubtful["baro_hgt"]
     assert agreement.baro_hgt["down"].innovation_correlation < 0.95
-    assert ". Not so the barometer, of which nothing is concluded: " in agreement_words(agreement)
-    assert model.flown.besides == {}
+    assert ". Not so the barometer, of which nothing is concluded: " in format_agreement(agreement)
+    assert model.flown.other_aid_updates == {}
     own = np.interp(model.flown.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"])
     assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
     found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
@@ -257,16 +257,16 @@ def test_what_the_log_lacks_of_the_heights_is_said() -> None:
     ekf2, stretches = model.flight.ekf2, model.inputs.stretches
     record = ekf2.record
 
-    def why(meant: dict[str, float], rows: int = 1, **parameters: float) -> str:
+    def why(enabled: dict[str, float], rows: int = 1, **parameters: float) -> str:
         """With aids meant to be fused for so much of the flight; 0 is GNSS from 60 s on."""
         found = {
-            name: made(AidLog, meant=pd.Series([share, 1.0], index=[0.0, 60.0]))
-            for name, share in meant.items()
+            name: made(AidLog, enabled=pd.Series([share, 1.0], index=[0.0, 60.0]))
+            for name, share in enabled.items()
         }
         log = replace(record, parameters=record.parameters | parameters)
         other = replace(flight, barometer=flight.barometer.iloc[::rows])
-        told = with_heights(other, replace(ekf2, aids=found), log, stretches)
-        return told if isinstance(told, str) else ""
+        update_log = add_heights(other, replace(ekf2, aids=found), log, stretches)
+        return update_log if isinstance(update_log, str) else ""
 
     assert why({"baro_hgt": 1.0}) == ""
     assert "range to the ground in a part" in why({"baro_hgt": 1.0, "rng_hgt": 0.0})
@@ -278,23 +278,23 @@ def test_what_the_log_lacks_of_the_heights_is_said() -> None:
     assert "3.3 samples of the barometer" in why({"baro_hgt": 1.0}, rows=3)
     old = {"EKF2_AID_MASK": 1.0}
     log = replace(record, parameters=old)
-    assert "before PX4 v1.14" in with_heights(flight, ekf2, log, stretches)
+    assert "before PX4 v1.14" in add_heights(flight, ekf2, log, stretches)
 
 
 def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
     """covariance.cpp, BADACC_BIAS_PNOISE."""
     inputs = opened_once().inputs
     (stretch,) = inputs.stretches
-    spoilt = replace(stretch, shaken=np.ones(len(stretch.time_s), bool))
+    spoilt = replace(stretch, distrusted_share=np.ones(len(stretch.time_s), bool))
 
-    def ran(one: Stretch, **changed: float) -> Run:
+    def ran(one: Stretch, **changed: float) -> StretchRun:
         settings = inputs.settings | changed
         return run_variants(replace(inputs, stretches=(one,)), [Variant(settings)], {})[0]
 
     np.testing.assert_array_equal(ran(spoilt).state, ran(stretch, EKF2_ACC_NOISE=4.9).state)
     # one axis of three throughout is as a third of the steps
     third = np.sqrt((2.0 * inputs.settings["EKF2_ACC_NOISE"] ** 2 + 4.9**2) / 3.0)
-    clipped = replace(stretch, shaken=np.full(len(stretch.time_s), 1.0 / 3.0))
+    clipped = replace(stretch, distrusted_share=np.full(len(stretch.time_s), 1.0 / 3.0))
     expected = ran(stretch, EKF2_ACC_NOISE=float(third)).variance
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
@@ -305,10 +305,10 @@ def test_axes_at_the_end_of_their_range_are_relied_on_less_in_their_step() -> No
     clipped = pd.Series(0, flight.imu.index)
     at = plain.time_s[[100, 200]] - 1e-4
     clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
-    (told,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.stretches
-    assert not plain.shaken.any()
-    assert told.shaken[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
-    assert np.flatnonzero(told.shaken).tolist() == [100, 200]
+    (update_log,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.stretches
+    assert not plain.distrusted_share.any()
+    assert update_log.distrusted_share[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
+    assert np.flatnonzero(update_log.distrusted_share).tolist() == [100, 200]
 
 
 # ---------------------------------------------------------------- flights of PX4's EKF2
@@ -387,7 +387,7 @@ def test_table_and_results_have_each_sensor_of_height(models: dict[str, Model]) 
     model, changes, without = models["nominal"], {"EKF2_BARO_GATE": 1.5}, {"gnss_hgt": 100.0}
     request = WhatIfRequest(log=model.flight.log.name, changes=changes, without=without)
     asked = what_if(model, [changes], without)
-    found = Counterfactual(model.flight, asked, changes, asked=False, why={}, without=without)
+    found = WhatIfAnalysis(model.flight, asked, changes, asked=False, why={}, without=without)
     said = json.loads(to_json(whatif_results(request, found)))
     jsonschema.validate(said, schema())
     assert said["whatif"]["heights"].keys() == {"baro_hgt"}

@@ -14,8 +14,8 @@ from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import noises_and_clock, turned_frame
-from px4fuse.filter.causes import Hypotheses, explained, hypotheses_of
+from px4fuse.comparison.estimates import estimate_frame_rotation, noises_and_clock
+from px4fuse.filter.causes import DesignMatrix, bias_scale_jump_fit, make_design_matrix
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -30,15 +30,15 @@ from px4fuse.simulation.scenario import Scenario
 
 pytestmark = pytest.mark.usefixtures("quick_filter")
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
-OF_CAUSES = (imu.bias, sent.detect, stamps.arrivals, intervals.thinning)
-DETECTORS = (*OF_CAUSES, source_clock.detect, source_frame.detect, noises.settings_off)
+OF_CAUSES = (imu.bias, sent.detect, stamps.arrivals, intervals.downsampling)
+DETECTORS = (*OF_CAUSES, source_clock.detect, source_frame.detect, noises.deviating_settings)
 
 
 def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analysis:
     """A flight with its noises, its clock and its frame, all that the detectors here need."""
     comparison = compare(flight, settings, axes=("north", "east"), **span)
     tuning, clock = noises_and_clock(comparison)
-    heading = turned_frame(comparison, tuning, clock)
+    heading = estimate_frame_rotation(comparison, tuning, clock)
     return replace(unexplained(comparison), tuning=tuning, clock=clock, heading=heading)
 
 
@@ -64,15 +64,15 @@ def test_responses_are_what_the_filter_itself_makes_of_signals() -> None:
     """Of the measurements, and of these with a step in them, against replays with filterpy."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
-    legs = preintegrate(north, RIGHT)
-    none = np.zeros(len(legs.measurement_m), dtype=bool)
-    measured = legs.measurement_m - legs.initial.position_m
+    intervals = preintegrate(north, RIGHT)
+    none = np.zeros(len(intervals.measurement_m), dtype=bool)
+    measured = intervals.measurement_m - intervals.initial.position_m
     both = replace(
-        legs,
-        delta_position_m=np.outer(legs.delta_position_m, [1.0, 1.0]),
-        delta_velocity_m_s=np.outer(legs.delta_velocity_m_s, [1.0, 1.0]),
+        intervals,
+        delta_position_m=np.outer(intervals.delta_position_m, [1.0, 1.0]),
+        delta_velocity_m_s=np.outer(intervals.delta_velocity_m_s, [1.0, 1.0]),
         measurement_m=np.stack([measured, measured + step[1:]], 1),
-        initial=replace(legs.initial, position_m=0.0),
+        initial=replace(intervals.initial, position_m=0.0),
     )
     nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
     for column, added in zip(nu.T, (0.0, step), strict=True):
@@ -83,22 +83,22 @@ def test_responses_are_what_the_filter_itself_makes_of_signals() -> None:
     # what is not fused, as the filter of the likelihood leaves it out
     skip = np.arange(len(none)) % 7 == 3
     nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
-    expected = innovations(legs, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
+    expected = innovations(intervals, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
 def test_an_axis_of_which_a_gap_tells_less_has_a_filter_of_its_own() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
-    model = hypotheses_of(analysis.flight, axes, RIGHT, 0.10, 0.0)
-    north, east = model.legs
+    model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
+    north, east = model.intervals
     gap = np.zeros_like(east.noise_fixed)
     gap[200] = 0.5, 0.5, 1.0
-    unlike = replace(model, legs=(north, replace(east, noise_fixed=gap)))
+    unlike = replace(model, intervals=(north, replace(east, noise_fixed=gap)))
     skip = np.zeros(len(model.time_s), dtype=bool)
     for each in (model, unlike):
-        fits, (data, columns, _) = each.fit(0.27, skip), each.laid_out(0.27, skip)
-        for at, legs in enumerate(each.legs):
+        fits, (data, columns, _) = each.fit(0.27, skip), each.whitened_design(0.27, skip)
+        for at, legs in enumerate(each.intervals):
             own = replace(
                 legs,
                 measurement_m=legs.measurement_m[:, 0],
@@ -107,35 +107,37 @@ def test_an_axis_of_which_a_gap_tells_less_has_a_filter_of_its_own() -> None:
             )
             nu, s = innovations(own, 0.27, 0.10)
             np.testing.assert_allclose(data[at], nu / np.sqrt(s), atol=1e-9)
-            rest = data[at] - columns[at] @ fits.coefficients
-            np.testing.assert_allclose(fits.rest[fits.axis == at], rest, atol=1e-9)
+            residual = data[at] - columns[at] @ fits.coefficients
+            np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)
 
 
 def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None:
     rng = np.random.default_rng(1)
     columns, data = rng.normal(size=(2, 25, 2)), rng.normal(size=(2, 25))
     skip = np.arange(25) % 5 == 0
-    model = part_of(Hypotheses, prior=np.array([np.inf, 0.5]))
+    model = part_of(DesignMatrix, prior_sigma=np.array([np.inf, 0.5]))
     made = model.regress(data, columns, 0.0, skip)
     columns, data = columns[:, ~skip].reshape(40, 2), data[:, ~skip].ravel()
     assert made.axis.tolist() == [0] * 20 + [1] * 20
     rows = np.vstack([columns, [0.0, 1.0 / 0.5]])
     expected, *_ = np.linalg.lstsq(rows, np.append(data, 0.0), rcond=None)
     np.testing.assert_allclose(made.coefficients, expected, rtol=1e-9)
-    np.testing.assert_allclose(made.rest, data - columns @ expected)
+    np.testing.assert_allclose(made.residual, data - columns @ expected)
     np.testing.assert_allclose(made.covariance, np.linalg.inv(rows.T @ rows), rtol=1e-9)
-    assert made.square == pytest.approx(np.sum((np.append(data, 0.0) - rows @ expected) ** 2))
+    assert made.square_sum == pytest.approx(np.sum((np.append(data, 0.0) - rows @ expected) ** 2))
     # a sigma is widened where more remains than the noises say
     sigma = np.sqrt(made.covariance[0, 0])
     for spread, widened in ((3.0, 3.0), (0.5, 1.0)):
-        assert replace(made, spread=spread).estimate(0).sigma == pytest.approx(widened * sigma)
+        assert replace(made, residual_rms=spread).estimate(0).sigma == pytest.approx(
+            widened * sigma
+        )
 
 
 # ------------------------------------------------------------------ the causes
 
 
 def test_a_clean_flight_has_no_causes_beyond_noise() -> None:
-    causes, low_pass = flown().explained, flown().smoothing
+    causes, low_pass = flown().bias_scale_jump_fit, flown().smoothing
     assert causes.jumps == ()
     assert low_pass.correlation == 0.0
     assert causes.sigma_a_m_s2 == pytest.approx(0.2, rel=0.35)  # the white noise alone
@@ -190,7 +192,7 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
     for seed in range(5):
         flown = simulate_flight(Scenario(ekf2=False, truth=False, seed=seed))
         comparison = compare(flown, RIGHT, axes=("north", "east"))
-        found = explained(
+        found = bias_scale_jump_fit(
             comparison.flight, tuple(result.axis for result in comparison.axes.values()), RIGHT,
             sigma_a_m_s2=0.2, sigma_z_m=0.1, outlier_time_s=np.array([]), clock_offset_s=0.0,
         )  # fmt: skip
@@ -201,7 +203,7 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
 def test_a_jump_is_where_it_was_made_and_outliers_that_end_are_none() -> None:
     assert set(found(flown("nlos=5%"))) == {"source_outliers"}
     assert "source_outliers" not in found(flown("jump=1,40s"))
-    causes = flown("jump=1,40s").explained
+    causes = flown("jump=1,40s").bias_scale_jump_fit
     (jump,) = causes.jumps
     assert jump.time_s == pytest.approx(40.0, abs=0.5)
     heading = np.degrees(np.arctan2(jump.step_m[1].value, jump.step_m[0].value))
@@ -257,7 +259,7 @@ def test_what_a_log_cannot_show_is_not_guessed(mistake, change) -> None:
 
 def test_what_was_not_tuned_is_unavailable_with_a_remedy() -> None:
     untuned = replace(flown("jump=1,40s"), tuning={})
-    assert isinstance(untuned.explained, Unavailable)
+    assert isinstance(untuned.bias_scale_jump_fit, Unavailable)
     assert isinstance(untuned.smoothing, Unavailable)
     assert found(untuned) == {}
 
@@ -266,5 +268,5 @@ def test_what_was_not_tuned_is_unavailable_with_a_remedy() -> None:
 def test_a_flight_of_a_moment_says_nothing(mistake) -> None:
     short = analysed(flight(mistake), start_s=20.0, end_s=25.0)
     assert found(short) == {}
-    assert isinstance(short.explained, Unavailable)
+    assert isinstance(short.bias_scale_jump_fit, Unavailable)
     assert isinstance(short.smoothing, Unavailable)

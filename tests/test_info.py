@@ -18,7 +18,7 @@ from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import Px4FuseError
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.inspect.inventory import Ability, Inventory, Source, take_inventory, to_plain
+from px4fuse.inspect.inventory import AnalysisOption, Inventory, Source, take_inventory, to_plain
 from px4fuse.origin import GNSS
 from px4fuse.readers import read_log
 from px4fuse.recording import Dropout, Sender
@@ -53,7 +53,7 @@ def source(inventory: Inventory, part: str) -> Source:
     return next(source for source in inventory.sources if source.part == part)
 
 
-def ability(inventory: Inventory, name: str) -> Ability:
+def ability(inventory: Inventory, name: str) -> AnalysisOption:
     return next(ability for ability in inventory.abilities if ability.name == name)
 
 

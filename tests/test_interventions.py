@@ -13,17 +13,17 @@ from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.interventions import (
     CLOCK,
-    EXPLAINS,
     FORWARD,
+    MIN_EXPLAINED_SHARE,
     OUTLIERS,
     TURN,
     Intervention,
     cause_of,
     interventions,
-    to_try,
+    planned_variants,
 )
 from px4fuse.comparison.interventions import RIGHT as TO_RIGHT
-from px4fuse.ekf2.model import disturbed, moved, replay_settings
+from px4fuse.ekf2.model import replay_settings, with_misaligned_positions, with_position_noise
 from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.heading import HeadingError
@@ -147,8 +147,10 @@ def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
         assert one.after == pytest.approx(asked.whatif[0].axes[axis].nis_mean, rel=1e-9)
     # it was run along with EKF2 as flown; of other positions it is another
     known = analysis, analysis.tuning, analysis.clock, analysis.heading
-    assert Variant({**model.inputs.settings, **change}) in to_try(*known, model.inputs)
-    once, other = (replay_settings(of, [change])[0] for of in (model, disturbed(model, 0.01, 1)))
+    assert Variant({**model.inputs.settings, **change}) in planned_variants(*known, model.inputs)
+    once, other = (
+        replay_settings(of, [change])[0] for of in (model, with_position_noise(model, 0.01, 1))
+    )
     assert not once.updates.equals(other.updates)
 
 
@@ -181,7 +183,9 @@ def test_outliers_are_left_out_of_stamps_that_are_moved() -> None:
     assert alone.brings_into_band
     model, out = analysis.ekf2_model, analysis.tuning["horizontal"]
     (bare,) = replay_settings(model, [{}], out.outlier_time_s)
-    (late,) = replay_settings(moved(model, 0.0, 0.19), [{}], out.outlier_time_s + 0.19)
+    (late,) = replay_settings(
+        with_misaligned_positions(model, 0.0, 0.19), [{}], out.outlier_time_s + 0.19
+    )
     assert len(late.updates) == pytest.approx(len(bare.updates), abs=2)
     # both are without their outliers
     for each in (bare, late):
@@ -195,7 +199,7 @@ def test_a_parameter_that_is_not_px4s_is_tried() -> None:
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
     model = replace(analysis.ekf2_model, inputs=inputs)
     rows = interventions(analysis, analysis.tuning, analysis.clock, analysis.heading,
-                         analysis.explained, model)  # fmt: skip
+                         analysis.bias_scale_jump_fit, model)  # fmt: skip
     tried = [one.change for one in rows if (one.axis, one.of) == ("aisle", "nis")]
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
@@ -207,7 +211,7 @@ def test_what_explains_too_little_or_too_much_is_no_cause() -> None:
             after=9.0 ** (1.0 - explains), explains=explains, brings_into_band=into,
         )  # fmt: skip
 
-    for explains in (EXPLAINS - 0.01, 1.51, -1.0):
+    for explains in (MIN_EXPLAINED_SHARE - 0.01, 1.51, -1.0):
         assert cause_of([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
     part, whole = one({"sigma_a_m_s2": 0.1}, 0.99), one({"sigma_z_m": 1.0}, 0.9, into=True)
     assert cause_of([part, whole], "kf", "aisle") is whole  # into the band before near to it
@@ -228,7 +232,7 @@ def test_without_what_it_needs_a_candidate_is_not_tried() -> None:
     def tried(**parts: Any) -> set[tuple[str, str]]:
         known: dict[str, Any] = {
             "tuning": analysis.tuning, "clock": analysis.clock, "heading": analysis.heading,
-            "explained": analysis.explained, "model": analysis.ekf2_model,
+            "bias_scale_jump_fit": analysis.bias_scale_jump_fit, "model": analysis.ekf2_model,
         }  # fmt: skip
         rows = interventions(analysis, **{**known, **parts})
         return {(row.filter, name) for row in rows for name in row.change}

@@ -8,7 +8,7 @@ from flights import aisle_flight
 from mavlink_tools import BOOT_S, Aisle, boot, track_of, unix
 from ulog_tools import load
 
-from px4fuse.alignment.joining import join, later
+from px4fuse.alignment.joining import join, shift_times
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, FlightMode, Reset, Unavailable
 from px4fuse.readers import read_log
@@ -116,11 +116,11 @@ def test_every_part_that_lacks_is_taken_and_moved(record):
 def test_times_in_records_move_too(sample_flight):
     ekf2 = replace(sample_flight.ekf2, instances=((0.0, 0), (9.0, 1)), gate=5.0)
     ekf2 = replace(ekf2, resets=(Reset(3.0, "position", (1.0, 0.0, 0.0)),))
-    moved = later(ekf2, 2.5)
+    moved = shift_times(ekf2, 2.5)
     assert moved.instances == ((2.5, 0), (11.5, 1))
     assert moved.resets == (Reset(5.5, "position", (1.0, 0.0, 0.0)),)
     assert (moved.gate, moved.step_s) == (5.0, ekf2.step_s)
-    assert later((FlightMode(1.0, 2.0, "Land"),), 2.5) == (FlightMode(3.5, 4.5, "Land"),)
+    assert shift_times((FlightMode(1.0, 2.0, "Land"),), 2.5) == (FlightMode(3.5, 4.5, "Land"),)
 
 
 def test_missing_names_what_still_lacks_and_nothing_else(record):

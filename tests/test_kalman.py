@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from px4fuse.errors import SettingsError
 from px4fuse.filter import model
-from px4fuse.filter.kalman import UPDATES, replay, state_at, variance_at
+from px4fuse.filter.kalman import UPDATE_COLUMNS, replay, state_at, variance_at
 from px4fuse.filter.model import COVARIANCES, STATES
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
@@ -99,7 +99,7 @@ def test_replay_of_any_axis_equals_the_plain_recursion(axis: Axis, chosen: Setti
     run = replay(axis, chosen)
     states, updates = plain_replay(axis, chosen)
     np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(run.updates[UPDATES], updates, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(run.updates[UPDATE_COLUMNS], updates, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["sigma_a_m_s2", "sigma_z_m", "dt_s", "clock_offset_s"])
@@ -156,7 +156,7 @@ def test_variance_between_steps_is_predicted_from_the_step_before(dt: float, gap
         for k, at in enumerate(times):
             step = run.steps.iloc[k]
             ahead = at - edges[k]
-            P = model.matrix(step[COVARIANCES])
+            P = model.symmetric_matrix(step[COVARIANCES])
             F = np.array([[1.0, ahead], [0.0, 1.0]])
             q = (0.7**2 + step["input_variance_m2_s4"]) * dt
             Q = q * np.array([[ahead**3 / 4.0, ahead**2 / 2.0], [ahead**2 / 2.0, ahead]])
@@ -210,13 +210,17 @@ P = (0.5, -0.2, 0.7)
 @pytest.mark.parametrize("dt", [0.01, 0.1, 0.7])
 def test_elements_are_those_of_the_matrices(dt: float) -> None:
     f, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2.0], [dt]])
-    spread = f @ model.matrix(P) @ f.T
-    np.testing.assert_allclose(model.matrix(model.spread(P, dt)), spread, rtol=1e-14)
+    propagate_covariance = f @ model.symmetric_matrix(P) @ f.T
+    np.testing.assert_allclose(
+        model.symmetric_matrix(model.propagate_covariance(P, dt)), propagate_covariance, rtol=1e-14
+    )
     x = np.array([[1.5], [-2.0]])
     moved = f @ x + b * 3.0
-    np.testing.assert_allclose(model.move(1.5, -2.0, 3.0, dt), moved[:, 0], rtol=1e-14)
+    np.testing.assert_allclose(model.propagate_state(1.5, -2.0, 3.0, dt), moved[:, 0], rtol=1e-14)
     # Q = B Bᵀ / dt: the acceleration is constant over the step
-    np.testing.assert_allclose(model.matrix(model.noise(dt)), b @ b.T / dt, rtol=1e-14)
+    np.testing.assert_allclose(
+        model.symmetric_matrix(model.process_noise_unit(dt)), b @ b.T / dt, rtol=1e-14
+    )
 
 
 def test_many_short_steps_add_the_limit() -> None:
@@ -224,6 +228,9 @@ def test_many_short_steps_add_the_limit() -> None:
     dt = total / count
     covariance = (0.0, 0.0, 0.0)
     for _ in range(count):
-        spread, added = model.spread(covariance, dt), model.noise(dt)
-        covariance = tuple(a + b for a, b in zip(spread, added, strict=True))
-    np.testing.assert_allclose(covariance, model.noise_of_many_steps(total), rtol=1e-7)
+        propagate_covariance, added = (
+            model.propagate_covariance(covariance, dt),
+            model.process_noise_unit(dt),
+        )
+        covariance = tuple(a + b for a, b in zip(propagate_covariance, added, strict=True))
+    np.testing.assert_allclose(covariance, model.continuous_noise_unit(total), rtol=1e-7)

@@ -12,12 +12,12 @@ from scipy.stats import norm
 
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import (
+    filter_states,
     innovations,
     parabola_vertex,
     preintegrate,
-    recursion,
-    states,
-    total_over_grid,
+    run_filter,
+    score_grid,
 )
 from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
@@ -76,7 +76,7 @@ def test_an_imu_gap_costs_the_same_in_both_filters() -> None:
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings)
 def test_states_equal_the_replay_at_the_measurements(axis: Axis, chosen: Settings) -> None:
-    grid = states(
+    grid = filter_states(
         preintegrate(axis, chosen), chosen.sigma_a_m_s2 * np.array([[2.0], [1.0]]), chosen.sigma_z_m
     )
     run = replay(axis, chosen)
@@ -109,11 +109,11 @@ def test_a_skipped_measurement_is_compared_but_not_fused() -> None:
 def test_a_weight_is_a_smaller_variance_of_its_measurement() -> None:
     """A weight of 1/w² is SIGMA_Z times w; hardly any weight is a measurement left out."""
     legs = preintegrate(walk(count=40), ZERO)
-    rows = list(recursion(legs, 0.5, 0.2, None, np.full(39, 4.0)))
+    rows = list(run_filter(legs, 0.5, 0.2, None, np.full(39, 4.0)))
     heavier = innovations(legs, 0.5, 0.1)
     np.testing.assert_allclose([row[:2] for row in rows], np.transpose(heavier), rtol=1e-12)
     skip = np.arange(39) % 7 == 3
-    left_out = list(recursion(legs, 0.5, 0.1, None, np.where(skip, 1e-14, 1.0)))
+    left_out = list(run_filter(legs, 0.5, 0.1, None, np.where(skip, 1e-14, 1.0)))
     nu, s = innovations(legs, 0.5, 0.1, skip)
     np.testing.assert_allclose([row[0] for row in left_out], nu, rtol=1e-6)
     np.testing.assert_allclose(np.array([row[1] for row in left_out])[~skip], s[~skip], rtol=1e-6)
@@ -124,7 +124,7 @@ def test_the_likelihood_over_a_grid_is_that_of_normal_innovations() -> None:
     axes = walk(4, count=60), walk(5, count=60)
     a, z = np.array([0.2, 0.5, 2.0]), np.array([0.05, 0.1])
     legs = [preintegrate(axis, ZERO) for axis in axes]
-    total = total_over_grid(legs, a[:, None], z, np.ones(59))
+    total = score_grid(legs, a[:, None], z, np.ones(59))
     density = np.zeros((3, 2))
     for axis in axes:
         for i, j in np.ndindex(3, 2):

@@ -15,8 +15,8 @@ from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop
 from px4fuse.flight import Unavailable
 from px4fuse.lesson import ODOMETRY_M, loop_lines
-from px4fuse.loop.analysis import analyse, loop_in
-from px4fuse.loop.corrections import BY_DISTANCE, PLAIN, SINGLE_LOOP
+from px4fuse.loop.analysis import analyse, analyse_flight_loop
+from px4fuse.loop.corrections import BY_DISTANCE, POSITIONS_ONLY, SINGLE_LOOP
 from px4fuse.loop.model import Loop, OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.tracks import LoopSource, read_source, split_part
@@ -150,11 +150,11 @@ def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop
 
 
 def test_without_a_known_heading_there_is_one_correction_by_distance(sample, sample_loop) -> None:
-    assert [part.name for part in sample_loop.reported[1:3]] == [PLAIN, BY_DISTANCE]
+    assert [part.name for part in sample_loop.reported_paths[1:3]] == [POSITIONS_ONLY, BY_DISTANCE]
     found = loop_of(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
-    names = [part.name for part in found.reported]
-    assert PLAIN in names
+    names = [part.name for part in found.reported_paths]
+    assert POSITIONS_ONLY in names
     assert BY_DISTANCE not in names
     plain, turned = (path(found, way).trajectory for way in ("by_distance_plain", "by_distance"))
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
@@ -181,7 +181,7 @@ def test_an_absolute_track_is_not_taken_for_odometry() -> None:
     found = analyse(source)
     assert found.absolute
     assert "loop_of_absolute_track" in {finding.id for finding in find_loop(found)}
-    assert isinstance(loop_in(source.flight), Unavailable)
+    assert isinstance(analyse_flight_loop(source.flight), Unavailable)
 
 
 # ------------------------------------------------------------------ laps with known drift

@@ -9,19 +9,19 @@ from findings_tools import made
 from scipy.spatial.transform import Rotation
 from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
-from px4fuse.ekf2.magnetometer import Samples, fuse_field, gather
-from px4fuse.ekf2.stretches import Sensed, Stretch, _field_s, _mean_field
+from px4fuse.ekf2.magnetometer import EventSamples, fuse_field, mean_by_event
+from px4fuse.ekf2.stretches import SensorSamples, Stretch, _field_span, _mean_field
 from px4fuse.flight import Columns, FusionRecord
 from px4fuse.readers import read_log
 
 EARTH = np.array([0.21, 0.015, 0.43])
 
 
-def told(rotation: Rotation, body: np.ndarray, size: int = 1) -> Samples:
+def told(rotation: Rotation, body: np.ndarray, size: int = 1) -> EventSamples:
     """What the magnetometer of a body that stands so measures."""
     turn = rotation.inv().as_matrix()
     value = np.tile(turn @ EARTH + body, (size, 1))
-    return Samples(value, np.tile(turn, (size, 1, 1)), np.ones(size), np.zeros(size))
+    return EventSamples(value, np.tile(turn, (size, 1, 1)), np.ones(size), np.zeros(size))
 
 
 def knowing(size: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +92,7 @@ def test_each_variant_has_its_own_noise_and_gate_and_takes_what_it_was_sent() ->
     np.testing.assert_allclose(told_of[0, [0, 1, 3], 0], 0.3)
     assert np.isnan(told_of[:, 2]).all()
     # 0.01 gauss of noise at least, as mag_control.cpp has it
-    least, *_ = fuse_field(x[:1], P[:1], Samples(*(each[:1] for each in seen)),
+    least, *_ = fuse_field(x[:1], P[:1], EventSamples(*(each[:1] for each in seen)),
                            np.array([0.01]), np.array([100.0]))  # fmt: skip
     np.testing.assert_allclose(after[3], least[0])
 
@@ -102,8 +102,8 @@ def test_samples_are_fused_at_the_first_event_after_them() -> None:
     gauss = np.arange(12.0).reshape(4, 3)
     step = np.array([2, 3, 6, 9])
     turn = rotation[step].transpose(0, 2, 1)
-    sensed = Sensed(step, gauss, turn, np.full(4, 2.0), np.array([0.1, 0.3, 0.2, 0.4]))
-    found = gather(sensed, np.array([1, 3, 6, 6, 8]))
+    sensed = SensorSamples(step, gauss, turn, np.full(4, 2.0), np.array([0.1, 0.3, 0.2, 0.4]))
+    found = mean_by_event(sensed, np.array([1, 3, 6, 6, 8]))
     np.testing.assert_allclose(found.noise, [0.0, 0.2, 0.2, 0.0, 0.0])
     assert found.number.tolist() == [0.0, 4.0, 2.0, 0.0, 0.0]
     np.testing.assert_allclose(found.value[1], gauss[:2].mean(axis=0))
@@ -211,7 +211,7 @@ def settled(frame_hz: float, on: slice, count: int = 60) -> tuple[float, float] 
     fused = np.zeros(count)
     fused[on] = 1.0
     frame = pd.DataFrame({"fused_3d": fused}, index=np.arange(count) / frame_hz)
-    return _field_s(made(FusionRecord, field_gauss=frame))
+    return _field_span(made(FusionRecord, field_gauss=frame))
 
 
 def test_the_magnetometer_is_replayed_where_all_of_it_was_fused_without_a_break() -> None:

@@ -23,21 +23,28 @@ from px4fuse.filter.fitting import (
     NoiseFit,
     Noises,
     _outlier_probability,
-    filter_part,
-    fitted,
-    most_likely,
+    filter_positions,
+    fit_noises,
+    maximise_likelihood,
     negative_log_likelihood,
-    widened_by_outliers,
+    outlier_variance_factor,
 )
 from px4fuse.filter.likelihood import (
     PROFILE_DROP,
     innovations,
     preintegrate,
     profile_ends,
-    total_over_grid,
+    score_grid,
 )
-from px4fuse.filter.marginal import Positions, centred, factorise, fit, paired_products, squares
-from px4fuse.filter.model import noise_of_many_steps
+from px4fuse.filter.marginal import (
+    Positions,
+    centre_on_path,
+    expected_squares,
+    factorise,
+    fit_positions,
+    products_by_stretch,
+)
+from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 
@@ -60,7 +67,7 @@ def test_the_system_is_that_of_the_dense_normal_equations(seed: int) -> None:
     second = int(rng.integers(3, count - 2))
     joined = np.arange(1, count) != second
     length = rng.uniform(0.05, 0.6, count - 1)
-    noise = rng.uniform(0.001, 0.4) * np.stack(noise_of_many_steps(length))
+    noise = rng.uniform(0.001, 0.4) * np.stack(continuous_noise_unit(length))
     noise[[0, 2]] += rng.choice([0.0, 0.003], count - 1)
     precision = np.stack([rng.uniform(1.0, 100.0, count), np.zeros(count)], 1)
     precision[[0, second], 1] = 0.5, 2.0
@@ -141,7 +148,7 @@ def with_constants(offsets: int = 3) -> Positions:
     initial[START] = WEAK
     return Positions(
         measurement_m=measured, start=START, length_s=length,
-        noise_unit=0.1 * np.stack(noise_of_many_steps(length)),
+        noise_unit=0.1 * np.stack(continuous_noise_unit(length)),
         noise_fixed=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
         initial=initial, constant_sigma=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
@@ -150,7 +157,7 @@ def with_constants(offsets: int = 3) -> Positions:
 
 
 def arguments(positions: Positions, noises: Noises, weight: Array) -> tuple[Any, float, Array]:
-    """What :func:`fit` takes."""
+    """What :func:`fit_positions` takes."""
     if noises.slow_m:
         positions = replace(positions, slow=(noises.slow_m, noises.tau_s))
     scaled, variance = positions.over(1.0, noises.walk_m, weight / noises.sigma_z_m**2)
@@ -213,10 +220,12 @@ def test_marginal_constants_are_a_covariance() -> None:
 
     expected = np.array([[dense(noises, at) for at in range(3)] for noises in SOME_NOISES])
     assert np.ptp(expected) > 1000.0
-    ours = np.array([fit(*arguments(part, noises, WEIGHT)).totals()[0] for noises in SOME_NOISES])
+    ours = np.array(
+        [fit_positions(*arguments(part, noises, WEIGHT)).totals()[0] for noises in SOME_NOISES]
+    )
     np.testing.assert_allclose(ours - ours[0, 0], expected - expected[0, 0], rtol=1e-5, atol=1e-3)
     # over SIGMA_Z, which only changes what is as good as unknown
-    scaled = np.array([fitted([part], noises, WEIGHT).totals()[0] for noises in SOME_NOISES])
+    scaled = np.array([fit_noises([part], noises, WEIGHT).totals()[0] for noises in SOME_NOISES])
     np.testing.assert_allclose(scaled - scaled[0, 0], ours - ours[0, 0], rtol=1e-5, atol=1e-3)
 
 
@@ -230,7 +239,7 @@ def test_an_axis_that_is_hardly_measured_says_nothing(start_known: bool) -> None
     without[15, 2] = np.nan
     for noises in SOME_NOISES:
         both = part, replace(part, measurement_m=without)
-        one, none = (fit(*arguments(each, noises, np.ones(COUNT))) for each in both)
+        one, none = (fit_positions(*arguments(each, noises, np.ones(COUNT))) for each in both)
         np.testing.assert_allclose(one.totals(), none.totals(), rtol=1e-12)
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
@@ -242,7 +251,7 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
     for noises in SOME_NOISES[:5]:
         variance, square = np.full(COUNT, noises.sigma_z_m**2), np.zeros(COUNT)
         arranged = arguments(part, noises, np.ones(COUNT))
-        constants = fit(*arranged).constants()[:, 0]
+        constants = fit_positions(*arranged).constants()[:, 0]
         for stretch in range(2):
             _, _, made = joint_normal(part, noises, variance, stretch)
             information, right = np.diag(part.constant_sigma**-2.0), np.zeros(3)
@@ -257,7 +266,7 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
                 r = np.diag(variance[rows])
                 error = r @ np.linalg.solve(covariance, signals @ [1.0, *found])
                 square[rows] += error**2 + np.diag(r - r @ np.linalg.solve(covariance, r))
-        ours, count = squares(*arranged, constants)
+        ours, count = expected_squares(*arranged, constants)
         np.testing.assert_allclose(ours, square, rtol=1e-4, atol=1e-9)
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
@@ -268,14 +277,14 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
     still = np.zeros((3, 2, COUNT - 1))
     first, second = signal.transpose(1, 2, 0), signal[..., [1, 1]].transpose(1, 2, 0)
     given = arguments(part, noises, np.ones(COUNT))
-    ours = paired_products(*given, (first, still, still), second)
+    ours = products_by_stretch(*given, (first, still, still), second)
     # a path to which the legs lead is not seen
     legs = np.random.default_rng(9).normal(0.0, 1.0, (2, *still.shape))
     path, speed = np.zeros((2, *first.shape))
     for at in np.flatnonzero(part.joined):
         path[..., at + 1] = path[..., at] + part.length_s[at] * speed[..., at] + legs[0, ..., at]
         speed[..., at + 1] = speed[..., at] + legs[1, ..., at]
-    moved = paired_products(*given, (first + path, *legs), second)
+    moved = products_by_stretch(*given, (first + path, *legs), second)
     np.testing.assert_allclose(moved, ours, rtol=1e-3, atol=1e-3)
     for stretch in range(2):
         _, covariance, made = joint_normal(part, noises, given[2], stretch)
@@ -286,15 +295,17 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
 
 def test_a_smooth_path_taken_out_changes_nothing() -> None:
     part = with_constants()
-    given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centred(part))]
-    plain, ours = (fit(*each).totals()[0] for each in given)
+    given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
+    plain, ours = (fit_positions(*each).totals()[0] for each in given)
     assert np.ptp(plain) > 1.0
     np.testing.assert_allclose(ours, plain, rtol=1e-7)
     # a scale's signal is the path to which each offset leads
-    scaled = fit(*arguments(centred(part, scaled=True), SOME_NOISES[0], WEIGHT)).gram
+    scaled = fit_positions(
+        *arguments(centre_on_path(part, scaled=True), SOME_NOISES[0], WEIGHT)
+    ).gram
     way, speed = part.delta_position_m[:, 1:2], part.delta_velocity_m_s[:, 1:2]
     alone = replace(part, delta_position_m=way, delta_velocity_m_s=speed)
-    one = fit(*arguments(centred(alone, scaled=True), SOME_NOISES[0], WEIGHT)).gram
+    one = fit_positions(*arguments(centre_on_path(alone, scaled=True), SOME_NOISES[0], WEIGHT)).gram
     assert np.ptp(scaled[..., -1, -1]) > 1.0
     np.testing.assert_allclose(scaled[:, [1]], one, rtol=1e-7, atol=1e-7)
 
@@ -302,7 +313,7 @@ def test_a_smooth_path_taken_out_changes_nothing() -> None:
 @pytest.mark.parametrize("which", ["filter", "constants"])
 def test_the_likelihood_between_its_nodes_is_the_likelihood(which: str) -> None:
     """Over four powers of ten of the ratio and of SIGMA_Z, but for one number always the same."""
-    parts = [filter_part(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
+    parts = [filter_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
         part = with_constants(offsets=1)
         parts = [replace(part, noise_fixed=0.0 * part.noise_fixed)]
@@ -344,13 +355,13 @@ def test_the_filters_likelihood_is_that_of_its_innovations(interval: float | Non
     weight = np.ones(len(nu))
     expected = 0.5 * np.sum(np.log(s) + nu**2 / s, axis=0)
     assert np.ptp(expected) > 50.0
-    np.testing.assert_allclose(total_over_grid([legs], a, z, weight), expected, rtol=1e-9)
-    part = [filter_part(legs)]
+    np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
+    part = [filter_positions(legs)]
     ours = np.array([negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs])
     np.testing.assert_allclose(ours - ours[0], expected - expected[0], rtol=1e-6, atol=2e-3)
     # weights mean the same in both
     weight = np.random.default_rng(1).uniform(0.01, 1.0, len(nu))
-    grid = total_over_grid([legs], a, z, weight)
+    grid = score_grid([legs], a, z, weight)
     ours = np.array([negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs])
     np.testing.assert_allclose(ours - ours[0], grid - grid[0], rtol=2e-3, atol=0.02)
 
@@ -382,23 +393,25 @@ def pair(seed: int) -> tuple[Axis, Axis]:
     return modelled(seed, MANY), modelled(seed + 500, MANY)
 
 
-def spoiled(axis: Axis, outlier: Array, size_m: float, seed: int) -> Axis:
-    wrong = np.random.default_rng(seed).choice([-size_m, size_m], len(outlier))
-    return line(axis.measurement_time_s, axis.measurement_m + np.where(outlier, wrong, 0.0))
+def spoiled(axis: Axis, outlier_probability: Array, size_m: float, seed: int) -> Axis:
+    wrong = np.random.default_rng(seed).choice([-size_m, size_m], len(outlier_probability))
+    return line(
+        axis.measurement_time_s, axis.measurement_m + np.where(outlier_probability, wrong, 0.0)
+    )
 
 
 def bursts(seed: int, share: float, length: int) -> Array:
     rng = np.random.default_rng(seed + 77)
-    outlier = np.zeros(MANY + 1, dtype=bool)
-    while outlier.sum() < share * MANY:
+    outlier_probability = np.zeros(MANY + 1, dtype=bool)
+    while outlier_probability.sum() < share * MANY:
         at = rng.integers(1, MANY + 1 - length)
-        outlier[at : at + length] = True
-    return outlier
+        outlier_probability[at : at + length] = True
+    return outlier_probability
 
 
 def noises_of(*axes: Axis) -> NoiseFit:
-    parts = [filter_part(preintegrate(axis, TRUE)) for axis in axes]
-    return most_likely(parts, Noises(TRUE.sigma_a_m_s2, TRUE.sigma_z_m), np.ones(MANY))
+    parts = [filter_positions(preintegrate(axis, TRUE)) for axis in axes]
+    return maximise_likelihood(parts, Noises(TRUE.sigma_a_m_s2, TRUE.sigma_z_m), np.ones(MANY))
 
 
 @pytest.fixture(scope="module")
@@ -414,17 +427,20 @@ def test_outliers_are_found_and_do_not_move_the_noise(clean, share, size_m, leng
     hits = wrong = missed = 0
     ratio = []
     for seed in SEEDS:
-        outlier = bursts(seed, share, length)
+        outlier_probability = bursts(seed, share, length)
         north, east = pair(seed)
-        axes = spoiled(north, outlier, size_m, seed), spoiled(east, outlier, size_m, seed + 50)
+        axes = (
+            spoiled(north, outlier_probability, size_m, seed),
+            spoiled(east, outlier_probability, size_m, seed + 50),
+        )
         found = noises_of(*axes)
         ratio.append(found.noises.sigma_z_m / clean[seed].noises.sigma_z_m)
-        called = found.outlier > 0.5
-        hits += np.count_nonzero(called & outlier[1:])
-        wrong += np.count_nonzero(called & ~outlier[1:])
-        missed += np.count_nonzero(~called & outlier[1:])
+        called = found.outlier_probability > 0.5
+        hits += np.count_nonzero(called & outlier_probability[1:])
+        wrong += np.count_nonzero(called & ~outlier_probability[1:])
+        missed += np.count_nonzero(~called & outlier_probability[1:])
         # what is called an outlier counts little, and all else counts
-        assert np.all(found.weight[called & outlier[1:]] < 0.6)
+        assert np.all(found.weight[called & outlier_probability[1:]] < 0.6)
         assert np.median(found.weight) > 0.98
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.025)
     assert hits / (hits + missed) > least_found
@@ -458,17 +474,17 @@ def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(axes, 
     sigma, wide = np.exp(best[0]), np.exp(best[1])
     over = square / sigma**2
     found = _outlier_probability(over, np.full(4000, axes), float(expit(best[2])), float(wide))
-    widening = widened_by_outliers(over, np.full(4000, axes), found, float(wide))
+    widening = outlier_variance_factor(over, np.full(4000, axes), found, float(wide))
     assert widening > 1.1
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
 def test_without_a_search_the_weights_stay() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
-    parts = [filter_part(preintegrate(pair(1)[0], TRUE))]
-    found = most_likely(parts, Noises(0.5, 0.1), weight, outliers=False)
+    parts = [filter_positions(preintegrate(pair(1)[0], TRUE))]
+    found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, outliers=False)
     np.testing.assert_array_equal(found.weight, weight)
-    assert not found.outlier.any()
+    assert not found.outlier_probability.any()
     best = negative_log_likelihood(parts, found.noises, weight)
     for a, z in ((1.1, 1.0), (0.9, 1.0), (1.0, 1.05), (1.0, 0.95)):
         other = Noises(a * found.noises.sigma_a_m_s2, z * found.noises.sigma_z_m)

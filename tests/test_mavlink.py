@@ -397,6 +397,24 @@ def test_integer_parameters_are_bytes_in_px4_and_casts_in_ardupilot(read, autopi
     assert flight.ekf2.gate == 3.5
 
 
+def test_parameter_out_of_range_becomes_default_with_note(read):
+    recorder = Aisle().record()
+    for name, value in (
+        (b"EKF2_EVP_GATE", 0.0),
+        (b"EKF2_EVP_NOISE", 1e30),
+        (b"EKF2_EV_DELAY", 300.0),
+    ):
+        recorder.hear(unix(60.0), AUTOPILOT, parameter(name, value, by_bytes=True))
+    flight = read(recorder)
+    notes = [note for note in flight.log.notes if "EKF2_" in note]
+    assert notes == [
+        "EKF2_EVP_GATE 0 SD is outside PX4's range 1 to 1000; the default 5 is used.",
+        "EKF2_EVP_NOISE 1e+30 m is outside PX4's range 0.01 to 1000; the default 0.1 is used.",
+    ]
+    assert flight.ekf2.gate == 5.0
+    assert flight.log.parameters["EKF2_EV_DELAY"] == 300.0
+
+
 @pytest.mark.parametrize(
     "lacking", [(), ("VISION_POSITION_ESTIMATE",), ("HIGHRES_IMU", "ODOMETRY")]
 )
@@ -478,7 +496,11 @@ def test_gnss_is_a_position_about_the_autopilots_origin(read, origin, clock):
     """Also where the receiver stamps by its own clock."""
     flight = read(outdoors(origin=origin, clock=clock))
     (track,) = flight.positions
-    assert (track.name, track.origin.by_gnss, track.origin.automatic) == ("GPS_RAW_INT", True, True)
+    assert (track.name, track.origin.fused_as_gnss, track.origin.is_automatic) == (
+        "GPS_RAW_INT",
+        True,
+        True,
+    )
     assert track.age_s == pytest.approx(0.11)
     true = np.array([Aisle().path(BOOT_S + t)[0] for t in track.samples.index])
     exact_m = 0.02 if clock is same else 0.03
@@ -507,7 +529,7 @@ def test_the_height_of_a_recording_may_be_the_barometers(read):
 
 def test_gnss_is_not_taken_by_itself_where_the_autopilot_does_not_know_where_it_is(read):
     flight = read(outdoors(knows=False))
-    assert not flight.positions[0].origin.automatic
+    assert not flight.positions[0].origin.is_automatic
     with pytest.raises(MissingDataError, match="`position_source` GPS_RAW_INT"):
         compare(flight)
 

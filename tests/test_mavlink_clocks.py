@@ -30,7 +30,7 @@ from mavlink_tools import (
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Flight, sample_rate
 from px4fuse.readers import read_log
-from px4fuse.readers.mavlink_clocks import Line, least_delay, map_clock
+from px4fuse.readers.mavlink_clocks import Line, fit_least_delay, map_clock
 
 NOTHING = np.zeros(0)
 NO_EXCHANGES = (NOTHING, NOTHING), (NOTHING, NOTHING)
@@ -57,7 +57,7 @@ def test_offset_and_drift_come_back_under_one_sided_delays(offset, drift_ppm, le
     rng = np.random.default_rng(seed)
     x = np.arange(1200) * 0.1
     exact = offset + (1.0 + drift_ppm * 1e-6) * x
-    line = least_delay(x, exact + least + rng.exponential(scale, len(x)))
+    line = fit_least_delay(x, exact + least + rng.exponential(scale, len(x)))
     error = line.at(x) - exact - least
     rounding = 4.0 * np.spacing(abs(offset) + 200.0)
     assert np.all(error > -0.2 * scale - rounding)
@@ -68,7 +68,7 @@ def test_offset_and_drift_come_back_under_one_sided_delays(offset, drift_ppm, le
 @pytest.mark.parametrize(("span", "slope"), [(100.0, 1.00005), (20.0, 1.0)])
 def test_without_delay_the_line_is_exact_and_a_short_span_tells_no_drift(span, slope):
     x = np.linspace(0.0, span, 500)
-    line = least_delay(x, 7.0 + 1.00005 * x)
+    line = fit_least_delay(x, 7.0 + 1.00005 * x)
     assert (line.pairs, line.slope) == (500, pytest.approx(slope, abs=1e-12))
     np.testing.assert_allclose(line.at(x), 7.0 + 1.00005 * x, atol=1e-9 if span > 30 else 1e-3)
     np.testing.assert_allclose(line.inverse().at(line.at(x)), x, atol=1e-9)
@@ -80,7 +80,7 @@ def test_without_delay_the_line_is_exact_and_a_short_span_tells_no_drift(span, s
 def test_a_recording_replayed_at_another_speed_is_mapped(speed, span):
     x = np.linspace(0.0, span, 600)
     delay = np.random.default_rng(1).exponential(0.01, len(x))
-    line = least_delay(x, 5.0 + speed * x + delay)
+    line = fit_least_delay(x, 5.0 + speed * x + delay)
     assert line.slope == pytest.approx(speed, rel=0.01)
     assert np.abs(line.at(x) - 5.0 - speed * x).max() < 0.05
 
@@ -93,7 +93,7 @@ def test_a_recording_replayed_at_another_speed_is_mapped(speed, span):
 @settings(max_examples=100)
 def test_any_pairs_give_a_line_that_can_be_turned_round(pairs):
     x, y = np.array(pairs).T
-    line = least_delay(x, y)
+    line = fit_least_delay(x, y)
     turned = line.inverse()
     assert line.slope > 0.0
     assert turned.slope > 0.0

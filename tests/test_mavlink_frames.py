@@ -142,7 +142,7 @@ def agrees(path: Path) -> None:
     assert (frames.received_us is not None) == with_stamps
     assert len(frames) - count == BEYOND_PYMAVLINK.get(path.name, 0)
     if path.name not in BEYOND_PYMAVLINK:  # else pymavlink takes some of those for unknown ones
-        assert frames.passed_over == unknown
+        assert frames.unknown_frame_count == unknown
 
 
 def test_the_sample_tlog_is_read_as_pymavlink_reads_it(sample_log):
@@ -229,17 +229,19 @@ JUNK = {"zeros": b"\x00" * 50, "starts": b"\xfd" * 50, "old starts": b"\xfe" * 3
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
-@pytest.mark.parametrize(("parts", "good", "passed_over", "bad"), [
+@pytest.mark.parametrize(("parts", "good", "unknown_frame_count", "bad"), [
     pytest.param(SIGNED, range(10), 0, 0, id="signed"),
     pytest.param([*BEATS[:4], *UNKNOWN, *BEATS[4:]], range(10), 3, 0, id="unknown"),
     pytest.param([*BEATS[:4], spoilt(BEATS[4]), *BEATS[5:]], (0, 1, 2, 3, 5, 6, 7, 8, 9), 0, 1,
                  id="damaged"),
 ])  # fmt: skip
-def test_frames_are_good_unknown_or_damaged(read, parts, good, passed_over, bad, with_stamps):
+def test_frames_are_good_unknown_or_damaged(
+    read, parts, good, unknown_frame_count, bad, with_stamps
+):
     """A signature is no bad byte, an unknown frame costs nothing else."""
     frames = read(stamped(*parts) if with_stamps else b"".join(parts))
     assert frames.sequence.tolist() == [*good]
-    assert frames.passed_over == passed_over
+    assert frames.unknown_frame_count == unknown_frame_count
     assert frames.bad_bytes == bad * (len(BEATS[4]) + 8 * with_stamps)
 
 
@@ -365,7 +367,7 @@ def test_any_mixture_gives_back_its_good_frames(tmp_path_factory, kinds):
     path.write_bytes(b"".join(parts))
     frames = read_frames(path.name, path.read_bytes())
     assert len(frames) == good
-    assert frames.passed_over <= kinds.count("unknown")
+    assert frames.unknown_frame_count <= kinds.count("unknown")
 
 
 # ---- what is no MAVLink, and what it costs ------------------------------------------------------
@@ -444,3 +446,11 @@ def test_a_frame_costs_a_bounded_amount(tmp_path, make, each_bytes, more_bytes):
     assert len(flight.log.senders) <= 32
     assert len(read_frames(path.name, path.read_bytes())) == len(parts)
     assert peak < path.stat().st_size + each_bytes * len(parts) + more_bytes
+
+
+def test_a_recording_that_ends_in_flight_says_so(tmp_path, sample_log):
+    content = sample_log.with_suffix(".tlog").read_bytes()
+    path = tmp_path / "half.tlog"
+    path.write_bytes(content[: len(content) // 2])
+    assert read_log(path).log.ends_in_flight
+    assert not read_log(sample_log.with_suffix(".tlog")).log.ends_in_flight

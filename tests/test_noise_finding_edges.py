@@ -34,9 +34,9 @@ from px4fuse.comparison.model import Difference
 from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.tuning import HeldOut, Noise
+from px4fuse.filter.tuning import HeldOutCheck, Noise
 from px4fuse.findings import Finding, hidden_errors, loops, noises, since
-from px4fuse.findings.causes import by_cause
+from px4fuse.findings.causes import group_by_cause
 from px4fuse.findings.noises import _is_default
 from px4fuse.findings.story import story
 from px4fuse.loop.model import Closure, Loop
@@ -51,14 +51,14 @@ RIGHT = Noise(1.0, 0.9, 1.1)
 def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a replay would be made with stands in its place."""
 
-    said, tried_out = noises.remedy.filter_words, list[Settings]()
+    said, tried_out = noises.remedy.format_kf_remedy, list[Settings]()
 
     def words(of: Any, changes: Any, more: str = "", unseen_nats: float | None = None) -> str:
         typed = said(of, changes, more).removeprefix("px4fuse compare LOG ").removesuffix(".")
         changed = tried_out[-1]
         return f"[{typed}|{changed.sigma_z_m:g}|{changed.sigma_a_m_s2:g}|{unseen_nats}]."
 
-    monkeypatch.setattr(noises.remedy, "filter_words", words)
+    monkeypatch.setattr(noises.remedy, "format_kf_remedy", words)
     monkeypatch.setattr(noises.remedy, "filter_errors_m", lambda _, new: tried_out.append(new))
 
 
@@ -84,7 +84,7 @@ def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )  # fmt: skip
 def test_a_setting_that_is_off(chosen: float, asked: Noise, expected: Any) -> None:
-    off = noises.off_by("sigma_z_m", chosen, asked)
+    off = noises.setting_deviation("sigma_z_m", chosen, asked)
     if off is None or expected is None:
         assert off is expected
         return
@@ -92,9 +92,9 @@ def test_a_setting_that_is_off(chosen: float, asked: Noise, expected: Any) -> No
 
 
 def test_both_settings_are_told_together_the_worse_one_first() -> None:
-    held = made(HeldOut, gain_nats=0.25)
+    held = made(HeldOutCheck, gain_nats=0.25)
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11), held_out=held)
-    worse, other = noises.settings_off(analysis(source=MOVING, tuning=fitted))
+    worse, other = noises.deviating_settings(analysis(source=MOVING, tuning=fitted))
     assert (worse.id, worse.caused_by) == ("sigma_a_large", None)
     assert (other.id, other.caused_by) == ("sigma_z_large", "sigma_a_large")
     assert worse.severity == "error"
@@ -102,19 +102,19 @@ def test_both_settings_are_told_together_the_worse_one_first() -> None:
     assert worse.evidence["factor"] == pytest.approx(10.0)
     assert "10 times too large: the innovations (horizontal) ask for 0.1 m/s²" in worse.message
     small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None), held_out=held)
-    worse, _ = noises.settings_off(analysis(source=MOVING, tuning=small))
+    worse, _ = noises.deviating_settings(analysis(source=MOVING, tuning=small))
     assert "times too small: the innovations (horizontal) ask for 9 m/s². The" in worse.message
-    assert named(noises.settings_off, analysis(source=MOVING)) == {}
+    assert named(noises.deviating_settings, analysis(source=MOVING)) == {}
 
 
 def test_a_noise_that_is_only_bounded_is_typed_as_no_less_than_5_mm() -> None:
     bounded = tuned(Noise(None, None, 0.0021))
-    finding = only(noises.settings_off, analysis(source=MOVING, tuning=bounded))
+    finding = only(noises.deviating_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == "[--sigma-z 0.005|0.005|1|None]."
     assert "is at least 480 times too large" in finding.message
     assert "ask for at most 0.0021 m. The" in finding.message
     known = analysis(source=MOVING, tuning=tuned(Noise(0.00211, 0.002, 0.0022)))
-    assert only(noises.settings_off, known).remedy == "[--sigma-z 0.00211|0.00211|1|None]."
+    assert only(noises.deviating_settings, known).remedy == "[--sigma-z 0.00211|0.00211|1|None]."
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_a_noise_that_is_only_bounded_is_typed_as_no_less_than_5_mm() -> None:
 def test_where_innovations_tell_less(parts: dict[str, Any], expected: list[str]) -> None:
     asked = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
     fitted = tuned(Noise(asked, 0.9 * asked, 1.1 * asked), Noise(0.1, 0.09, 0.11))
-    assert list(named(noises.settings_off, analysis(tuning=fitted, **parts))) == expected
+    assert list(named(noises.deviating_settings, analysis(tuning=fitted, **parts))) == expected
 
 
 def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
@@ -162,13 +162,13 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
     ],
 )  # fmt: skip
 def test_a_process_noise_that_is_forgotten(one: Any, expected: str | None) -> None:
-    assert severity(noises.forgotten, analysis(axes=(one,))) == expected
+    assert severity(noises.process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
 def test_a_forgotten_process_noise_is_told_with_how_slow_the_filter_is() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
-    finding = only(noises.forgotten, analysis(axes=(following(0.05), slower)))
+    finding = only(noises.process_noise_near_zero, analysis(axes=(following(0.05), slower)))
     assert finding.remedy == "Raise SIGMA_A."
     assert "(5.0% in variance), the gain is 0.050, and the filter needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
@@ -176,7 +176,7 @@ def test_a_forgotten_process_noise_is_told_with_how_slow_the_filter_is() -> None
         (Noise(2.3456, 2.0, 3.0), " [--sigma-a 2.35|1|2.35|None]."), (Noise(None, None, 3.0), ""),
     ):  # fmt: skip
         one = analysis(axes=(following(0.05),), tuning=tuned(None, asked))
-        assert only(noises.forgotten, one).remedy == f"Raise SIGMA_A.{more}"
+        assert only(noises.process_noise_near_zero, one).remedy == f"Raise SIGMA_A.{more}"
 
 
 # ---------------------------------------------------------------- variances
@@ -204,7 +204,7 @@ def test_one_finding_for_the_horizontal_axes_with_the_vertical_one_behind() -> N
         ("kf_variance_understated", "kf_variance_understated", "down"),
     ]  # fmt: skip
     assert "understated 1.73 times in σ along east (mean NIS 3, consistent" in found[1].message
-    assert by_cause(found) == found
+    assert group_by_cause(found) == found
 
 
 def test_of_what_is_overstated_a_source_that_drifts_or_the_truth_forbids_to_lower_it() -> None:
@@ -267,11 +267,11 @@ def test_ekf2s_noise_is_the_programs_unless_the_sender_chose_another(flown, used
     ],
 )  # fmt: skip
 def test_what_a_cause_asks_for(owner, change, kind, says, monkeypatch) -> None:
-    def words(_: Any, changes: Any, helps: Any, *, otherwise: str) -> str:
+    def words(_: Any, changes: Any, helps: Any, *, fallback_remedy: str) -> str:
         ((name, value),) = changes.items()
         return f"{{{name}: {value:g} {PARAMETERS[name].unit}|{helps.__name__}}}"
 
-    monkeypatch.setattr(since.remedy, "remedy_words", words)
+    monkeypatch.setattr(since.remedy, "format_ekf2_remedy", words)
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 1.0)))
     # what explains less, and what explains the other way, is none
     causes = (tried(owner, {"sigma_z_m": 7.0}, explains=0.4), tried(owner, change),
@@ -362,7 +362,7 @@ def loop(*closures: Closure, **parts: Any) -> Loop:
     ],
 )  # fmt: skip
 def test_closures(closures: tuple[Closure, ...], expected: list[str]) -> None:
-    found = list(loops.closures(loop(*closures, end_assumed=False)))
+    found = list(loops.closures(loop(*closures, is_end_assumed=False)))
     assert [finding.id for finding in found] == expected
     if expected == ["loop_drift_understated"]:
         dropped = sum((each.weight_gnc or 0.0) < 0.5 for each in closures)
@@ -556,4 +556,4 @@ def test_of_noise_that_no_setting_stands_for_no_setting_is_the_cause() -> None:
 def test_what_is_wrong_in_words(owner: Any, change: dict[str, float], said: str) -> None:
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 7.0)))
     one = analysis(settings=replace(CHOSEN, clock_offset_s=0.1), ekf2_model=model)
-    assert since.change_words(one, tried(owner, change)) == said
+    assert since.format_change(one, tried(owner, change)) == said

@@ -32,10 +32,10 @@ from px4fuse.readers.px4_positions import project, unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
 from px4fuse.simulation.mistakes import Mistakes, parse
-from px4fuse.simulation.scenario import Scenario, scenario_of
+from px4fuse.simulation.scenario import Scenario, make_scenario
 from px4fuse.trajectory.rotation import interpolate, matrix
 
-OUTDOOR = scenario_of("outdoor", seed=5)
+OUTDOOR = make_scenario("outdoor", seed=5)
 pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
@@ -65,7 +65,7 @@ def test_what_is_projected_comes_back(
 def test_fixes_are_the_truth_with_the_stated_noise_at_the_age_that_ekf2_takes(
     tmp_path: Path,
 ) -> None:
-    simulation = simulate(scenario_of("outdoor", seed=2, passes=6))
+    simulation = simulate(make_scenario("outdoor", seed=2, passes=6))
     log = tmp_path / "outdoor.ulg"
     log.write_bytes(to_ulog(simulation))
     flight = read_log(log)

@@ -21,9 +21,9 @@ from px4fuse.trajectory.graph.model import (
     FROM_CHORDAL,
     FROM_ODOMETRY,
     PoseGraph,
-    composed,
+    compose_odometry,
     cost,
-    observed_directions,
+    information_eigenvectors,
     residuals,
 )
 from px4fuse.trajectory.graph.solver import solve
@@ -63,7 +63,7 @@ def noisy_graph(dimension: int, seed: int, poses: int = 30, sigma: float = 0.05)
     measured = lie.compose(exact, lie.exp(rng.normal(size=(len(first), free)) * sigma))
     information = np.tile(np.eye(free) / sigma**2, (len(first), 1, 1))
     made = PoseGraph(dimension, np.arange(poses), truth, first, second, measured, information)
-    return composed(made)
+    return compose_odometry(made)
 
 
 # --- where to start ------------------------------------------------------------------------------
@@ -77,8 +77,8 @@ def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed:
     assert (graph.second == 0).any()
     n, measured = len(graph), lie.rotation_matrix(graph.measurements)
     held = lie.rotation_matrix(graph.poses[:1])[0]
-    of_edges = graph.first, graph.second, graph.measurements, measured, graph.information
-    edges = list(zip(*of_edges, strict=True))
+    edge_arrays = graph.first, graph.second, graph.measurements, measured, graph.information
+    edges = list(zip(*edge_arrays, strict=True))
 
     def least_squares(weights: list[Any], values: list[Any], at_0: np.ndarray) -> np.ndarray:
         """Unknowns x of each pose with (weight of i, of j) · (x_i, x_j) = value; x_0 is held."""
@@ -143,7 +143,7 @@ def test_minimum_is_gtsams(name: str) -> None:
 def test_start_of_graphs_without_vertices(name: str) -> None:
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
     assert graph.initialised == FROM_CHORDAL
-    assert cost(graph) < 1e-3 * cost(composed(graph))
+    assert cost(graph) < 1e-3 * cost(compose_odometry(graph))
     assert solve(graph).cost < 0.9 * cost(graph) or name == "SE-Sync_CSAIL"
 
 
@@ -197,7 +197,7 @@ def test_cost_does_not_know_the_frame(values: list[float], dimension: int) -> No
 
 def test_order_of_edges_and_their_direction() -> None:
     graph = noisy_graph(3, 4)
-    shuffled = graph.of_edges(np.random.default_rng(0).permutation(len(graph.first)))
+    shuffled = graph.select_edges(np.random.default_rng(0).permutation(len(graph.first)))
     # Z^-1 exp(-Ad(Z) r): the other way round, the same information
     back = np.linalg.inv(lie.adjoint(graph.measurements))
     turned = replace(
@@ -217,10 +217,10 @@ def test_graphs_that_cannot_be_solved_are_refused() -> None:
     poses = graph.poses.copy()
     poses[4, 1] = np.nan
     for bad, said in (
-        (graph.of_edges((graph.second < 10) | (graph.first >= 10)),
+        (graph.select_edges((graph.second < 10) | (graph.first >= 10)),
          "falls into 2 parts: vertex 10 is not joined to"),
         (replace(graph, information=graph.information * 0.0), "falls into 30 parts"),
-        (graph.of_edges(np.zeros(len(graph.first), dtype=bool)), "has no edges"),
+        (graph.select_edges(np.zeros(len(graph.first), dtype=bool)), "has no edges"),
         (replace(graph, poses=poses), "not a finite number"),
     ):  # fmt: skip
         with pytest.raises(TrajectoryError, match=said):
@@ -294,7 +294,7 @@ def test_false_closure_is_set_aside() -> None:
     off: dict[str, list[float]] = {"none": [], "dcs": [], "gnc": []}
     for seed in range(SEEDS):
         graph, truth, true = laps(seed)
-        known = ate(solve(graph.of_edges(true)).poses, truth)
+        known = ate(solve(graph.select_edges(true)).poses, truth)
         for method in ("none", "dcs", "gnc"):
             solution = solve(graph, robust=method)
             # least squares has no good minimum here to converge to
@@ -385,7 +385,7 @@ def test_gate_measures_by_gtsams_covariance(dimension: int, is_back: bool) -> No
     """A closure that is known exactly is as far off as odometry's covariance says."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
-    chain = graph.of_edges(graph.successive)
+    chain = graph.select_edges(graph.successive)
     factors, values = gtsam_problem(gtsam, chain)
     kind, free = "Pose2" if dimension == 2 else "Pose3", TANGENT[dimension]
     held = getattr(values, f"at{kind}")(0)
@@ -394,7 +394,7 @@ def test_gate_measures_by_gtsams_covariance(dimension: int, is_back: bool) -> No
     order = GTSAM_ORDER if dimension == 3 else [0, 1, 2]
     marginal = gtsam.Marginals(factors, values).marginalCovariance(len(graph) - 1)
     covariance = marginal[np.ix_(order, order)]
-    pose = lie.between(graph.poses[0], composed(chain).poses[-1])
+    pose = lie.between(graph.poses[0], compose_odometry(chain).poses[-1])
     for off in np.random.default_rng(5).normal(size=(4, free)) * 1e-6:
         measured = lie.compose(pose, lie.exp(-off))
         closure = replace(
@@ -413,7 +413,7 @@ def test_gate_measures_by_gtsams_covariance(dimension: int, is_back: bool) -> No
 def test_gate_needs_odometry() -> None:
     graph = odometry_graph(2, 1e-3)
     edge = len(graph.first) - 1
-    gap = graph.of_edges(np.arange(len(graph.first)) != 10)
+    gap = graph.select_edges(np.arange(len(graph.first)) != 10)
     with pytest.raises(TrajectoryError, match="No odometry edge joins vertices 10 and 11"):
         gate(gap, [edge - 1])
     for at, direction, said in (
@@ -431,6 +431,6 @@ def test_what_is_observed_and_how_well_is_the_whole_information() -> None:
     """In metres and radians of very different sizes, with correlations, and a direction untold."""
     rng = np.random.default_rng(4)
     root = rng.normal(size=(6, 4)) * np.array([3.0, 2.0, 5.0, 40.0, 70.0, 20.0])[:, None]
-    directions, variance = observed_directions(root @ root.T)
+    directions, variance = information_eigenvectors(root @ root.T)
     assert variance.shape == (4,)
     np.testing.assert_allclose((directions / variance) @ directions.T, root @ root.T, rtol=1e-9)

@@ -26,7 +26,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight
-from px4fuse.practice import CHOICES, NOISY_UWB, Trick, draw
+from px4fuse.practice import CHOICES, NOISY_UWB, HiddenMistake, draw
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -63,12 +63,17 @@ def test_the_hardest_level_has_two_mistakes_at_times() -> None:
 # ------------------------------------------------------------------ the tell-tales
 
 
-def flown(trick: Trick | None, level: int, seed: int) -> Flight:
+def flown(trick: HiddenMistake | None, level: int, seed: int) -> Flight:
     """With one mistake of a level, or without."""
     size = "" if trick is None else trick.sizes[level - 1]
     noisy = trick is not None and trick.mistake == NOISY_UWB
-    scenario = Scenario(**practice.FLOWN, length_m=9.0 + 0.7 * seed, heading_deg=50.0 * seed,
-                        seed=seed, sigma_uwb_m=float(size) if noisy else 0.1)  # fmt: skip
+    scenario = Scenario(
+        **practice.SCENARIO_VALUES,
+        length_m=9.0 + 0.7 * seed,
+        heading_deg=50.0 * seed,
+        seed=seed,
+        sigma_uwb_m=float(size) if noisy else 0.1,
+    )
     named = [] if trick is None or noisy else [f"{trick.mistake}={size}"]
     return simulate_flight(scenario, parse(named))
 
@@ -85,8 +90,8 @@ def ours(flight: Flight, **settings: float) -> Any:
 LEVELS_AND_SEEDS = [(1, 1), (3, 3)]
 
 
-def trick(mistake: str) -> Trick:
-    return next(one for one in practice.TRICKS if one.mistake == mistake)
+def trick(mistake: str) -> HiddenMistake:
+    return next(one for one in practice.HIDDEN_MISTAKES if one.mistake == mistake)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -30,7 +30,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import Columns, Reset, Unavailable
-from px4fuse.origin import ALIGNED, GNSS, KEPT, MOTION_CAPTURE, REBUILT, RECEIVED
+from px4fuse.origin import ALIGNED, FROM_INNOVATIONS, GNSS, LOGGED_BY_EKF2, MOTION_CAPTURE, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S
 
@@ -203,7 +203,7 @@ def test_accelerometer_times_follow_their_offset(read):
 
 def test_clipping_and_a_tumbling_vehicle_are_read_where_they_are_logged(read):
     log = make_log("v1.16")
-    assert (plain := read(log)).tumbled == ()
+    assert (plain := read(log)).tumble_spans == ()
     assert "clipped" not in plain.imu
     bits = np.zeros(len(log["sensor_combined"]["timestamp"]), np.uint8)
     bits[300:304] = 4  # of the third axis
@@ -215,7 +215,7 @@ def test_clipping_and_a_tumbling_vehicle_are_read_where_they_are_logged(read):
     log.add(topic("failure_detector_status", at, failing))
     flight = read(log)
     np.testing.assert_array_equal(np.flatnonzero(flight.imu["clipped"]), range(300, 304))
-    assert flight.tumbled == ((pytest.approx(3.0), pytest.approx(5.5)),)
+    assert flight.tumble_spans == ((pytest.approx(3.0), pytest.approx(5.5)),)
 
 
 @pytest.mark.parametrize(("name", "at", "jump_us"), [
@@ -402,8 +402,8 @@ PREFERRED = [
     ("vehicle_visual_odometry", RECEIVED),
     ("vehicle_mocap_odometry", MOTION_CAPTURE),
     ("estimator_visual_odometry_aligned", ALIGNED),
-    ("estimator_aid_src_ev_pos", KEPT),
-    ("ekf2_state_plus_innovation", REBUILT),
+    ("estimator_aid_src_ev_pos", LOGGED_BY_EKF2),
+    ("ekf2_state_plus_innovation", FROM_INNOVATIONS),
     ("vehicle_gps_position", GNSS),
 ]
 
@@ -449,7 +449,7 @@ def test_ekf2s_own_delay_is_added_back_to_its_observations(read, delay_ms):
     for name in ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt"):
         log[name]["timestamp_sample"] -= np.uint64((delay_ms * 1e-3 + HALF_PERIOD_S) * 1e6)
     track, _ = choose_source(read(log))
-    assert (track.name, track.origin) == ("estimator_aid_src_ev_pos", KEPT)
+    assert (track.name, track.origin) == ("estimator_aid_src_ev_pos", LOGGED_BY_EKF2)
     is_vision(track)
 
 
@@ -479,7 +479,7 @@ def test_state_plus_innovation_is_the_measurement(read, generation):
     if generation == "v1.12":
         log.drop("estimator_visual_odometry_aligned")
     track, _ = choose_source(read(log))
-    assert (track.name, track.origin) == ("ekf2_state_plus_innovation", REBUILT)
+    assert (track.name, track.origin) == ("ekf2_state_plus_innovation", FROM_INNOVATIONS)
     expected = position(times(track.samples)) + ev_error(times(track.samples))
     np.testing.assert_allclose(track.samples[Columns.POSITION], expected, atol=1e-5)
     assert len(track.samples) >= len(ev_stamps(10.0)) - 1
@@ -576,7 +576,9 @@ def test_simulated_uwb_is_read_as_it_was_sent(shared_logs, name):
     kept = name == "v1.16.1_aisle_hwlog"  # the vision topic is not in its profile
     assert track.name == ("estimator_aid_src_ev_pos" if kept else "vehicle_visual_odometry")
 
-    axes = slice(0, 2) if track.origin == KEPT else slice(0, 3)  # EKF2 kept no height in these
+    axes = (
+        slice(0, 2) if track.origin == LOGGED_BY_EKF2 else slice(0, 3)
+    )  # EKF2 kept no height in these
     sent_z = np.array([sample["z"] for sample in sent["uwb"]])[:, axes]
     sent_s = np.array([sample["t_px4_us"] for sample in sent["uwb"]]) * 1e-6
     read_z = track.samples[Columns.POSITION[axes]].to_numpy()

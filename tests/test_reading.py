@@ -13,7 +13,7 @@ from patience import patience
 
 from px4fuse import workers
 from px4fuse.errors import LogError, Px4FuseError
-from px4fuse.reading import max_log_bytes, read_text, read_whole, shown
+from px4fuse.reading import display_name, max_log_bytes, read_bytes_limited, read_text
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256
 
@@ -121,9 +121,9 @@ def test_the_limit_of_a_log_can_be_set_for_one_command(desk, monkeypatch, capsys
 def test_the_limit_is_the_last_byte_that_is_read(tmp_path) -> None:
     path = tmp_path / "x"
     path.write_bytes(b"x" * 100)
-    assert len(read_whole(path, LogError, 100)) == 100
+    assert len(read_bytes_limited(path, LogError, 100)) == 100
     with pytest.raises(LogError, match=r"x: 0\.00 MB, more than the limit"):
-        read_whole(path, LogError, 99)
+        read_bytes_limited(path, LogError, 99)
 
 
 @pytest.mark.skipif(not Path("/proc/kallsyms").exists(), reason="the file is Linux's")
@@ -131,7 +131,7 @@ def test_a_file_that_says_it_is_empty_is_read_no_further_than_the_limit() -> Non
     path = Path("/proc/kallsyms")
     assert path.stat().st_size == 0
     with pytest.raises(LogError, match="more than the limit"):
-        read_whole(path, LogError, 1000)
+        read_bytes_limited(path, LogError, 1000)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
@@ -170,4 +170,4 @@ def test_a_folder_is_refused_by_its_name_or_path(desk, monkeypatch, capsys, comm
 
 def test_errors_are_on_one_line() -> None:
     assert str(Px4FuseError("a\r\nb c\td\x00\ud800")) == "a  b c d??"
-    assert shown(Path("logs") / "σ.ulg") == "σ.ulg"
+    assert display_name(Path("logs") / "σ.ulg") == "σ.ulg"

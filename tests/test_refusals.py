@@ -36,6 +36,7 @@ def desk(tmp_path_factory):
     binary = np.random.default_rng(0).bytes(5000)
     for name, content in {
         "a.ulg": (SAMPLES / "aisle_uwb.ulg").read_bytes(),
+        "deep.md": b"*" * 500 + b"a" + b"*" * 500,
         "a.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes(),
         "c.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
         "l.ulg": (SAMPLES / "loop_vio.ulg").read_bytes(), "straight.ulg": make_log().encode(),
@@ -70,6 +71,10 @@ REFUSED = {
     "beyond the flight": ("compare a.ulg --start 500", "empty"),
     "end before start": ("compare a.ulg --start 50 --end 40", "empty"),
     "no such source": ("compare a.ulg --position-source nonsense", "no such source"),
+    "notes that nest": (
+        "compare a.ulg --notes deep.md",
+        "--notes deep.md: nested 251 deep, at most 100 are",
+    ),
     "no notes": ("compare a.ulg --notes absent.md", "absent.md"),
     "no report": ("compare a.ulg -o report.txt", "report.txt"),
     "a file as a folder": ("compare a.ulg -o n.md/r.pdf", "n.md"),
@@ -156,8 +161,6 @@ REFUSED = {
     "late from when": ("grade in -o out --late 10%/day", "--due"),
     "due in words": ("grade in -o out --due soon", "--due"),
     "late by what": ("grade in -o out --due 2026-11-20 --late 10", "--late"),
-    "no submission": ("grade --gradescope missing", "missing"),
-    "autograder of no logs": ("grade --write-autograder a.zip", "--logs"),
     # assignments
     **{
         name: (f"simulate -o f --assignment roster.csv {typed}", said)
@@ -168,7 +171,6 @@ REFUSED = {
             ("too many for a loop", "--kind mixed --mistakes 2", "0 to 1"),
             ("preview without a secret", "--preview", "requires --secret-file"),
             ("key inside", "--answer f/k.json", "students' folder"),
-            ("key is the roster", "--answer roster.csv", "is the roster"),
         )
     },
     "mistakes alone": ("simulate -o f.ulg --mistakes 1", "requires --assignment"),
@@ -225,6 +227,7 @@ SPARED = {
     "sync over positions": "sync a.ulg --position c.csv --json c.csv",
     "compare by hard link": "compare a.ulg -o r.pdf --json hard.json",
     "compare over positions": "compare a.ulg --position c.csv -o r.pdf --json ../{folder}/c.csv",
+    "key over roster": "simulate -o f --assignment roster.csv --answer roster.csv",
     "compare over notes": "compare a.ulg --notes n.md -o r.pdf --json n.md",
 }
 

@@ -10,7 +10,7 @@ from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison import remedy as remedies
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import asked_of_ekf2, noise_used_m
+from px4fuse.comparison.remedy import ml_ekf2_parameters, noise_used_m
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import AxisSummary, Summary, what_if
 from px4fuse.filter.settings import Settings
@@ -93,14 +93,14 @@ def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, 
     for finding in findings:
         assert "set EKF2_EVP_NOISE" not in finding.remedy
         assert "--sigma-z" not in finding.remedy
-    asked = asked_of_ekf2(analysis, analysis.ekf2_model, analysis.tuning, analysis.clock)
+    asked = ml_ekf2_parameters(analysis, analysis.ekf2_model, analysis.tuning, analysis.clock)
     flown_with = analysis.ekf2_model.inputs.settings["EKF2_EVP_NOISE"]
     assert asked.get("EKF2_EVP_NOISE", flown_with) >= flown_with
 
 
 def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> None:
     comparison = flown(AISLE, Settings())
-    worse = remedies.filter_words(comparison, {"sigma_z_m": 3.0})
+    worse = remedies.format_kf_remedy(comparison, {"sigma_z_m": 3.0})
     assert worse.startswith("Leave it: --sigma-z 3 fits")
     truth = Unavailable("ground truth", "none", "")
     axes = {}
@@ -109,8 +109,10 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
         axes[name] = replace(axis, truth=truth, filters=filters)
     blind = replace(comparison, axes=axes)
     typed = "px4fuse compare LOG --sigma-z 0.2."
-    assert remedies.filter_words(blind, {"sigma_z_m": 0.2}, unseen_nats=0.1) == typed
-    assert remedies.filter_words(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1).startswith("Leave")
+    assert remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=0.1) == typed
+    assert remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1).startswith(
+        "Leave"
+    )
 
 
 # ---------------------------------------------------------------- of EKF2
@@ -167,8 +169,10 @@ def test_a_remedy_must_help_and_not_harm(after, noise, fewer, delay) -> None:
 
 
 def words(analysis: Analysis, **changes: float) -> str:
-    model, why, otherwise = analysis.ekf2_model, "Because: ", "Look elsewhere:"
-    return remedies.remedy_words(model, changes, remedies.noise_helps, why=why, otherwise=otherwise)
+    model, why, fallback_remedy = analysis.ekf2_model, "Because: ", "Look elsewhere:"
+    return remedies.format_ekf2_remedy(
+        model, changes, remedies.noise_helps, why=why, fallback_remedy=fallback_remedy
+    )
 
 
 def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
@@ -194,7 +198,7 @@ def test_what_the_data_ask_for(sample: Analysis) -> None:
     model, comparison = sample.ekf2_model, sample
 
     def asked(analysis: Analysis) -> dict[str, float]:
-        return asked_of_ekf2(comparison, model, analysis.tuning, analysis.clock)
+        return ml_ekf2_parameters(comparison, model, analysis.tuning, analysis.clock)
 
     assert asked(sample) == {"EKF2_EVP_NOISE": 0.098}
     assert asked(replace(sample, tuning={})) == {}
@@ -208,7 +212,7 @@ def test_what_the_data_ask_for(sample: Analysis) -> None:
     assert "EKF2_EV_DELAY" not in asked(offset(sample, -0.4))  # beyond PX4's range
     assert "EKF2_EV_DELAY" not in asked(offset(sample, 0.2))  # early: it is 0 already
     other = replace(comparison, source=replace(comparison.source, name="another"))
-    assert asked_of_ekf2(other, model, sample.tuning, sample.clock) == {}
+    assert ml_ekf2_parameters(other, model, sample.tuning, sample.clock) == {}
 
 
 def test_a_noise_that_the_sender_reports_is_overruled(sample: Analysis) -> None:

@@ -19,15 +19,15 @@ from page_tools import set_by_typst
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.clock import ClockOffset, PartOffset
-from px4fuse.filter.likelihood import preintegrate, states
+from px4fuse.filter.likelihood import filter_states, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.notes import write
-from px4fuse.report.page import Block, Page, printable
-from px4fuse.report.pdf import compiled
-from px4fuse.report.sensitivity import PAIRS, SETTINGS, _settled
+from px4fuse.report.page import Block, Page, replace_unprintable
+from px4fuse.report.pdf import compile_pdf
+from px4fuse.report.sensitivity import GAIN_GROUPS, SETTINGS, _second_half_median
 from px4fuse.results.model import Student
 
 THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
@@ -44,7 +44,7 @@ def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Fonts are looked up anew, before and after."""
 
     def forget() -> None:
-        for cached in (fonts.font_of, fonts._others):
+        for cached in (fonts.font_of, fonts._other_fonts):
             cached.cache_clear()
 
     forget()
@@ -55,7 +55,7 @@ def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> None:
     """A machine with one more font, which has these characters."""
-    monkeypatch.setattr(fonts, "_others", lambda: ((name, "path"),))
+    monkeypatch.setattr(fonts, "_other_fonts", lambda: ((name, "path"),))
     own = fonts._characters
     with_one_more = {"path": frozenset(map(ord, characters))}
     monkeypatch.setattr(fonts, "_characters", lambda path: with_one_more.get(path) or own(path))
@@ -64,18 +64,18 @@ def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> No
 @pytest.mark.usefixtures("_fresh")
 def test_a_font_of_the_machine_is_taken_for_what_dejavu_lacks(monkeypatch) -> None:
     with_font(monkeypatch, "Some Thai", THAI)
-    assert fonts.missing(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
-    assert fonts.families(f"Ångström {ARABIC}") == [fonts.FONT]
-    assert fonts.families(f"{THAI} and me") == [fonts.FONT, "Some Thai"]
-    assert fonts.missing(f"{THAI} {HAN}") == HAN
+    assert fonts.missing_characters(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
+    assert fonts.font_names(f"Ångström {ARABIC}") == [fonts.FONT]
+    assert fonts.font_names(f"{THAI} and me") == [fonts.FONT, "Some Thai"]
+    assert fonts.missing_characters(f"{THAI} {HAN}") == HAN
 
 
 @pytest.mark.usefixtures("_fresh")
 def test_what_no_font_has_is_a_square_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fonts, "_others", lambda: ())
-    assert fonts.families(THAI + HAN) == [fonts.FONT]
-    assert printable(f"a {HAN}\x1b b") == "a □□□ b"
-    said = fonts.advice(THAI + HAN)
+    monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
+    assert fonts.font_names(THAI + HAN) == [fonts.FONT]
+    assert replace_unprintable(f"a {HAN}\x1b b") == "a □□□ b"
+    said = fonts.font_advice(THAI + HAN)
     assert "characters สมชาย王小明:" in said
     assert "fonts.google.com" in said
 
@@ -90,7 +90,11 @@ def test_a_font_that_has_a_box_for_everything_is_none(monkeypatch: pytest.Monkey
     manager = SimpleNamespace(ttflist=entries, addfont=lambda _: None)
     monkeypatch.setattr(font_manager, "fontManager", manager)
     monkeypatch.setattr(font_manager, "findSystemFonts", list)
-    assert [name for name, _ in fonts._others()] == ["Noto Sans Thai", "An Alphabet Sans", "Zebra"]
+    assert [name for name, _ in fonts._other_fonts()] == [
+        "Noto Sans Thai",
+        "An Alphabet Sans",
+        "Zebra",
+    ]
 
 
 def test_lists_keep_their_marks_and_depth() -> None:
@@ -102,7 +106,7 @@ def test_lists_keep_their_marks_and_depth() -> None:
 
 
 def test_code_keeps_its_spaces_and_dollars() -> None:
-    assert printable("\N{NO-BREAK SPACE}x\n") == "\N{NO-BREAK SPACE}x\n"
+    assert replace_unprintable("\N{NO-BREAK SPACE}x\n") == "\N{NO-BREAK SPACE}x\n"
     (code,) = written("```\nif x:\n    $y$ <b>\n```")
     assert code["text"].replace("\N{NO-BREAK SPACE}", " ") == "if x:\n    $y$ <b>"
 
@@ -181,7 +185,7 @@ def test_what_a_student_writes_is_never_evaluated() -> None:
 )  # fmt: skip
 def test_a_template_reaches_no_file(asked: str) -> None:
     with pytest.raises(typst.TypstError):
-        compiled({"fonts": [fonts.FONT]}, f"#{asked}")
+        compile_pdf({"fonts": [fonts.FONT]}, f"#{asked}")
 
 
 def offset(**changes: Any) -> ClockOffset:
@@ -208,15 +212,17 @@ def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
 def test_the_clock_has_its_page_when_there_is_something_to_say() -> None:
     whole = offset(parts=())
     fine, unknown = with_clock(whole), replace(whole, determinable=False, reason="no motion")
-    named = [SimpleNamespace(findings=[Finding(name, "error", "", "")]) for name in clock.FINDINGS]
+    named = [
+        SimpleNamespace(findings=[Finding(name, "error", "", "")]) for name in clock.CLOCK_FINDINGS
+    ]
     nothing: Any = SimpleNamespace(findings=[])
-    assert "the stamps are right" in clock.line(fine, [])
+    assert "the stamps are right" in clock.summary_line(fine, [])
     assert not list(clock.draw(fine, nothing))
     for made, results in ((with_clock(unknown), nothing), *((fine, each) for each in named)):
-        assert clock.line(made, results.findings) == "see its page"
+        assert clock.summary_line(made, results.findings) == "see its page"
         assert len(list(clock.draw(made, results))) == 1
     none = with_clock(Unavailable("clock offset", "no IMU", "Give the ULog."))
-    assert clock.line(none, []) == "not determinable: no IMU. Give the ULog."
+    assert clock.summary_line(none, []) == "not determinable: no IMU. Give the ULog."
     assert not list(clock.draw(none, nothing))
 
 
@@ -247,9 +253,11 @@ def test_only_the_ratio_moves_the_gain_and_the_track() -> None:
     rng = np.random.default_rng(3)
     axis = random_walk(rng, count=600, interval_s=0.2, sigma_a=0.5, sigma_z=0.1)
     factors = np.array([(a, z) for _, a, z in SETTINGS]).T
-    run = states(preintegrate(axis, Settings(input="zero")), 0.5 * factors[0], 0.1 * factors[1])
-    gains, sigmas = _settled(run.gain), _settled(run.sigma_p_m)
-    for (_, (one, other)), scale in zip(PAIRS, (4.0, 0.25), strict=True):
+    run = filter_states(
+        preintegrate(axis, Settings(input="zero")), 0.5 * factors[0], 0.1 * factors[1]
+    )
+    gains, sigmas = _second_half_median(run.gain), _second_half_median(run.sigma_p_m)
+    for (_, (one, other)), scale in zip(GAIN_GROUPS, (4.0, 0.25), strict=True):
         assert gains[one] == pytest.approx(gains[other], rel=1e-6)
         assert sigmas[one] / sigmas[other] == pytest.approx(scale, rel=1e-6)
         half = slice(300, None)

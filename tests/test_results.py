@@ -18,6 +18,7 @@ from px4fuse.flight import Flight
 from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
+from px4fuse.results.bounds import within_bounds
 from px4fuse.results.contract import KINDS, schema, to_json
 from px4fuse.results.reading import read_results
 
@@ -161,3 +162,34 @@ def test_to_json_numbers_have_ten_significant_digits():
     for text in (EXAMPLE, LOOP):
         once = to_json(text)
         assert to_json(json.loads(once)) == once
+
+
+def test_numbers_outside_their_bounds_are_absent_with_the_reason():
+    """Optional numbers go alone, required ones with the part that may be missing."""
+    results = read_results(json.dumps(EXAMPLE).encode())
+    assert within_bounds(results) is results
+    axis = results.axes["aisle"]
+    kf = replace(axis.filters["kf"], nis_mean=-3.0)
+    ekf2 = replace(axis.filters["ekf2"], sigma_p_median_m=1e10)
+    wrong = replace(axis, filters={"kf": kf, "ekf2": ekf2})
+    found = within_bounds(replace(results, axes={"aisle": wrong}))
+    filters = found.axes["aisle"].filters
+    assert isinstance(filters["kf"], UnjudgedFilter)
+    assert (
+        filters["kf"].reason == "axes.aisle.filters.kf.nis_mean is -3, its bounds are 0 and 1e+06"
+    )
+    assert filters["kf"].truth == kf.truth
+    assert filters["ekf2"] == replace(ekf2, sigma_p_median_m=None)
+    assert [one.what for one in found.missing[len(results.missing) :]] == [
+        "axes.aisle.filters.ekf2.sigma_p_median_m"
+    ]
+    assert_valid(to_json(found))
+
+
+def test_results_without_any_axis_within_bounds_are_refused():
+    results = read_results(json.dumps(EXAMPLE).encode())
+    wrong = replace(
+        results.axes["aisle"], updates=replace(results.axes["aisle"].updates, input_gap_s=math.nan)
+    )
+    with pytest.raises(ResultsError, match=r"axes.aisle.updates.input_gap_s is not a finite"):
+        within_bounds(replace(results, axes={"aisle": wrong}))

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from class_tools import entry
 
-from px4fuse.assignment.roster import Person, Register, people_of_sheet, read_roster
+from px4fuse.assignment.roster import Person, Register, read_people, read_roster
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import ExportOrigin
-from px4fuse.grading.outputs import filled, grade_column
+from px4fuse.grading.outputs import fill_grades, grade_column
 
 SUBMITTED = "Friday, 20 November 2026, 11:58 PM"
 # As mod/assign/gradingtable.php of Moodle writes it
@@ -82,7 +82,7 @@ def table(tmp_path: Path, text: str, encoding: str = "utf-8-sig") -> Sheet:
 )  # fmt: skip
 def test_columns_are_found_by_the_titles_that_platforms_write(tmp_path, text, is_) -> None:
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
-        assert people_of_sheet(table(tmp_path, text, encoding))[0] == is_
+        assert read_people(table(tmp_path, text, encoding))[0] == is_
 
 
 ROSTERS = {
@@ -167,15 +167,15 @@ def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOr
     ],
 )
 def test_whose_a_file_is_by_what_the_platform_says(origin, place) -> None:
-    assert CLASS.place(origin.person) == place
+    assert CLASS.student_index(origin.person) == place
 
 
 def test_whose_a_report_is_by_id_then_by_name() -> None:
     said = (("42", "Max Roe"), ("", "Roe, Max"), ("99", "Jane Doe"), ("", ""))
-    assert [CLASS.place(Person(*each)) for each in said] == [0, 1, 0, None]
+    assert [CLASS.student_index(Person(*each)) for each in said] == [0, 1, 0, None]
     # of two ids that differ by zeros the exact one is meant
     register = Register([Person("042"), Person("42")])
-    assert [register.place(Person(each)) for each in ("42", "0042")] == [1, None]
+    assert [register.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
 
 
 def test_a_worksheet_adds_what_it_knows() -> None:
@@ -196,7 +196,7 @@ def rows(text: str, separator: str = ",") -> list[dict[str, str]]:
 
 
 def register(sheet) -> Register:
-    return Register(PEOPLE, people_of_sheet(sheet))
+    return Register(PEOPLE, read_people(sheet))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -212,7 +212,7 @@ def test_a_platforms_table_comes_back_with_two_columns_filled(
     tmp_path, text, column, title, feedback, encoding
 ) -> None:
     sheet = table(tmp_path, text, encoding)
-    made, notes = filled(sheet, ENTRIES, register(sheet), column, TEXTS)
+    made, notes = fill_grades(sheet, ENTRIES, register(sheet), column, TEXTS)
     content = made.content()
     assert content[:2] == sheet.path.read_bytes()[:2]
     separator = "\t" if text is BLACKBOARD else ","
@@ -236,23 +236,23 @@ def test_a_row_is_found_by_the_participant_alone(tmp_path) -> None:
     hidden = MOODLE.replace("Doe Jane", "").replace("0042,jane@x.edu", ",")
     sheet = table(tmp_path, hidden)
     people = Register([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
-    assert filled(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
+    assert fill_grades(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
 
 
 def test_who_is_not_in_the_table_is_said(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
-    _, notes = filled(sheet, ENTRIES, register(sheet), "", TEXTS)
+    _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
     assert notes == ("table.csv: it has no row for Max Roe.",)
 
 
 def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
     text = "Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;;\n"
     sheet = table(tmp_path, text, "cp1252")
-    made, _ = filled(sheet, ENTRIES, Register(PEOPLE), "", TEXTS)
+    made, _ = fill_grades(sheet, ENTRIES, Register(PEOPLE), "", TEXTS)
     assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\r\n0042;Jane Doe;87.5;\r\n"
     moodle = MOODLE.replace(",100.00,", ',"100,00",')
     sheet = table(tmp_path, moodle)
-    made, _ = filled(sheet, ENTRIES, register(sheet), "", TEXTS)
+    made, _ = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
     assert made.rows[0][5] == "87,5"
 
 

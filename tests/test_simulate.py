@@ -23,7 +23,7 @@ from px4fuse.findings import find
 from px4fuse.flight import Columns
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
-from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made, parse
+from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistakes, format_mistake, parse
 from px4fuse.simulation.motion import attitude, direction, plan
 from px4fuse.simulation.scenario import DT_S, Scenario, quantities
 
@@ -280,9 +280,9 @@ def test_values_have_units(text, field, value):
 @pytest.mark.parametrize("name", MISTAKES)
 def test_every_default_is_a_mistake_and_can_be_typed_again(name):
     parsed = parse([name])
-    assert made(parsed) == (name,)
-    assert parse([as_typed(name, parsed)]) == parsed
-    assert made(parse(["clock-offset=0", "nlos=0"])) == ()
+    assert active_mistakes(parsed) == (name,)
+    assert parse([format_mistake(name, parsed)]) == parsed
+    assert active_mistakes(parse(["clock-offset=0", "nlos=0"])) == ()
 
 
 @pytest.mark.parametrize(("text", "said"), [

@@ -124,7 +124,7 @@ def test_where_it_stands_still_the_attitude_is_levelled():
     tilt = Rotation.from_euler("x", 0.1).as_matrix()
     gravity = np.array([0.0, 0.0, 9.80665])
     bias, rate = np.array([0.03, -0.02, 0.05]), np.array([0.002, -0.001, 0.003])
-    x, P = ekf2._standing(tilt, tilt.T @ -gravity + bias, rate, 0.01)
+    x, P = ekf2._initial_state_at_rest(tilt, tilt.T @ -gravity + bias, rate, 0.01)
     assert x[9:12] == pytest.approx(rate, rel=1e-3)
     # what is left of the horizontal bias is a tilt that makes up for it
     force = tilt @ (tilt.T @ -gravity + bias - x[12:15])
@@ -189,7 +189,7 @@ def test_samples_with_older_stamps_than_the_last_are_not_taken():
     taken = topics["estimator_aid_src_ev_pos"]["timestamp_sample"].astype(np.int64)
     assert np.any(np.diff(sent) < 0)
     assert np.all(np.diff(taken) > 0)
-    rows = ekf2._received(simulation.positions)
+    rows = ekf2._arrived_samples(simulation.positions)
     assert len(rows.stamp_s) < len(sent)
     assert np.all(np.diff(rows.stamp_s) > 0)
 

@@ -11,12 +11,13 @@ from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.coloured import hanging_together
+from px4fuse.filter import coloured
+from px4fuse.filter.coloured import time_correlation_fit
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.causes import SETTINGS
-from px4fuse.findings.source_noise import detect, levels
+from px4fuse.findings.source_noise import detect, noise_variation
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
@@ -216,7 +217,7 @@ def test_a_filter_that_outliers_pull_is_no_noisy_part() -> None:
     """At 2 Hz most innovations of 13 s are large, since outliers lead the filter away."""
     analysis = judged(partial(errors.with_outliers, share=0.05), 2.0, seed=13)
     assert {"source_outliers"} == set(told(analysis))
-    assert list(levels(analysis)) == []
+    assert list(noise_variation(analysis)) == []
 
 
 def test_too_few_and_no_imu_are_said() -> None:
@@ -224,11 +225,29 @@ def test_too_few_and_no_imu_are_said() -> None:
     axis, given = analysis.axes["north"].axis, {"outlier_time_s": NONE, "clock_offset_s": 0.0}
     few = replace(axis, measurement_time_s=axis.measurement_time_s[:99],
                   measurement_m=axis.measurement_m[:99])  # fmt: skip
-    found = hanging_together(analysis.flight, (few,), RIGHT, Noises(0.3, 0.1), **given)
+    found = time_correlation_fit(analysis.flight, (few,), RIGHT, Noises(0.3, 0.1), **given)
     assert isinstance(found, Unavailable)
     assert "99" in found.reason
     blind = replace(analysis.flight, imu=Unavailable("IMU", "no IMU", ""))
-    assert hanging_together(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
+    assert time_correlation_fit(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
+
+
+def test_slow_error_is_searched_at_zero_and_at_the_clock_offset(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    analysis, tried = judged(MIXED), []
+
+    def none_better(moved: Any, offsets: list[float], noises: Any) -> tuple[float, Any]:
+        tried.append(offsets)
+        return 0.0, noises[0]
+
+    monkeypatch.setattr(coloured, "_best_of", none_better)
+    for offset_s in (0.0, 0.3, -0.2):
+        time_correlation_fit(
+            analysis.flight, (analysis.axes["north"].axis,), RIGHT, Noises(0.3, 0.1),
+            outlier_time_s=NONE, clock_offset_s=offset_s,
+        )  # fmt: skip
+    assert tried[::2] == tried[1::2] == [[0.0], [0.0, 0.3], [-0.2, 0.0]]
 
 
 def test_a_slow_error_shows_beside_a_jump_and_outliers() -> None:

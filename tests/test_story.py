@@ -14,7 +14,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import EV_POS, FLOW, Aid
 from px4fuse.findings import find
-from px4fuse.findings.story import MOST_SENTENCES, story
+from px4fuse.findings.story import MAX_SENTENCES, story
 from px4fuse.flight import AidLog
 
 ALONG_DEG = 30.0
@@ -24,7 +24,7 @@ def told(comparison: Comparison) -> tuple[str, ...]:
     """Story of a comparison, each sentence checked for form."""
     analysis = with_noises(comparison)
     sentences = story(analysis, find(analysis))
-    assert 1 <= len(sentences) <= MOST_SENTENCES
+    assert 1 <= len(sentences) <= MAX_SENTENCES
     for sentence in sentences:
         assert re.fullmatch(r"[A-Z0-9].*[^.]\.", sentence), sentence
         assert "nan" not in sentence

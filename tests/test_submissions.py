@@ -19,7 +19,7 @@ from px4fuse.assignment.roster import Person
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
-from px4fuse.grading.submissions import collect, origin_of, read, with_origins
+from px4fuse.grading.submissions import find_submissions, origin_of, read, with_origins
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification.intake import MAX_BYTES, read_report
 
@@ -53,7 +53,7 @@ def who(name: str) -> tuple[str, str]:
 
 
 def only(path: Path) -> Submission:
-    (submission,), _ = collect([path])
+    (submission,), _ = find_submissions([path])
     return submission
 
 
@@ -65,7 +65,7 @@ def test_folders_are_searched_and_sorted(tmp_path):
         write(tmp_path / name, PDF)
     for name in (".hidden.pdf", "__MACOSX/x.pdf", ".git/x.pdf"):
         write(tmp_path / name, PDF)
-    found, notes = collect([tmp_path])
+    found, notes = find_submissions([tmp_path])
     assert [each.name for each in found] == ["A/Report.PDF", "b/report.pdf", "c.pdf"]
     assert notes == ("Files passed over that are not PDFs: 3.",)
     assert [read(each) for each in found] == [PDF] * 3
@@ -148,7 +148,7 @@ def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
     write(tmp_path / "unpacked" / "submission_31" / "submission_metadata.yml", forged.encode())
     write(tmp_path / "unpacked" / "submission_31" / "report.pdf", PDF)
     for place in (path, tmp_path / "unpacked"):
-        (found,), notes = collect([place])
+        (found,), notes = find_submissions([place])
         person = found.origin.person
         assert notes == ("Files passed over that are not PDFs: 1.",)
         assert person == Person(
@@ -159,7 +159,7 @@ def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
 
 def test_metadata_that_cannot_be_read_is_said(tmp_path):
     bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
-    (found,), (note,) = collect([write(tmp_path / "export.zip", bomb)])
+    (found,), (note,) = find_submissions([write(tmp_path / "export.zip", bomb)])
     assert found.origin.person == Person("", numbers={"gradescope": "3"})
     assert note.startswith("submission_metadata.yml: it shrinks more than 100 times")
 
@@ -169,7 +169,7 @@ def test_times_of_entries_are_kept(tmp_path):
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(zipfile.ZipInfo("a.pdf", (2026, 11, 20, 12, 34, 56)), PDF)
         archive.writestr(zipfile.ZipInfo("b.pdf"), PDF)
-    found, _ = collect([write(tmp_path / "x.zip", out.getvalue())])
+    found, _ = find_submissions([write(tmp_path / "x.zip", out.getvalue())])
     times = {each.name: each.time and each.time.isoformat() for each in found}
     assert times == {"a.pdf": "2026-11-20T12:34:56", "b.pdf": None}
 
@@ -178,7 +178,7 @@ def test_a_zip_that_a_student_handed_in_is_told_and_not_opened(tmp_path):
     name = "Roe_1_assignsubmission_file_/work.zip"
     handed_in = zipped({"report.pdf": PDF, "more.zip": zipped({"deep.pdf": PDF})})
     export = write(tmp_path / "all.zip", zipped({name: handed_in, "log.ulg": b""}))
-    found, notes = collect([export])
+    found, notes = find_submissions([export])
     assert [each.name for each in found] == [name]
     assert who(found[0].name) == ("Roe", "1")
     with pytest.raises(ResultsError) as refused:
@@ -190,28 +190,28 @@ def test_a_zip_that_a_student_handed_in_is_told_and_not_opened(tmp_path):
     )
     # the same where the export was unpacked
     write(tmp_path / "unpacked" / name, handed_in)
-    ((again,), _) = collect([tmp_path / "unpacked"])
+    ((again,), _) = find_submissions([tmp_path / "unpacked"])
     assert (again.name, again.entry) == (name, "")
 
 
 def test_a_class_has_more_files_than_a_student(tmp_path):
     class_ = {f"N_{n}_assignsubmission_file_/r.pdf": PDF for n in range(80)}
-    assert len(collect([write(tmp_path / "class.zip", zipped(class_))])[0]) == 80
+    assert len(find_submissions([write(tmp_path / "class.zip", zipped(class_))])[0]) == 80
 
 
 def test_nothing_there(tmp_path):
     with pytest.raises(SettingsError, match="no regular file, and no folder"):
-        collect([tmp_path / "absent"])
+        find_submissions([tmp_path / "absent"])
     write(tmp_path / "a.txt", b"")
     with pytest.raises(SettingsError, match="No PDF was found") as caught:
-        collect([tmp_path])
+        find_submissions([tmp_path])
     assert "\n" not in str(caught.value)
 
 
 def test_a_damaged_zip_leaves_the_others(tmp_path):
     bad = write(tmp_path / "bad.zip", b"PK" + bytes(100))
     good = write(tmp_path / "good.zip", zipped({"a.pdf": PDF}))
-    found, notes = collect([bad, good])
+    found, notes = find_submissions([bad, good])
     assert [each.name for each in found] == ["a.pdf"]
     assert len(notes) == 1
     assert "bad.zip: passed over: it cannot be read (damaged)." in notes
@@ -228,7 +228,7 @@ def test_links_do_not_lead_out_of_the_folder(tmp_path):
     (tmp_path / "in" / "same.pdf").symlink_to(inside)
     (tmp_path / "in" / "circle.pdf").symlink_to(tmp_path / "in" / "circle.pdf")
     os.mkfifo(tmp_path / "in" / "pipe.pdf")
-    found, notes = collect([tmp_path / "in"])
+    found, notes = find_submissions([tmp_path / "in"])
     assert [each.name for each in found] == ["a.pdf"]
     assert notes == (
         "in: 6 links out of the folder, special files or folders that cannot be read were not "
@@ -243,7 +243,7 @@ def test_folders_in_each_other_without_end(tmp_path):
         folder.mkdir()
     paths = [write(tmp_path / "in" / "a.pdf", PDF), write(folders[-1] / "b.pdf", PDF)]
     try:
-        found, notes = collect([tmp_path / "in"])
+        found, notes = find_submissions([tmp_path / "in"])
         known = files_by_sha256([tmp_path / "in"])
     finally:  # shutil.rmtree, which clears the tests' folders, calls itself
         for path in paths:
@@ -269,7 +269,7 @@ def test_hostile_names_are_shown_and_never_used(tmp_path):
     folder = tmp_path / "work"
     path = write(folder / "x.zip", zipped(dict.fromkeys(shown_as, PDF)))
     before = sorted(tmp_path.rglob("*"))
-    found, _ = collect([path])
+    found, _ = find_submissions([path])
     assert {each.name for each in found} == set(shown_as.values())
     assert all(read(each) == PDF for each in found)
     assert sorted(tmp_path.rglob("*")) == before
@@ -316,7 +316,7 @@ def test_bounds_of_a_whole_zip_file(tmp_path, monkeypatch, limit, value, said):
     path = write(tmp_path / "x.zip", zipped({f"{n}.pdf": bytes(100) for n in range(4)}))
     other = write(tmp_path / "y.pdf", PDF)
     monkeypatch.setattr(submissions, limit, value)
-    found, notes = collect([path, other])
+    found, notes = find_submissions([path, other])
     assert [each.file for each in found] == [other]
     assert any(note.startswith("x.zip: passed over: ") and said in note for note in notes)
 
@@ -336,7 +336,7 @@ def test_entries_that_are_not_read_say_why(tmp_path):
     for mark, place in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         name = content.index(b"locked.pdf", 0 if place == 6 else content.index(b"PK\x01\x02"))
         content[content.rindex(mark, 0, name) + place] |= 1
-    found, notes = collect([write(tmp_path / "x.zip", bytes(content))])
+    found, notes = find_submissions([write(tmp_path / "x.zip", bytes(content))])
     by_name = {each.name: each for each in found}
     assert "symbolic link" in reason(by_name["link.pdf"])
     assert "a method that is not read" in reason(by_name["packed.pdf"])
@@ -351,13 +351,13 @@ def test_equal_names_are_told_apart(tmp_path):
     for folder in "abc":
         write(tmp_path / folder / "Report.pdf", folder.encode())
     folders = [tmp_path / folder for folder in "abc"]
-    found, _ = collect([*folders, *folders])
+    found, _ = find_submissions([*folders, *folders])
     assert [each.name for each in found] == ["Report.pdf", "Report.pdf (2)", "Report.pdf (3)"]
     assert [read(each) for each in found] == [b"a", b"b", b"c"]
     # of an unmarked code page
     content = zipped({"M_ller.pdf": PDF, "Zo__.pdf": PDF})
     content = content.replace(b"M_ller", b"M\x81ller").replace(b"Zo__", "Zoë".encode())
-    found, _ = collect([write(tmp_path / "x.zip", content)])
+    found, _ = find_submissions([write(tmp_path / "x.zip", content)])
     assert [each.name for each in found] == ["Müller.pdf", "Zoë.pdf"]
 
 
@@ -371,7 +371,7 @@ def test_mutated_zip_files_never_raise_anything_else(tmp_path):
             content[rng.randrange(len(content))] = rng.randrange(256)
         path.write_bytes(content[: rng.choice([len(content), rng.randrange(len(content))])])
         try:
-            found, notes = collect([path])
+            found, notes = find_submissions([path])
         except SettingsError:
             continue
         for each in found:

@@ -14,7 +14,7 @@ from class_tools import at_once, report_of, zipped
 from golden_tools import agrees
 
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.assignment.roster import people_of_sheet
+from px4fuse.assignment.roster import read_people
 from px4fuse.assignment.sheet import read_sheet
 from px4fuse.grading.entries import Course, due_time, late_rule
 from px4fuse.grading.grade import GradeOutcome, grade
@@ -88,7 +88,7 @@ class Lab:
         rows = [[student_id(n), first(n), last(n), f"s{n}@x.edu"] for n in STUDENTS]
         roster = table(folder / "roster.csv", ["id", "first name", "last name", "email"], rows)
         self.sheets = [self.worksheet(), self.gradebook(), self.grades()]
-        self.roster = people_of_sheet(read_sheet(roster))
+        self.roster = read_people(read_sheet(roster))
 
     def moodle(self) -> Path:
         files = {f"{name(n)}_{9000 + n}_assignsubmission_file_/report.pdf": self.pdf[n]
@@ -207,9 +207,9 @@ def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> None:
     words = " ".join(text.split())
     assert "Well argued." in words
     assert "Your instructor: Not shown." in words
-    table_of = (lab.output / "class.csv").read_bytes()
+    fleet_table = (lab.output / "class.csv").read_bytes()
     assert lab.grade().entries == third.entries
-    assert (lab.output / "class.csv").read_bytes() == table_of
+    assert (lab.output / "class.csv").read_bytes() == fleet_table
 
 
 def anonymous(lab: Lab, outcome: GradeOutcome) -> None:

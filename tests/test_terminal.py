@@ -6,21 +6,23 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from cli_tools import done
+from cli_tools import done, refused
 from conftest import page_of
 from exchange import replace
 from rich.console import Console
 
 from px4fuse.analysis import Analysis
 from px4fuse.analysis import run as analyse
-from px4fuse.cli.outputs import free_report, progress, terminal
+from px4fuse.cli.outputs import default_report, progress, terminal
+from px4fuse.errors import OutputError
 from px4fuse.report import screen
-from px4fuse.report.screen import paragraph, runnable
+from px4fuse.report.screen import expand_commands, print_paragraph
 from px4fuse.report.terminal import summary
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, settings_name
 from px4fuse.results.build import results
@@ -95,7 +97,7 @@ def test_nothing_is_cut_and_words_are_whole(document, monkeypatch) -> None:
 
 def test_a_paragraph_hangs_beside_its_label(capsys) -> None:
     console = Console(width=30, highlight=False)
-    paragraph(console, "one two three four five six seven", "Label", 9)
+    print_paragraph(console, "one two three four five six seven", "Label", 9)
     lines = ["Label    one two three four", "         five six seven"]
     assert capsys.readouterr().out.splitlines() == lines
 
@@ -115,7 +117,7 @@ def test_commands_are_written_with_what_was_typed() -> None:
         log="my flights/a'b.ulg", mavlink="-t.tlog", position=PositionFile(path="u w/b.csv"),
         start_s=12.5, sigma_z_m=0.3,
     )  # fmt: skip
-    text, (command, loops) = runnable(
+    text, (command, loops) = expand_commands(
         "Try px4fuse compare LOG --sigma-z 0.2 --clock-offset -0.125: better. Or (px4fuse loop "
         "LOG). Not px4fuse sync LOG.ulg.",
         request,
@@ -190,37 +192,57 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     """Write a report without pages where it goes by default."""
     student = Student(name=str(changes.pop("student", "")))
     request = replace(made.request, **changes)
-    changed = replace(made, request=request.recorded(), student=student)
-    path = free_report(Path(request.log).stem, settings_name(request), changed)
+    changed = replace(made, request=request.without_paths(), student=student)
+    path = default_report(Path(request.log).stem, settings_name(request), changed)
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(page_of(None, to_json(changed)))
     path.with_suffix(".json").write_text(to_json(changed), encoding="utf-8")
     return path.name
 
 
-def test_other_settings_do_not_overwrite_a_report_and_the_same_do(made) -> None:
+def test_default_report_of_same_run_is_replaced(made) -> None:
     assert reported(made) == reported(made) == "aisle_uwb.pdf"
     assert reported(made, sigma_z_m=0.05) == "aisle_uwb_sigma-z-0.05.pdf"
-    assert reported(made) == "aisle_uwb.pdf"
-    # a name is added to what had none; another student's is kept
-    assert reported(made, student="Ana") == "aisle_uwb.pdf"
-    assert reported(made, student="Ben") == reported(made, student="Ben") == "aisle_uwb_2.pdf"
-    assert reported(made) == "aisle_uwb_3.pdf"
+    # a name is added to a report without one
+    assert reported(made, student="Ana") == reported(made, student="Ana") == "aisle_uwb.pdf"
 
-    # nor does another flight of the same name; a name that is too long is a number
+
+def test_default_report_with_long_name_is_shortened(made) -> None:
+    log = f"{'ü' * 110}.ulg"
+    names = {reported(made, log=log), reported(made, log=log, sigma_z_m=0.05)}
+    assert len(names) == 2
+    assert all(len(os.fsencode(name)) < 200 and name.startswith("ü" * 80) for name in names)
+
+
+def test_default_report_of_other_log_or_student_is_kept(made) -> None:
+    reported(made, student="Ana")
+    before = Path("reports/aisle_uwb.pdf").read_bytes()
     other = replace(made, log=replace(made.log, sha256="0" * 64))
-    assert reported(other) == reported(other) == "aisle_uwb_4.pdf"
-    assert reported(made, log=f"{'ü' * 110}.ulg") == f"{'ü' * 110}.pdf"
-    assert reported(made, log=f"{'ü' * 110}.ulg", sigma_z_m=0.05) == f"{'ü' * 110}_2.pdf"
+    for results_, student in ((other, "Ana"), (made, "Ben"), (made, "")):
+        with pytest.raises(OutputError, match=r"aisle_uwb\.pdf: exists .* Name the report with -o"):
+            reported(results_, student=student)
+    assert Path("reports/aisle_uwb.pdf").read_bytes() == before
 
 
 @pytest.mark.parametrize("name", ["aisle_uwb.pdf", "aisle_uwb.json"])
-def test_what_is_no_report_is_kept(made, name) -> None:
+def test_default_name_of_another_file_is_refused(made, name) -> None:
     mine = Path("reports") / name
     mine.parent.mkdir()
     mine.write_text("mine")
-    assert reported(made) == "aisle_uwb_2.pdf"
+    with pytest.raises(OutputError, match=f"{name}: exists and is not a report"):
+        reported(made)
     assert mine.read_text() == "mine"
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_same_name_in_two_folders_keeps_first_report(desk, sample_log) -> None:
+    (desk / "b").mkdir()
+    shutil.copy(sample_log, desk / "b" / "l.ulg")
+    done("compare", "l.ulg")
+    before = Path("reports/l.pdf").read_bytes()
+    assert "Name the report with -o" in refused("compare", "b/l.ulg")
+    assert Path("reports/l.pdf").read_bytes() == before
+    done("compare", "l.ulg")
 
 
 def test_names_of_reports_are_names_of_files() -> None:
@@ -260,4 +282,4 @@ def test_the_bar_shows_what_is_done_on_a_terminal_only(monkeypatch, capsys) -> N
 def test_what_is_bold_on_a_page_is_bold_on_a_terminal() -> None:
     for weight, bold in (("bold", True), ("regular", False)):
         block = {"text": "so", "colour": "black", "weight": weight}
-        assert ("bold" in str(screen._styled(block).style)) is bold  # type: ignore[arg-type]
+        assert ("bold" in str(screen._styled_text(block).style)) is bold  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from typing import Any
 import jsonschema
 import pypdf
 import pytest
-from cli_tools import contents, run
+from cli_tools import contents, refused, run
 from click.testing import Result
 from conftest import REPOSITORY
 
@@ -166,19 +166,21 @@ def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_evaluate_with_other_settings_or_files_writes_over_no_page(desk, tmp_path, monkeypatch):
+def test_evaluate_with_other_settings_or_files_keeps_the_page(desk, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "other").mkdir()
     write(tmp_path / "other" / "s.tum", ROWS[:-50])
     commands = {
         "s_against_s": [desk / "s.tum"],
         "s_against_s_rpe-5-m_consecutive": [desk / "s.tum", "--rpe", "5m", "--consecutive"],
-        "s_against_s_2": [tmp_path / "other" / "s.tum"],
     }
     for count, (estimate, *options) in enumerate(commands.values(), start=1):
         assert run("evaluate", estimate, desk / "s.tum", *options).exit_code == 0
         written = {Path(name).stem for name in contents(tmp_path / "reports")}
         assert written == set(list(commands)[:count])
+    before = contents(tmp_path / "reports")
+    assert "-o" in refused("evaluate", tmp_path / "other" / "s.tum", desk / "s.tum")
+    assert contents(tmp_path / "reports") == before
 
 
 @pytest.mark.usefixtures("no_drawing")

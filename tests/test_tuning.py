@@ -25,7 +25,7 @@ from px4fuse.filter.tuning import (
     tune_axes,
 )
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.report.sensitivity import noise_words
+from px4fuse.report.sensitivity import format_noise
 
 SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
 
@@ -237,7 +237,7 @@ def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
     ],
 )
 def test_a_noise_at_an_end_of_the_search_is_a_bound(noise: Noise, said: str) -> None:
-    assert noise_words(noise, "m") == said
+    assert format_noise(noise, "m") == said
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,11 @@ from forgery import (
     Change,
     Edit,
     Forge,
+    appended,
+    array,
     base,
+    dictionary,
     edited,
-    entry,
     font,
     forged,
     glyphs,
@@ -30,21 +31,17 @@ from forgery import (
     plain,
     put,
     read_again,
-    replaced,
     report_of,
+    root,
     saved,
     text,
+    titled,
     with_results,
 )
 from pypdf import PdfReader, PdfWriter
 from pypdf.annotations import Link
 from pypdf.generic import (
-    ArrayObject,
-    DecodedStreamObject,
-    DictionaryObject,
-    FloatObject,
     NameObject,
-    NumberObject,
     TextStringObject,
 )
 
@@ -54,11 +51,12 @@ from px4fuse.results.contract import to_json, to_plain
 from px4fuse.verification import pages, verification
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.verification import (
-    ESTIMATE_RELATIVE,
+    ESTIMATE_RELATIVE_TOLERANCE,
     LIMIT,
     NO_LOG,
-    RELATIVE,
+    RELATIVE_TOLERANCE,
     compare_results,
+    flattened,
     verify,
 )
 
@@ -68,12 +66,10 @@ LOOP_LOG = SAMPLES / "loop_vio.ulg"
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _looked_at_once() -> Iterator[None]:
-    """The redrawn report is the same in most tests: it is rasterised once, in this process."""
-    pytest.importorskip("pypdfium2", reason='pypdfium2 is absent: pip install "px4fuse[grade]"')
+def _pages_in_this_process() -> Iterator[None]:
+    """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "looks", lru_cache(8)(pages.looks))
-        patch.setattr(pages, "bounded", lambda function, job, *_: function(job))
+        patch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
         yield
 
 
@@ -100,8 +96,8 @@ def test_the_shipped_report_is_verified(aisle: Base) -> None:
     verdict = verify(report_of(shipped), shipped, aisle.files, recompute=aisle.recompute)
     assert verdict.status == "verified", verdict
     assert verdict.with_log
+    assert verdict.page_status == "same"
     assert LIMIT in verdict.reasons
-    assert aisle.pdf == shipped
 
 
 def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
@@ -152,12 +148,35 @@ def test_another_platform_is_still_verified(which: str, request: pytest.FixtureR
     elsewhere = (nudged_, lambda: drawn)
     verdict = verify(report_of(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
     assert verdict.outcome == "verified", verdict
-    assert f"within {RELATIVE:g}" in verdict.reasons[0]
+    assert f"within {RELATIVE_TOLERANCE:g}" in verdict.reasons[0]
     aside = shifted(one.pdf, 0.6)
     elsewhere = (one.again[0], lambda: aside)
     verdict = verify(report_of(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
     assert (verdict.status, verdict.outcome) == ("verified", "page differs")
     assert verdict.redrawn == aside
+
+
+def test_verify_numbers_1e_12_apart_are_verified(aisle: Base) -> None:
+    """Other kernels of OpenBLAS change results of the sample flights by 3e-8 at most."""
+    nudged_ = read_again(nudged(json.loads(to_json(aisle.again[0])), -1e-12))
+    elsewhere = (nudged_, lambda: forged(aisle.pdf))
+    verdict = verify(report_of(aisle.pdf), aisle.pdf, aisle.files, recompute=lambda *_: elsewhere)
+    assert verdict.outcome == "verified", verdict
+
+
+def test_compare_results_numbers_1e_4_apart_differ(aisle: Base) -> None:
+    """Every number but those with the tolerance of an estimate, and those near zero."""
+    ours = json.loads(to_json(aisle.again[0]))
+    for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
+        theirs = nudged(ours, share)
+        found = {one.path for one in compare_results(theirs, ours)[0]}
+        wide = verification.ESTIMATES if least == RELATIVE_TOLERANCE else ()
+        expected = {
+            path[:120] for path, value in flattened(ours)
+            if isinstance(value, float) and abs(value) > 0.01 and not path.startswith(wide)
+        }  # fmt: skip
+        assert len(expected) > 100
+        assert expected - found == set()
 
 
 KF = ("axes", "north", "filters", "kf")
@@ -166,10 +185,10 @@ KF = ("axes", "north", "filters", "kf")
 def test_tolerances(aisle: Base) -> None:
     ours = json.loads(to_json(aisle.again[0]))
     for share, path, alike in (
-        (0.5 * RELATIVE, (*KF, "nis_mean"), True),
-        (2.0 * RELATIVE, (*KF, "nis_mean"), False),
-        (0.5 * ESTIMATE_RELATIVE, ("tuning", "horizontal", "sigma_a_m_s2"), True),
-        (2.0 * ESTIMATE_RELATIVE, ("tuning", "horizontal", "sigma_a_m_s2"), False),
+        (0.5 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), True),
+        (2.0 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), False),
+        (0.5 * ESTIMATE_RELATIVE_TOLERANCE, ("tuning", "horizontal", "sigma_a_m_s2"), True),
+        (2.0 * ESTIMATE_RELATIVE_TOLERANCE, ("tuning", "horizontal", "sigma_a_m_s2"), False),
     ):
         theirs = copy.deepcopy(ours)
         part = theirs
@@ -274,7 +293,7 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
 @pytest.mark.parametrize("name", STRUCTURE)
 def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     change, expected = STRUCTURE[name]
-    monkeypatch.setattr(verification, "compare_pages", lambda *_: ())  # they are as drawn
+    monkeypatch.setattr(verification, "compare_pages", lambda *_, **__: ())  # they are as drawn
     results = copy.deepcopy(aisle.results)
     change(results)
     verdict = aisle.verified(aisle.with_results(results))
@@ -292,9 +311,9 @@ def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> N
     again = verification.recompute(read_again(results), loop.files)
     pdf = loop.with_results(results)
     verdict = verify(report_of(pdf), pdf, loop.files, recompute=lambda *_: again)
-    assert (verdict.status, verdict.outcome) == ("verified", "page differs"), verdict
+    assert verdict.outcome != "verified", verdict
+    assert verdict.differences == ()
     assert verdict.redrawn != loop.pdf
-    # another version of a library is no accusation
     named = any("matplotlib 9.9.9 (here" in reason for reason in verdict.reasons)
     assert named == (path[-1] == "matplotlib")
 
@@ -351,12 +370,9 @@ DRAWING: dict[str, Edit] = {
     "nothing at all": lambda c: b"\n",
 }
 PAGES = 8
-# Nobody who looks at the page sees these, or reads anything else from it (see pages.DISTANCE)
-UNSEEN = {"a comment", "a point of a line moved", "a colour"}
-
 
 # Every page in one way, and each of the others on one page
-DRAWN = [
+DRAW_LABEL = [
     (page, name)
     for place, name in enumerate(DRAWING)
     for page in range(1, PAGES + 1)
@@ -364,110 +380,57 @@ DRAWN = [
 ]
 
 
-@pytest.mark.parametrize(("page", "name"), DRAWN)
+@pytest.mark.parametrize(("page", "name"), DRAW_LABEL)
 def test_a_changed_page(aisle: Base, page: int, name: str) -> None:
     verdict = aisle.verified(forged(aisle.pdf, on_page(page, DRAWING[name])))
     assert verdict.redrawn == aisle.pdf  # what is redrawn is never touched by a forgery
     assert verdict.status == "verified"
-    assert verdict.outcome == ("verified" if name in UNSEEN else "page differs"), verdict
-    assert [one.page for one in verdict.pages] == [page] * (name not in UNSEEN)
+    assert verdict.outcome == "page differs", verdict
+    assert [one.page for one in verdict.pages] == [page]
 
 
-def kids(change: Callable[[list[Any]], list[Any]]) -> Forge:
-    def forge(writer: PdfWriter) -> None:
-        tree: Any = writer.root_object["/Pages"]
-        pages = change(list(tree["/Kids"]))
-        tree[NameObject("/Kids")] = ArrayObject(pages)
-        tree[NameObject("/Count")] = NumberObject(len(pages))
-
-    return forge
-
-
-def page(number: int, key: str, value: Any) -> Forge:
-    return lambda writer: entry(key, value)(writer.pages[number - 1])
-
-
-def root(key: str, value: Any) -> Forge:
-    return lambda writer: entry(key, value)(writer.root_object)
-
-
-def box(*corners: float) -> ArrayObject:
-    return ArrayObject([FloatObject(corner) for corner in corners])
-
-
-def dictionary(**entries: Any) -> DictionaryObject:
-    return DictionaryObject({NameObject(f"/{key}"): value for key, value in entries.items()})
-
-
-def script(words: str) -> DictionaryObject:
-    return dictionary(S=NameObject("/JavaScript"), JS=TextStringObject(words))
-
-
-def exchanged_glyphs(writer: PdfWriter) -> None:
-    """A font that draws a 9 where the text has a 1: all texts stay, the page reads otherwise."""
-    numbers = list(range(max(LETTERS.values()) + 1))
-    one, nine = DIGITS[1], DIGITS[9]
-    numbers[one], numbers[nine] = nine, one
-    held = DecodedStreamObject()
-    held.set_data(b"".join(number.to_bytes(2, "big") for number in numbers))
-    descendant = font("/f0")(writer)["/DescendantFonts"][0].get_object()
-    descendant[NameObject("/CIDToGIDMap")] = writer._add_object(held)
-
-
-def titled(**entries: str) -> Forge:
-    return lambda writer: writer.add_metadata({f"/{key}": held for key, held in entries.items()})
-
-
-NOTE = dictionary(
-    Type=NameObject("/Annot"), Subtype=NameObject("/FreeText"), Rect=box(100, 100, 200, 120),
-    Contents=TextStringObject("0.01"), DA=TextStringObject("/Helv 8 Tf"),
-)  # fmt: skip
-NOTHING = dictionary()
-DOCUMENT: dict[str, tuple[Forge, str]] = {
-    "the first page away": (kids(lambda k: k[1:]), "page differs"),
-    "a page away": (kids(lambda k: k[:3] + k[4:]), "page differs"),
-    "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "page differs"),
-    "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "page differs"),
-    "one page for all": (kids(lambda k: k[:1] * len(k)), "page differs"),
-    "an annotation": (page(2, "/Annots", ArrayObject([NOTE])), "page differs"),
-    "a page turned": (page(3, "/Rotate", 180), "page differs"),
-    "a page cut": (page(3, "/CropBox", box(0, 0, 300, 300)), "page differs"),
-    "an action of a page": (page(3, "/AA", dictionary(O=script("1"))), "refused"),
-    "glyphs exchanged": (exchanged_glyphs, "page differs"),
-    "texts of glyphs exchanged": (
-        replaced(font("/f0"), "/ToUnicode", lambda c: c.replace(b"> <0031>", b"> <0039>")),
-        "page differs",
+DOCUMENT: dict[str, tuple[Forge, str, str]] = {
+    "a page away": (lambda w: w.remove_page(7), "page differs", "page 8: it is missing"),
+    "another title": (titled(Title="my report"), "page differs", "document: /Title is"),
+    "a form": (root("/AcroForm", dictionary(Fields=array())), "cannot verify", "form fields that"),
+    "an annotation": (
+        lambda w: w.add_annotation(1, Link(rect=(50, 50, 200, 70), url="http://example.org")),
+        "cannot verify", "page 2: an annotation that px4fuse does not write",
     ),
-    "a script": (root("/OpenAction", script("app.alert(1)")), "refused"),
-    "a form": (root("/AcroForm", dictionary(Fields=ArrayObject())), "verified"),
-    "named scripts": (
-        lambda w: entry("/JavaScript", dictionary(Names=ArrayObject()))(w.root_object["/Names"]),
-        "refused",
-    ),
-    "another title": (titled(Title="my report"), "verified"),
-    "a part that nothing refers to": (lambda w: w._add_object(dictionary(Eve=NOTHING)), "verified"),
+    "a part that nothing refers to": (lambda w: w._add_object(dictionary()), "verified", ""),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DOCUMENT)
 def test_a_changed_document(aisle: Base, name: str) -> None:
-    forge, expected = DOCUMENT[name]
-    pdf = forged(aisle.pdf, forge)
-    if expected == "refused":
-        with pytest.raises(ResultsError):
-            read_report(pdf, "r.pdf")
-        return
-    verdict = aisle.verified(pdf)
-    assert verdict.redrawn in (b"", aisle.pdf)
-    assert verdict.status == "verified"
+    forge, expected, said = DOCUMENT[name]
+    verdict = aisle.verified(forged(aisle.pdf, forge))
+    assert verdict.redrawn == aisle.pdf
     assert verdict.outcome == expected, verdict
+    assert verdict.status == ("verified" if expected == "page differs" else expected)
+    assert any(said in reason for reason in verdict.reasons), verdict
+    # the reason that a class table shows is the one that counts
+    if expected == "cannot verify":
+        assert said in verdict.reasons[0]
+        assert verdict.remedy.startswith("Ask for the PDF")
+        assert LIMIT not in verdict.reasons
 
 
-def appended(pdf: bytes, change: Forge) -> bytes:
-    """An incremental update, as viewers append one."""
-    writer = PdfWriter(io.BytesIO(pdf), incremental=True)
-    change(writer)
-    return saved(writer)
+@pytest.mark.parametrize("key", ["/OpenAction", "/AA"])
+def test_a_document_with_a_script_is_refused(aisle: Base, key: str) -> None:
+    script = dictionary(S=NameObject("/JavaScript"), JS=TextStringObject("app.alert(1)"))
+    with pytest.raises(ResultsError):
+        read_report(forged(aisle.pdf, root(key, script)), "r.pdf")
+
+
+def test_verify_numbers_that_differ_come_first(aisle: Base) -> None:
+    results = copy.deepcopy(aisle.results)
+    results["axes"]["north"]["filters"]["kf"]["nis_mean"] = 1.0
+    form = root("/AcroForm", dictionary(Fields=array()))
+    verdict = aisle.verified(forged(aisle.pdf, form, with_results(to_json(results))))
+    assert verdict.status == "numbers differ"
+    assert "1 of" in verdict.reasons[0]
+    assert any("form fields" in reason for reason in verdict.reasons)
 
 
 def emptied(writer: PdfWriter) -> None:
@@ -485,24 +448,23 @@ def pages_of_another(one: Base, other: Base) -> bytes:
 
 
 def packed(writer: PdfWriter) -> None:
-    """As programs that save a PDF again pack it: object streams, other compression, a link."""
+    """As programs that save a PDF again pack it: object streams, other compression."""
     writer.compress_identical_objects(remove_duplicates=True)
     for page in writer.pages:
         page.compress_content_streams(level=9)
-    writer.add_metadata({"/Producer": "Another program", "/Author": "Ada"})
-    writer.add_annotation(0, Link(rect=(50, 50, 200, 70), url="http://example.org"))
+    writer.add_metadata({"/Producer": "Another program"})
 
 
 FILES: dict[str, tuple[Callable[[Base, Base], bytes], set[str]]] = {
     "saved again": (lambda a, _: forged(a.pdf), {"verified"}),
     "packed in another way": (lambda a, _: forged(a.pdf, packed), {"verified"}),
-    "metadata appended": (lambda a, _: appended(a.pdf, titled(Author="Ada")), {"verified"}),
-    "bytes appended": (lambda a, _: a.pdf + b"\n% Eve\n", {"verified"}),
+    "metadata appended": (lambda a, _: appended(a.pdf, titled(Author="Ada")), {"page differs"}),
+    "bytes appended": (lambda a, _: a.pdf + b"\n% Eve\n", {"cannot verify"}),
     "a version appended": (lambda a, _: appended(a.pdf, emptied), {"page differs"}),
-    "a page of another report": (pages_of_another, {"page differs"}),
+    "a page of another report": (pages_of_another, {"cannot verify"}),
     "a link": (
         lambda a, _: forged(a.pdf, root("/URI", TextStringObject("http://example.org"))),
-        {"verified"},
+        {"cannot verify"},
     ),
     "results of another report": (
         lambda a, b: forged(a.pdf, with_results(to_json(b.results))), {"other log"},
@@ -518,7 +480,7 @@ def test_a_changed_file(aisle: Base, loop: Base, name: str) -> None:
     verdict = aisle.verified(pdf)
     assert verdict.redrawn in (b"", aisle.pdf)
     assert verdict.outcome in expected, verdict
-    assert verdict.redrawn == (aisle.pdf if verdict.status == "verified" else b"")
+    assert verdict.redrawn == (b"" if verdict.status == "other log" else aisle.pdf)
 
 
 def test_another_log(aisle: Base) -> None:

@@ -19,10 +19,10 @@ from exchange import replace
 from px4fuse.analysis import explain, run_what_if
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2 import walk
-from px4fuse.ekf2.inputs import Inputs, Received
+from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import Events, make_intervals
-from px4fuse.ekf2.model import Model, aids_of, open_model, replay_settings, run_variants
-from px4fuse.ekf2.recursion import Run, Variant, run
+from px4fuse.ekf2.model import Model, modelled_aids, open_model, replay_settings, run_variants
+from px4fuse.ekf2.recursion import StretchRun, Variant, run_stretch
 from px4fuse.ekf2.stretches import Stretch
 from px4fuse.ekf2.vision import STOP_S
 from px4fuse.ekf2.whatif import what_if
@@ -32,16 +32,16 @@ from px4fuse.findings import find
 from px4fuse.flight import AidLog, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.origin import RECEIVED
 from px4fuse.report.whatif import rows
-from px4fuse.report.why import agreement_words
+from px4fuse.report.why import format_agreement
 from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json
 from px4fuse.simulation import ekf2 as simulated
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import scenario_of
+from px4fuse.simulation.scenario import make_scenario
 
-OUTDOOR = scenario_of("outdoor", seed=3, passes=2)
+OUTDOOR = make_scenario("outdoor", seed=3, passes=2)
 OF_VISION = {
     "EKF2_EV_CTRL": 1.0, "EKF2_EVP_NOISE": 0.1, "EKF2_EVP_GATE": 5.0, "EKF2_EV_DELAY": 0.0,
     "EKF2_EV_NOISE_MD": 0.0, "EKF2_EV_POS_X": 0.0, "EKF2_EV_POS_Y": 0.0, "EKF2_EV_POS_Z": 0.0,
@@ -57,7 +57,7 @@ def on_gnss() -> Model:
 
 def sent(
     rate_hz: float = 15.0, sigma_m: float = 0.3, late_s: float = 0.0, seed: int = 1
-) -> Received:
+) -> ReceivedPositions:
     """Positions of vision: the truth in a frame of its own, which wanders."""
     truth = on_gnss().flight.truth
     rng = np.random.default_rng(seed)
@@ -68,7 +68,7 @@ def sent(
     wander = np.cumsum(rng.normal(0.0, 0.01 / np.sqrt(rate_hz), position.shape), axis=0)
     position = position + FRAME_M + wander + rng.normal(0.0, sigma_m, position.shape)
     count = len(stamp)
-    return Received(
+    return ReceivedPositions(
         stamp + late_s, np.full(count, -np.inf), position, np.full((count, 3), 0.01),
         np.full(count, np.nan), np.zeros(count, bool), "vehicle_visual_odometry",
     )  # fmt: skip
@@ -121,9 +121,9 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     x, P = stretch.state.copy(), deviation[:, None] * stretch.correlation * deviation
     taken_s = vision.stamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.step_s
     steps = np.searchsorted(stretch.time_s, taken_s - 1e-9).tolist()
-    seen = {step: row for row, step in enumerate(steps) if step > 0}
+    has_sample = {step: row for row, step in enumerate(steps) if step > 0}
     at = {int(event.end): event for event in events}
-    gps2, fixes, told = settings["EKF2_GPS_P_NOISE"] ** 2, [], []
+    gps2, fixes, update_log = settings["EKF2_GPS_P_NOISE"] ** 2, [], []
     biases: list[PlainBias] = []
 
     def fuse(i: int, nu: float, S: float, R: float) -> None:
@@ -153,26 +153,29 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
                 fuse(3 + j, nu[j], S[j], R[j])
         if event is not None:
             x[2] = stretch.attitude_error_rad[k, 2]
-        if k not in seen:
+        if k not in has_sample:
             continue
-        position, off = vision.position_m[seen[k], :2], vision.position_m[seen[k], :2] - x[6:8]
-        R0 = max(vision.variance_m2[seen[k], 0], settings["EKF2_EVP_NOISE"] ** 2, gps2)
+        position, off = (
+            vision.position_m[has_sample[k], :2],
+            vision.position_m[has_sample[k], :2] - x[6:8],
+        )
+        R0 = max(vision.variance_m2[has_sample[k], 0], settings["EKF2_EVP_NOISE"] ** 2, gps2)
         if not biases:
             biases = [PlainBias(float(one), 0.5 * R0, R0) for one in off]
             continue
         nu = position - [bias.bias for bias in biases] - x[6:8]
         R = np.array([R0 + bias.variance for bias in biases])
         S = np.diag(P)[6:8] + R
-        told.append(np.concatenate([[taken_s[seen[k]]], nu, S]))
+        update_log.append(np.concatenate([[taken_s[has_sample[k]]], nu, S]))
         for j, bias in enumerate(biases):
             bias.fuse(float(off[j]), R0 + P[6 + j, 6 + j], inputs.step_s)
         if np.all(nu**2 <= settings["EKF2_EVP_GATE"] ** 2 * S):
             for j in range(2):
                 fuse(6 + j, nu[j], S[j], R[j])
-    return np.array(fixes), np.array(told)
+    return np.array(fixes), np.array(update_log)
 
 
-def flying(vision: Received | None, seconds: float = 40.0, **settings: float) -> Inputs:
+def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: float) -> Inputs:
     """The flight's first part, with nothing to tell of tilt and height but GNSS and vision."""
     inputs = on_gnss().inputs
     (whole,) = inputs.stretches
@@ -182,7 +185,7 @@ def flying(vision: Received | None, seconds: float = 40.0, **settings: float) ->
         whole, time_s=whole.time_s[:count], step_s=whole.step_s[: count - 1],
         rotation=whole.rotation[:count], correction_rad=whole.correction_rad[: count - 1],
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
-        heights=None, state=whole.state[:15], variance=whole.variance[:15], shaken=None,
+        heights=None, state=whole.state[:15], variance=whole.variance[:15], distrusted_share=None,
         correlation=np.eye(15), attitude_variance_rad2=unknown, down_variance_m2=unknown[:, 0],
         attitude_error_rad=whole.attitude_error_rad[:count],
     )  # fmt: skip
@@ -190,14 +193,14 @@ def flying(vision: Received | None, seconds: float = 40.0, **settings: float) ->
     return replace(inputs, stretches=(stretch,), vision=vision, settings=known)
 
 
-def ran(inputs: Inputs, *variants: Variant) -> Run:
+def ran(inputs: Inputs, *variants: Variant) -> StretchRun:
     (stretch,) = inputs.stretches
     variants = variants or (Variant(inputs.settings),)
     made = [make_intervals(inputs, stretch, one.timing(inputs)) for one in variants]
-    return run(inputs, stretch, variants, made)
+    return run_stretch(inputs, stretch, variants, made)
 
 
-def told(done: Run, at: int = 0) -> pd.DataFrame:
+def update_log(done: StretchRun, at: int = 0) -> pd.DataFrame:
     assert done.vision is not None
     return done.vision.updates(at, done.stretch.time_s[done.events[at].end])
 
@@ -220,7 +223,7 @@ def test_the_recursion_is_the_plain_filter(
     assert apart.max() < 0.006
     assert np.all(without[3:] > 8.0 * apart[3:])
     np.testing.assert_allclose(S[10:], fixes[10:, 5:], rtol=2e-3)
-    found = told(done)
+    found = update_log(done)
     found = found.loc[rows[0, 0] + 3.0 :]
     rows = rows[np.searchsorted(rows[:, 0], found.index - 1e-6)]
     assert len(found) > 20.0 * rate_hz
@@ -238,21 +241,25 @@ def test_while_gnss_is_fused_vision_is_no_more_exact_than_a_fix() -> None:
     alone = Variant(inputs.settings, without={"gnss_pos": 0.0})
     done = ran(inputs, *map(Variant, noises), alone)
     assert done.vision is not None
-    noise = np.sqrt(np.unique(done.vision.noise_m2[done.vision.seen[0]].round(9), axis=0))
+    noise = np.sqrt(np.unique(done.vision.noise_m2[done.vision.has_sample[0]].round(9), axis=0))
     assert sorted({*noise[:, 0].round(6)}) == [0.1, 0.5, 0.7]
-    pd.testing.assert_frame_equal(told(done, 0), told(done, 1))
-    assert np.abs(told(done, 2) - told(done, 1)).max(axis=None) > 0.01
+    pd.testing.assert_frame_equal(update_log(done, 0), update_log(done, 1))
+    assert np.abs(update_log(done, 2) - update_log(done, 1)).max(axis=None) > 0.01
 
 
 def test_positions_of_a_sensor_beside_the_imu_are_those_of_the_imu() -> None:
     """EKF2_EV_POS, in the body, turned by the attitude at each sample."""
-    inputs, vision, place_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
+    inputs, vision, lever_arm_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
     (stretch,) = inputs.stretches
     step = np.searchsorted(stretch.time_s, vision.stamp_s - 0.5 * inputs.step_s - 1e-9)
     turn = stretch.rotation[np.minimum(step, len(stretch.rotation) - 1)]
-    beside = replace(vision, position_m=vision.position_m + turn @ place_m)
-    settings = {f"EKF2_EV_POS_{axis}": value for axis, value in zip("XYZ", place_m, strict=True)}
-    pd.testing.assert_frame_equal(told(ran(flying(beside, **settings))), told(ran(inputs)))
+    beside = replace(vision, position_m=vision.position_m + turn @ lever_arm_m)
+    settings = {
+        f"EKF2_EV_POS_{axis}": value for axis, value in zip("XYZ", lever_arm_m, strict=True)
+    }
+    pd.testing.assert_frame_equal(
+        update_log(ran(flying(beside, **settings))), update_log(ran(inputs))
+    )
 
 
 def test_the_bias_follows_visions_frame_and_gnss_says_where_the_vehicle_is() -> None:
@@ -273,7 +280,7 @@ def test_samples_beyond_the_gate_are_rejected_and_after_a_second_the_bias_begins
     at_s = float(on_gnss().inputs.stretches[0].time_s[0]) + 20.0
     jumped = replace(vision, position_m=vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None])
     smooth, done = ran(flying(vision)), ran(flying(jumped))
-    found = told(done)
+    found = update_log(done)
     rejected = found.index[found["rejected"] > 0.0]
     assert rejected[0] == pytest.approx(at_s, abs=0.05)
     assert rejected[-1] - rejected[0] == pytest.approx(1.0, abs=0.1)
@@ -283,7 +290,7 @@ def test_samples_beyond_the_gate_are_rejected_and_after_a_second_the_bias_begins
     apart = done.state[-1, 0, 6:8] - smooth.state[-1, 0, 6:8]
     assert np.abs(apart).max() < 0.05
     without_gate = ran(flying(jumped), Variant(flying(jumped).settings, gated=False))
-    assert not told(without_gate)["rejected"].any()
+    assert not update_log(without_gate)["rejected"].any()
 
 
 def test_after_silence_vision_starts_with_another_bias() -> None:
@@ -294,7 +301,7 @@ def test_after_silence_vision_starts_with_another_bias() -> None:
         moved = vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None]
         fields = ("stamp_s", "arrival_s", "variance_m2", "rejected", "reset")
         parts = {name: getattr(vision, name)[kept] for name in fields}
-        found = told(ran(flying(replace(vision, position_m=moved[kept], **parts))))
+        found = update_log(ran(flying(replace(vision, position_m=moved[kept], **parts))))
         after = found.loc[at_s + silent_s :]
         assert bool(after["rejected"].any()) is not anew
 
@@ -305,7 +312,7 @@ def test_without_gnss_ekf2_goes_to_where_vision_says_it_is() -> None:
     lost_s = float(inputs.stretches[0].time_s[0]) + 20.0
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), lost_s)
     done = ran(inputs, Variant(inputs.settings), Variant(inputs.settings, without=lost))
-    found, flown = told(done, 1), told(done, 0)
+    found, flown = update_log(done, 1), update_log(done, 0)
     assert not flown["reset"].any()
     (reset_s,) = found.index[found["reset"] > 0.0]
     assert reset_s == pytest.approx(lost_s, abs=0.3)
@@ -330,10 +337,10 @@ def test_a_reset_to_gnss_takes_the_bias_with_it() -> None:
         # up to v1.16 a position that is fused, also of vision, holds GNSS off
         assert int(done.reset.sum()) == (not with_velocity)
         assert done.moved_m.sum() == pytest.approx(0.0 if with_velocity else 30.0, abs=3.0)
-        assert told(done)["fused"].mean() > 0.999
+        assert update_log(done)["fused"].mean() > 0.999
 
 
-def off_by(received: Received, north_m: float) -> Received:
+def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
     """The same positions, off from 15 s on."""
     start_s = float(on_gnss().inputs.stretches[0].time_s[0])
     far = (received.stamp_s > start_s + 15.0)[:, None] * np.array([north_m, 0.0, 0.0])
@@ -343,7 +350,7 @@ def off_by(received: Received, north_m: float) -> Received:
 def test_where_both_are_rejected_the_position_is_reset_to_vision_with_its_bias() -> None:
     inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
     done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
-    found = told(done)
+    found = update_log(done)
     (reset_s,) = found.index[found["reset"] > 0.0]
     assert reset_s == pytest.approx(float(done.stretch.time_s[0]) + 16.0, abs=0.2)
     np.testing.assert_allclose(done.moved_m.sum(axis=(0, 1)), [20.0, 0.0], atol=0.7)
@@ -370,13 +377,13 @@ def test_samples_of_one_step_and_those_that_come_too_late() -> None:
     }
     stamps = np.repeat(vision.stamp_s, 2)
     stamps[::2] -= 0.0005
-    once, twice = (told(ran(flying(one))) for one in (
+    once, twice = (update_log(ran(flying(one))) for one in (
         vision, replace(vision, stamp_s=stamps, **doubled)))  # fmt: skip
     assert len(once) <= len(twice) <= 1.1 * len(once)
     horizon_s = flying(vision).horizon_s
     for age_s, kept in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):
         late = replace(vision, arrival_s=vision.stamp_s + age_s)
-        assert bool(len(told(ran(flying(late))))) is kept
+        assert bool(len(update_log(ran(flying(late))))) is kept
 
 
 # ---------------------------------------------------------------- a flight with both
@@ -397,7 +404,7 @@ def flown(
     heard = replace(vision, position_m=(-1.0 if flipped else 1.0) * vision.position_m
                     + wrong_m * noise)  # fmt: skip
 
-    def both(inputs: Inputs, variants: list[Variant], known: Any) -> list[Run]:
+    def both(inputs: Inputs, variants: list[Variant], known: Any) -> list[StretchRun]:
         settings = {**inputs.settings, **SETTINGS, **changed}
         given = replace(inputs, vision=heard, settings=settings)
         runs.extend(usual_run(given, [Variant(settings, without={"ev_pos": off_from_s})], known))
@@ -407,8 +414,8 @@ def flown(
         patch.setattr(simulated, "parameters", lambda *of: usual(*of) | OF_VISION | changed)
         patch.setattr(simulated, "run_variants", both)
         flight = simulate_flight(OUTDOOR, parse(()))
-    updates = told(runs[0])
-    meant = pd.Series([1.0, 0.0], index=[0.0, off_from_s])
+    updates = update_log(runs[0])
+    enabled = pd.Series([1.0, 0.0], index=[0.0, off_from_s])
     samples = pd.DataFrame({
         "innovation_north": updates["innovation_north_m"],
         "innovation_east": updates["innovation_east_m"],
@@ -418,7 +425,7 @@ def flown(
         "rejected": updates["rejected"],
     }).iloc[::7]  # fmt: skip
     log = AidLog(
-        ("estimator_aid_src_ev_pos",), ("north", "east"), samples, meant, {**OF_VISION, **changed}
+        ("estimator_aid_src_ev_pos",), ("north", "east"), samples, enabled, {**OF_VISION, **changed}
     )
     rows = pd.DataFrame(np.hstack([vision.position_m, vision.variance_m2]), vision.stamp_s,
                         [*Columns.POSITION, *Columns.POSITION_VARIANCE])  # fmt: skip
@@ -443,7 +450,7 @@ def test_a_flight_on_both_agrees_aid_by_aid() -> None:
         for axis in axes.values():
             assert axis.innovation_correlation > 0.998
             assert 0.99 < axis.s_ratio_p5 < axis.s_ratio_p95 < 1.01
-    assert aids_of(model().inputs)[:3] == ["gnss_pos", "gnss_vel", "ev_pos"]
+    assert modelled_aids(model().inputs)[:3] == ["gnss_pos", "gnss_vel", "ev_pos"]
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
@@ -457,16 +464,16 @@ def test_what_if_predicts_the_flight_with_the_other_noise_of_vision() -> None:
         assert predicted.nis_mean == pytest.approx(replayed.nis_mean, rel=0.01)
     assert found.logged.others["ev_pos"].nis_mean < 0.5 * predicted.others["ev_pos"].nis_mean
     # which R is of GNSS, whatever this is
-    told = what_if(model(), [{"EKF2_EVP_NOISE": 0.2}])
-    assert "no position of vision to be more exact than EKF2_GPS_P_NOISE" in told.notes[-1]
-    assert told.whatif[0].others == told.replayed.others
+    update_log = what_if(model(), [{"EKF2_EVP_NOISE": 0.2}])
+    assert "no position of vision to be more exact than EKF2_GPS_P_NOISE" in update_log.notes[-1]
+    assert update_log.whatif[0].others == update_log.replayed.others
 
 
 def test_a_smaller_gate_rejects_more_of_vision() -> None:
     request = WhatIfRequest(log="flight.ulg", changes={"EKF2_EVP_GATE": 1.0})
     made_of = run_what_if(request, flight=flown())
-    found, told = made_of.whatif, {label: cells for label, *cells in rows(made_of)}
-    assert "external vision, position: mean NIS" in told
+    found, update_log = made_of.whatif, {label: cells for label, *cells in rows(made_of)}
+    assert "external vision, position: mean NIS" in update_log
     results = json.loads(to_json(whatif_results(request, made_of)))
     jsonschema.validate(results, schema())
     assert results["replayed"]["others"]["ev_pos"]["rejected_share"] == 0.0
@@ -492,13 +499,13 @@ def test_without_one_of_both_the_other_goes_on() -> None:
 @pytest.mark.parametrize("wrong", [{"wrong_m": 1.0}, {"flipped": True}])
 def test_vision_that_does_not_agree_is_named_and_left_out(wrong: dict[str, Any]) -> None:
     found = opened(flown(**wrong))
-    assert "external vision" in agreement_words(found.agreement)
+    assert "external vision" in format_agreement(found.agreement)
     assert "ev_pos" in found.agreement.doubtful
     assert found.agreement.ev_pos["north"].innovation_correlation < 0.5
     # GNSS alone is not what EKF2 had
     assert not found.agreement.good
     assert found.inputs.vision is None
-    assert "ev_pos" not in aids_of(found.inputs)
+    assert "ev_pos" not in modelled_aids(found.inputs)
     with pytest.raises(SettingsError, match="EKF2_EVP_NOISE changes nothing here"):
         replay_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
 
@@ -506,8 +513,8 @@ def test_vision_that_does_not_agree_is_named_and_left_out(wrong: dict[str, Any])
 def test_samples_that_come_while_ekf2_does_without_vision_are_not_fused() -> None:
     found = opened(flown(off_from_s=60.0))
     assert found.inputs.vision is not None
-    told = np.isfinite(found.inputs.vision.position_m[:, 0])
-    assert found.inputs.vision.stamp_s[told][-1] == pytest.approx(60.0, abs=0.1)
+    update_log = np.isfinite(found.inputs.vision.position_m[:, 0])
+    assert found.inputs.vision.stamp_s[update_log][-1] == pytest.approx(60.0, abs=0.1)
     assert found.agreement.good
     assert found.agreement.doubtful == {}
 
@@ -527,7 +534,7 @@ def test_an_older_release_and_a_log_without_all_of_vision_are_refused() -> None:
 
 
 def test_the_walk_has_a_step_of_vision_and_findings_stay_with_the_source() -> None:
-    found = walk.walk(model())
+    found = walk.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]
         assert names.index(walk.SPEED) < names.index(walk.VISION) < names.index(walk.GATE)

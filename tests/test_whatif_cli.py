@@ -12,12 +12,12 @@ import pytest
 from cli_tools import done
 from pypdf import PdfReader
 
-from px4fuse.analysis import Counterfactual, run_what_if
+from px4fuse.analysis import WhatIfAnalysis, run_what_if
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight
-from px4fuse.report.whatif import heads, reading, rows, sweep_table
+from px4fuse.report.whatif import column_heads, reading, rows, sweep_table
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
 from px4fuse.results.reading import read_results
@@ -26,13 +26,13 @@ pytestmark = pytest.mark.usefixtures("analysed_once")
 
 
 @pytest.fixture(scope="module")
-def asked(sample_log: Path) -> Counterfactual:
+def asked(sample_log: Path) -> WhatIfAnalysis:
     """What the data ask for, of the sample flight."""
     return run_what_if(WhatIfRequest(log=str(sample_log)))
 
 
 @pytest.fixture(scope="module")
-def swept(sample_log: Path) -> Counterfactual:
+def swept(sample_log: Path) -> WhatIfAnalysis:
     """A changed gate, and the noise over three values."""
     sweep = Sweep("EKF2_EVP_NOISE", 0.05, 0.2, 3)
     request = WhatIfRequest(log=str(sample_log), changes={"EKF2_EVP_GATE": 3.0}, sweep=sweep)
@@ -71,7 +71,7 @@ def test_without_an_aid_from_a_time_on(sample_log: Path) -> None:
     assert "EKF2 itself gives its position up" in note
 
 
-def test_aids_and_times_that_are_not_there_are_refused(asked: Counterfactual) -> None:
+def test_aids_and_times_that_are_not_there_are_refused(asked: WhatIfAnalysis) -> None:
     model = open_model(asked.flight)
     for without, said in (
         ({"baro_hgt": 60.0}, "baro_hgt: of this log the model fuses ev_pos."),
@@ -81,20 +81,20 @@ def test_aids_and_times_that_are_not_there_are_refused(asked: Counterfactual) ->
             what_if(model, [], without)
 
 
-def test_without_set_it_is_what_the_data_ask_for(asked: Counterfactual) -> None:
+def test_without_set_it_is_what_the_data_ask_for(asked: WhatIfAnalysis) -> None:
     """The UWB's noise is 0.10 m, and its stamps are right."""
     assert asked.asked
     assert set(asked.changes) == {"EKF2_EVP_NOISE"}
     assert asked.changes["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
-    assert "what the data ask for" in heads(asked)[-1]
+    assert "what the data ask for" in column_heads(asked)[-1]
     table, found = {label.strip(): cells for label, *cells in rows(asked)}, asked.whatif
     every = (found.logged, found.replayed, found.whatif[0])
     assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
     assert table["samples"] == [str(s.samples) for s in every]
-    assert all(len(cells) == len(heads(asked)) == 3 for cells in table.values())
+    assert all(len(cells) == len(column_heads(asked)) == 3 for cells in table.values())
 
 
-def test_a_sweep_changes_the_rest_as_set(swept: Counterfactual) -> None:
+def test_a_sweep_changes_the_rest_as_set(swept: WhatIfAnalysis) -> None:
     first, *values = swept.whatif.whatif
     assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
     assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])
@@ -118,7 +118,7 @@ def test_a_log_without_ekf2s_inside_says_why(sample_log: Path) -> None:
 class TestFlownFlights:
     @staticmethod
     @cache
-    def of(shared_logs: Path, name: str) -> Counterfactual:
+    def of(shared_logs: Path, name: str) -> WhatIfAnalysis:
         log = shared_logs / "simulated" / f"{name}.ulg"
         return run_what_if(WhatIfRequest(log=str(log)))
 

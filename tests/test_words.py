@@ -31,8 +31,8 @@ def calls(folder: Path, function: str) -> Iterator[tuple[str, set[str | None]]]:
 
 
 TABLES = [*((room / "words.toml", "say") for room in ROOMS),
-          (PACKAGE / "refusals.toml", r"(\w+Error|refuse)\.of"),
-          (PACKAGE / "lacking.toml", "lacking")]  # fmt: skip
+          (PACKAGE / "refusals.toml", r"(\w+Error|error_type)\.of"),
+          (PACKAGE / "lacking.toml", "missing_data")]  # fmt: skip
 
 
 @pytest.mark.parametrize(("table", "function"), TABLES, ids=lambda given: Path(given).name)

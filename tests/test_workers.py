@@ -13,7 +13,7 @@ import pytest
 from bad_jobs import act
 
 from px4fuse import workers
-from px4fuse.workers import Failed, run_bounded
+from px4fuse.workers import JobFailure, run_bounded
 
 MEMORY = 1_500_000_000
 
@@ -44,21 +44,21 @@ def test_one_bad_job_is_lost_alone():
     ]
     results, _ = run(jobs)
     assert [results[n] for n in (0, 3, 10)] == [1, 4, 9]
-    assert results[1] == Failed("the process that read it ended (exit code 3).")
-    assert results[2] == Failed("ValueError: a b[2J")
-    assert results[4] == Failed("x.ulg: empty.")
-    assert isinstance(results[5], Failed)
-    assert results[6] == Failed("its result could not be read (ValueError).")
+    assert results[1] == JobFailure("the process that read it ended (exit code 3).")
+    assert results[2] == JobFailure("ValueError: a b[2J")
+    assert results[4] == JobFailure("x.ulg: empty.")
+    assert isinstance(results[5], JobFailure)
+    assert results[6] == JobFailure("its result could not be read (ValueError).")
     assert results[7] == bytes(30_000_000)
     assert results[8] == "1"
-    assert results[9] == Failed("the process that read it ended (exit code 0).")
+    assert results[9] == JobFailure("the process that read it ended (exit code 0).")
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
 def test_what_hangs_is_ended():
     results, _ = run([("hang", 0), ("square", 2), ("hang", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]
-    late = Failed("it took longer than 3 s and was ended.")
+    late = JobFailure("it took longer than 3 s and was ended.")
     assert results[0::2] == [late, late]
 
 
@@ -66,7 +66,7 @@ def test_what_hangs_is_ended():
 def test_what_eats_memory_is_ended():
     jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
     results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
-    assert results == [4, Failed("it needed more memory than one file may take."), 9]
+    assert results == [4, JobFailure("it needed more memory than one file may take."), 9]
     # the next job would not find enough memory in that process
     jobs = [("process", 0), ("hog", 10 * MEMORY), ("process", 0)]
     (before, _, after), _ = run(jobs, processes=1, memory_bytes=MEMORY)
@@ -84,7 +84,9 @@ def test_a_function_that_cannot_be_loaded_fails_and_ends(monkeypatch):
     monkeypatch.setattr(act, "__module__", "test_workers_is_not_here")
     monkeypatch.setitem(sys.modules, "test_workers_is_not_here", sys.modules[__name__])
     results, _ = run([("square", 1), ("square", 2)])
-    assert all(isinstance(each, Failed) and "before it began" in each.reason for each in results)
+    assert all(
+        isinstance(each, JobFailure) and "before it began" in each.reason for each in results
+    )
 
 
 def test_who_stops_listening_ends_all():

@@ -1,4 +1,4 @@
-"""Outputs: all or none, nothing replaced that is no regular file, and what is there is said."""
+"""Outputs: each complete or not at all; what is not a regular file stays; messages name files."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -119,7 +120,7 @@ def test_standard_output_in_a_file_keeps_what_is_in_it(desk) -> None:
     assert b"What px4fuse can do with it" in text  # the table follows
 
 
-# --- all or none ---
+# --- each file complete or not at all ---
 
 
 def test_a_name_as_long_as_can_be_is_written(tmp_path) -> None:
@@ -128,35 +129,43 @@ def test_a_name_as_long_as_can_be_is_written(tmp_path) -> None:
     assert path.read_bytes() == b"x"
 
 
-def refuse_renames_to(target: Path, monkeypatch: pytest.MonkeyPatch, count: int = 1) -> None:
-    """Let the first renames to a path fail, as those over a file that is open on Windows."""
-    real, left = Path.replace, [count]
+def at_rename_to(target: Path, monkeypatch: pytest.MonkeyPatch, act: Callable[[], None]) -> None:
+    """Act before the rename to a path."""
+    real = Path.replace
 
     def replace(self: Path, to: Path) -> Path:
-        if Path(to) == target and left[0]:
-            left[0] -= 1
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        if Path(to) == target:
+            act()
         return real(self, to)
 
     monkeypatch.setattr(Path, "replace", replace)
 
 
-@pytest.mark.parametrize("there", ["abc", ""])
-def test_a_rename_that_fails_half_way_puts_back_what_was_there(tmp_path, monkeypatch, there):
-    for name in there:
-        (tmp_path / name).write_bytes(b"old")
-    before, paths = contents(tmp_path), [tmp_path / name for name in "abc"]
-    refuse_renames_to(paths[1], monkeypatch)
-    told: list[Path] = []
-    with pytest.raises(OutputError, match=r"b: cannot be written .*No file was written\.$"):
-        write_all(dict.fromkeys(paths, b"new"), told.append)
-    assert (contents(tmp_path), told) == (before, [])
+def deny() -> None:
+    """Refuse as Windows does for a file that another program has open."""
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def test_where_a_viewer_locks_a_file_it_is_to_be_closed(tmp_path, monkeypatch) -> None:
+def test_error_stops_writing_and_lists_what_was_written(tmp_path, monkeypatch) -> None:
+    a, b, c = (tmp_path / name for name in "abc")
+    for path in (a, b, c):
+        path.write_bytes(b"old")
+    at_rename_to(b, monkeypatch, deny)
+    placed: list[Path] = []
+    with pytest.raises(OutputError) as refused:
+        write_all(dict.fromkeys((a, b, c), b"new"), placed.append)
+    said = f"{b}: cannot be written (Permission denied), {a} written before. Choose another place."
+    assert str(refused.value) == said
+    assert placed == [a]
+    assert contents(tmp_path) == {"a": b"new", "b": b"old", "c": b"old"}
+    with pytest.raises(OutputError, match=r"\(Permission denied\)\. Choose"):
+        write_all({b: b"new"})
+
+
+def test_locked_file_is_to_be_closed(tmp_path, monkeypatch) -> None:
     path = tmp_path / "r.pdf"
     path.write_bytes(b"old")
-    refuse_renames_to(path, monkeypatch, 2)
+    at_rename_to(path, monkeypatch, deny)
     for locks, said in ((True, "Close the program that has it open, or c"), (False, "C")):
         monkeypatch.setattr(writing, "LOCKS", locks)
         with pytest.raises(OutputError, match=rf"\. {said}hoose another"):
@@ -164,42 +173,25 @@ def test_where_a_viewer_locks_a_file_it_is_to_be_closed(tmp_path, monkeypatch) -
         assert path.read_bytes() == b"old"
 
 
-def test_what_cannot_be_put_back_is_said(tmp_path, monkeypatch) -> None:
-    a, b = tmp_path / "a", tmp_path / "b"
-    for path in (a, b, tmp_path / "c"):
-        path.write_bytes(b"old")
-    refuse_renames_to(b, monkeypatch, 2)
-    with pytest.raises(OutputError) as refused:
-        write_all({a: b"new", b: b"new", tmp_path / "c": b"new"})
-    assert a.read_bytes() == b"old"
-    kept = str(refused.value).rpartition("what it held is in ")[2].rstrip(".")
-    assert f"{b} could not be put back" in str(refused.value)
-    assert (tmp_path / f".{kept.lstrip('.')}").read_bytes() == b"old"
-
-
 @posix
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_signal_between_two_renames_waits_for_the_last_one(tmp_path, monkeypatch, name) -> None:
-    number, real = getattr(signal, name), Path.replace
-
-    def replace(self: Path, to: Path) -> Path:
-        made = real(self, to)
-        signal.raise_signal(number)
-        return made
+def test_signal_at_rename_leaves_complete_files_only(tmp_path, monkeypatch, name) -> None:
+    number = getattr(signal, name)
 
     def stop(number: int, _: object) -> None:
         raise KeyboardInterrupt(number)
 
     before = signal.signal(number, stop)
-    monkeypatch.setattr(Path, "replace", replace)
-    told: list[Path] = []
+    at_rename_to(tmp_path / "b", monkeypatch, lambda: signal.raise_signal(number))
+    (tmp_path / "b").write_bytes(b"old")
+    placed: list[Path] = []
     try:
         with pytest.raises(KeyboardInterrupt):
-            write_all({tmp_path / "a": b"new", tmp_path / "b": b"new"}, told.append)
+            write_all(dict.fromkeys((tmp_path / "a", tmp_path / "b"), b"new"), placed.append)
     finally:
         signal.signal(number, before)
-    assert names(tmp_path) == ["a", "b"]
-    assert told == [tmp_path / "a", tmp_path / "b"]
+    assert contents(tmp_path) == {"a": b"new", "b": b"old"}
+    assert placed == [tmp_path / "a"]
 
 
 # --- ended from outside ---
@@ -207,10 +199,8 @@ def test_a_signal_between_two_renames_waits_for_the_last_one(tmp_path, monkeypat
 
 @posix
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_who_is_stopped_while_writing_leaves_nothing_and_says_so_in_one_line(
-    desk, name, code
-) -> None:
-    os.mkfifo(desk / "pipe")  # nobody reads it: the run waits with its other file half done
+def test_signal_while_writing_names_the_written_files(desk, name, code) -> None:
+    os.mkfifo(desk / "pipe")  # nobody reads it: the run waits with its other file written
     number = getattr(signal, name)
     ours = signal.signal(number, signal.SIG_DFL)  # what is ignored here would be ignored there
     process = start(desk, *LOOP, "--json", "pipe", stdout=subprocess.PIPE)
@@ -223,8 +213,8 @@ def test_who_is_stopped_while_writing_leaves_nothing_and_says_so_in_one_line(
     process.send_signal(number)
     out, err = process.communicate(timeout=30.0)
     assert (process.returncode, out) == (code, b"")
-    assert err == b"px4fuse: interrupted, nothing was written.\n"
-    assert names(desk) == ["l.ulg", "pipe", "s.tum"]
+    assert err == b"px4fuse: interrupted, c.tum written before.\n"
+    assert names(desk) == ["c.tum", "l.ulg", "pipe", "s.tum"]
 
 
 def test_who_is_stopped_after_writing_says_what_is_there(desk, monkeypatch, capsys) -> None:
@@ -245,11 +235,12 @@ def test_who_is_stopped_after_writing_says_what_is_there(desk, monkeypatch, caps
 @full
 @pytest.mark.parametrize(
     ("json_path", "left", "there"),
-    [("-", "", []), ("c.json", ", c.tum, c.json written before.", ["c.json", "c.tum"])],
+    [
+        ("-", ", c.tum written before.", ["c.tum"]),
+        ("c.json", ", c.tum, c.json written before.", ["c.json", "c.tum"]),
+    ],
 )
-def test_what_cannot_be_printed_is_one_line_that_says_what_is_written(
-    desk, json_path, left, there
-) -> None:
+def test_full_standard_output_names_the_written_files(desk, json_path, left, there) -> None:
     with Path("/dev/full").open("wb") as device:
         process = start(desk, *LOOP, "--json", json_path, stdout=device)
         err = process.communicate()[1].decode()
@@ -269,10 +260,10 @@ def test_a_reader_of_the_results_that_leaves_is_no_reason_to_keep_the_files(desk
     assert names(desk) == ["c.tum", "l.ulg", "s.tum"]
 
 
-def test_results_are_printed_before_files_are_in_their_places(tmp_path, capsysbinary) -> None:
+def test_folder_as_target_is_refused(tmp_path, capsysbinary) -> None:
     (tmp_path / "folder").mkdir()
-    with pytest.raises(OutputError):
-        write_all({STANDARD_OUTPUT: b"{}", tmp_path / "folder": b""})
+    with pytest.raises(OutputError, match=r"folder: cannot be written \(Is a directory\)"):
+        write_all({tmp_path / "folder": b"", STANDARD_OUTPUT: b"{}"})
     assert capsysbinary.readouterr().out == b""
     write_all({tmp_path / "a": b"", STANDARD_OUTPUT: b"{}"})
     assert capsysbinary.readouterr().out == b"{}"
@@ -292,7 +283,7 @@ def test_a_name_that_no_font_has_is_said_before_the_report(
         return b"%PDF-"
 
     monkeypatch.setattr(pdf, "render", render)
-    monkeypatch.setattr(fonts, "_others", lambda: ())
+    monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
     fonts.font_of.cache_clear()
     run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())
     fonts.font_of.cache_clear()

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from px4fuse.alignment import tracks
-from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, OwnTrack
+from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
 from px4fuse.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.offset import STEP_S
@@ -15,7 +15,7 @@ WINDOW_S = 1.0  # by which the least squares may leave the correlation's peak
 # Concordance below which nothing was matched
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
 MIN_MISFIT = 1e-4  # better matches are as good as this one, so that the longer of them counts
-FAR_S = 3.0  # at this distance a lag is another one, even on a plateau
+SEPARATE_LAG_S = 3.0  # at this distance a lag is another one, even on a plateau
 RESIDUAL_FLOOR_M = 0.05  # what the grid's steps leave of a perfect match
 MAX_DISTANCE_M = 1.0  # a larger one counts as this where fits are compared: it may be NLOS
 
@@ -32,16 +32,16 @@ class Peak:
         2·Re(e^{-iψ}cov) / (var + var): a correlation that also falls where one of the two moves
         further than the other; 1 only where they are equal but for an offset. NaN where the lag
         was given.
-    rival_s : float
+    second_peak_s : float
         The best lag elsewhere, relative to this one; NaN where there is none.
-    rival_ratio : float
+    second_peak_ratio : float
         Its residual (RMS) over that of the peak.
     """
 
     lag_s: float
     concordance: float = float("nan")
-    rival_s: float = float("nan")
-    rival_ratio: float = float("inf")
+    second_peak_s: float = float("nan")
+    second_peak_ratio: float = float("inf")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ class Fit(Peak):
     rms_m: float
 
 
-def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None) -> Peak:
+def correlation_peak(file: SampledTrack, reference: SampledTrack, yaw_rad: float | None) -> Peak:
     """Lag of greatest likelihood gain over all lags on the grid, yaw free where None.
 
     With a free offset the residual sum of squares over an overlap of N grid points is
@@ -89,16 +89,20 @@ def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None)
         raise NoMatchError("too little is left between gaps to be matched")
     found = moments(file.horizontal_m, reference.horizontal_m, file.valid, reference.valid)
     count, covariance, power = found.count, found.covariance, found.power_a + found.power_b
-    shorter = min(np.count_nonzero(file.valid), np.count_nonzero(reference.valid))
-    enough = count >= max(tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / STEP_S, shorter / 2.0))
-    if not enough.any():
+    min_count = min(np.count_nonzero(file.valid), np.count_nonzero(reference.valid))
+    has_overlap = count >= max(
+        tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / STEP_S, min_count / 2.0)
+    )
+    if not has_overlap.any():
         raise NoMatchError("too little is left between gaps to be matched")
-    enough &= power > 1e-9 * np.max(power)  # else rounding errors correlate
-    agreed = np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
+    has_overlap &= power > 1e-9 * np.max(power)  # else rounding errors correlate
+    real_covariance = (
+        np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
+    )
     concordance = np.zeros_like(power)
-    concordance[enough] = 2.0 * agreed[enough] / power[enough]
+    concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / power[has_overlap]
     gain = -count * np.log(np.maximum(1.0 - concordance, MIN_MISFIT))
-    best = int(np.argmax(np.where(enough, gain, -np.inf)))
+    best = int(np.argmax(np.where(has_overlap, gain, -np.inf)))
 
     def lag(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file.valid) + 1) * STEP_S
@@ -107,23 +111,28 @@ def correlation_peak(file: OwnTrack, reference: OwnTrack, yaw_rad: float | None)
     outside = np.flatnonzero(concordance < 0.5 * concordance[best])
     low = np.max(outside[outside < best], initial=-1)
     high = np.min(outside[outside > best], initial=len(count))
-    rivals = (count >= 0.5 * count[best]) & (power >= 0.25 * power[best]) & enough
-    rivals &= concordance >= MIN_CONCORDANCE[reference.name]
-    far = round(FAR_S / STEP_S)
-    rivals[max(low + 1, best - far) : min(high, best + far + 1)] = False
+    is_other_peak = (count >= 0.5 * count[best]) & (power >= 0.25 * power[best]) & has_overlap
+    is_other_peak &= concordance >= MIN_CONCORDANCE[reference.name]
+    far = round(SEPARATE_LAG_S / STEP_S)
+    is_other_peak[max(low + 1, best - far) : min(high, best + far + 1)] = False
     peak = Peak(lag(best), float(concordance[best]))
-    if not rivals.any():
+    if not is_other_peak.any():
         return peak
     # per axis; the floor keeps two perfect matches equal
-    square = np.maximum(power - 2.0 * agreed, 0.0) / (2.0 * np.maximum(count, 1.0))
+    square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
     residual = np.sqrt(square + RESIDUAL_FLOOR_M**2)
-    rival = int(np.argmin(np.where(rivals, residual, np.inf)))
-    ratio = float(residual[rival] / residual[best])
-    return replace(peak, rival_s=lag(rival) - lag(best), rival_ratio=ratio)
+    second_peak = int(np.argmin(np.where(is_other_peak, residual, np.inf)))
+    ratio = float(residual[second_peak] / residual[best])
+    return replace(peak, second_peak_s=lag(second_peak) - lag(best), second_peak_ratio=ratio)
 
 
 def least_squares_fit(
-    file: OwnTrack, reference: OwnTrack, peak: Peak, yaw_rad: float | None, *, clock_free: bool
+    file: SampledTrack,
+    reference: SampledTrack,
+    peak: Peak,
+    yaw_rad: float | None,
+    *,
+    clock_free: bool,
 ) -> Fit:
     """Robust least squares (soft L1) over origin and, where free, lag and yaw.
 
@@ -137,8 +146,8 @@ def least_squares_fit(
     NoMatchError
         Too few samples lie within the reference.
     """
-    start, known = reference.at(file.time_s + peak.lag_s)
-    used = known & file.valid
+    start, is_known = reference.at(file.time_s + peak.lag_s)
+    used = is_known & file.valid
     if np.count_nonzero(used) < tracks.MIN_SAMPLES:
         raise NoMatchError(
             f"{np.count_nonzero(used)} of the file's positions fall on the reference"
@@ -164,36 +173,40 @@ def least_squares_fit(
 
     start_at = complex(np.mean(target))
     # origin, and where they are free lag and yaw
-    free = [True, True, clock_free, yaw_rad is None]
-    x0 = np.array([start_at.real, start_at.imag, 0.0, float(np.angle(coherence))])[free]
-    limit = np.array([np.inf, np.inf, WINDOW_S, np.inf])[free]
-    scale = _scale(residual(x0))
+    free_parameters = [True, True, clock_free, yaw_rad is None]
+    x0 = np.array([start_at.real, start_at.imag, 0.0, float(np.angle(coherence))])[free_parameters]
+    limit = np.array([np.inf, np.inf, WINDOW_S, np.inf])[free_parameters]
+    scale = _robust_scale(residual(x0))
     solution = least_squares(residual, x0, bounds=(-limit, limit), loss="soft_l1", f_scale=scale)
     (origin, shift, yaw), r = unpack(solution.x), residual(solution.x)
     r_complex = r[: len(z)] + 1j * r[len(z) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
     information += 1e-9 * np.diag(np.diag(information) + 1e-12)  # singular: a huge variance
-    variance = np.diag(np.linalg.inv(information)) * _scale(r) ** 2 * _inflation(r_complex)
+    variance = (
+        np.diag(np.linalg.inv(information))
+        * _robust_scale(r) ** 2
+        * _autocorrelation_factor(r_complex)
+    )
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    at_limit = clock_free and abs(shift) > 0.99 * WINDOW_S
+    is_at_limit = clock_free and abs(shift) > 0.99 * WINDOW_S
     ned, _ = reference.at(time + shift)
     down = ned[:, 2] - file.position_m[used, 2]
     down = down[np.isfinite(down)]
     origin_down = float(np.median(down)) if len(down) else 0.0
-    horizontal_rms = capped_rms(np.abs(r_complex)) / np.sqrt(2.0)
-    vertical_rms = capped_rms(down - origin_down) if len(down) else 0.0
+    horizontal_rms = truncated_rms(np.abs(r_complex)) / np.sqrt(2.0)
+    vertical_rms = truncated_rms(down - origin_down) if len(down) else 0.0
     concordance = peak.concordance
     if np.isnan(concordance):
-        agreed = float((np.exp(-1j * yaw) * coherence).real)
-        concordance = agreed * power / mean_square if power > 0 else 0.0
+        real_covariance = float((np.exp(-1j * yaw) * coherence).real)
+        concordance = real_covariance * power / mean_square if power > 0 else 0.0
     origin -= np.exp(1j * yaw) * centre
     return Fit(
         lag_s=peak.lag_s + shift,
-        lag_sigma_s=(np.inf if at_limit else float(sigma[2])) if clock_free else None,
+        lag_sigma_s=(np.inf if is_at_limit else float(sigma[2])) if clock_free else None,
         concordance=concordance,
-        rival_s=peak.rival_s,
-        rival_ratio=peak.rival_ratio,
+        second_peak_s=peak.second_peak_s,
+        second_peak_ratio=peak.second_peak_ratio,
         yaw_rad=yaw,
         yaw_sigma_rad=float(sigma[-1]) if yaw_rad is None else None,
         origin_m=np.array([origin.real, origin.imag, origin_down]),
@@ -203,23 +216,23 @@ def least_squares_fit(
     )
 
 
-def _scale(residual: Array) -> float:
+def _robust_scale(residual: Array) -> float:
     """Standard deviation by the median; never 0, for a perfect fit too."""
     return max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
 
 
-def _inflation(residual: Complex) -> float:
+def _autocorrelation_factor(residual: Complex) -> float:
     """1 + 2Σρ: how many autocorrelated residuals say as much as one independent one."""
-    limit = 3.0 * _scale(np.abs(residual))
+    limit = 3.0 * _robust_scale(np.abs(residual))
     clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
     rho = autocovariance(clipped)
     if rho[0] <= 0.0:
         return 1.0
-    crossed = np.flatnonzero(rho <= 0.0)
-    until = crossed[0] if len(crossed) else len(rho)
-    return float(1.0 + 2.0 * np.sum(rho[1:until]) / rho[0])
+    zero_crossings = np.flatnonzero(rho <= 0.0)
+    first_zero = zero_crossings[0] if len(zero_crossings) else len(rho)
+    return float(1.0 + 2.0 * np.sum(rho[1:first_zero]) / rho[0])
 
 
-def capped_rms(values_m: Array) -> float:
+def truncated_rms(values_m: Array) -> float:
     """Root mean square with large values counted as the largest that counts."""
     return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_DISTANCE_M) ** 2)))

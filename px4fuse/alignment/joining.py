@@ -9,8 +9,8 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, best_first
-from px4fuse.readers.parts import missing_parts
+from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preference
+from px4fuse.readers.parts import collect_unavailable
 from px4fuse.recording import InputFile
 
 # Fields of records that are times
@@ -45,40 +45,57 @@ def join(flight: Flight, other: Flight) -> Flight:
         raise MissingDataError.of(
             "no_common_time", flight=flight, other=other, one=_span(flight), two=_span(other)
         )
-    moved = later(other, shift_s)
-    agreement = _agreement(flight, moved)
-    taken: dict[str, Any] = {}
+    shifted = shift_times(other, shift_s)
+    agreement = _agreement(flight, shifted)
+    parts_taken: dict[str, Any] = {}
     streams = dict(flight.streams)
     for part in ("imu", "attitude", "ekf2", "truth", "airborne", "modes"):
-        mine, theirs = getattr(flight, part), getattr(moved, part)
-        if isinstance(mine, Unavailable) and not isinstance(theirs, Unavailable):
-            taken[part] = theirs
-            streams |= {k: v for k, v in moved.streams.items() if k.startswith(part)}
-    joined = replace(flight, **taken)
-    lacking = missing_parts(joined.imu, joined.attitude, joined.ekf2, joined.truth)
-    log, given = flight.log, other.log
+        own_part, other_part = getattr(flight, part), getattr(shifted, part)
+        if isinstance(own_part, Unavailable) and not isinstance(other_part, Unavailable):
+            parts_taken[part] = other_part
+            streams |= {k: v for k, v in shifted.streams.items() if k.startswith(part)}
+    joined = replace(flight, **parts_taken)
+    missing_parts_found = collect_unavailable(
+        joined.imu, joined.attitude, joined.ekf2, joined.truth
+    )
+    log, other_log = flight.log, other.log
     unix_s = log.start_unix_s
-    if unix_s is None and given.start_unix_s is not None:
-        unix_s = given.start_unix_s - shift_s
-    how = f"joined with {given.name} on the boot clock, {high - low:.1f} s in common; {agreement}"
+    if unix_s is None and other_log.start_unix_s is not None:
+        unix_s = other_log.start_unix_s - shift_s
+    join_note = (
+        f"joined with {other_log.name} on the boot clock, {high - low:.1f} s in common; {agreement}"
+    )
     return replace(
         joined,
         log=structs.replace(
             log,
-            notes=(*log.notes, *(f"{given.name}: {note}" for note in given.notes), how),
+            notes=(
+                *log.notes,
+                *(f"{other_log.name}: {note}" for note in other_log.notes),
+                join_note,
+            ),
             start_unix_s=unix_s,
-            damage=(*log.damage, *(f"{given.name}: {said}" for said in given.damage)),
-            senders=log.senders or given.senders,
-            restarts=log.restarts or given.restarts,
-            receipt_went_back=log.receipt_went_back or given.receipt_went_back,
-            dropped={**{f"{given.name}: {k}": n for k, n in given.dropped.items()}, **log.dropped},
+            damage=(
+                *log.damage,
+                *(f"{other_log.name}: {sentence}" for sentence in other_log.damage),
+            ),
+            senders=log.senders or other_log.senders,
+            restarts=log.restarts or other_log.restarts,
+            receipt_went_back=log.receipt_went_back or other_log.receipt_went_back,
+            dropped={
+                **{f"{other_log.name}: {k}": n for k, n in other_log.dropped.items()},
+                **log.dropped,
+            },
         ),
-        positions=best_first((*flight.positions, *moved.positions)),
-        missing=(*lacking, *(part for part in flight.missing if part.source)),
+        positions=sort_by_preference((*flight.positions, *shifted.positions)),
+        missing=(*missing_parts_found, *(part for part in flight.missing if part.source)),
         streams=streams,
         clocks=(*flight.clocks, *other.clocks),
         unused=(*flight.unused, *other.unused),
-        inputs=(*flight.inputs, InputFile(given.name, given.sha256, given.bytes, "mavlink")),
+        inputs=(
+            *flight.inputs,
+            InputFile(other_log.name, other_log.sha256, other_log.bytes, "mavlink"),
+        ),
     )
 
 
@@ -87,7 +104,7 @@ def _span(flight: Flight) -> str:
     return f"{start:.1f} s to {start + flight.log.duration_s:.1f} s"
 
 
-def later(part: Any, shift_s: float) -> Any:
+def shift_times(part: Any, shift_s: float) -> Any:
     """A flight, or a part, counted from another time zero: tables, and the times in its records.
 
     Parameters
@@ -98,21 +115,21 @@ def later(part: Any, shift_s: float) -> Any:
     if isinstance(part, pd.DataFrame | pd.Series):
         return part.set_axis(pd.Index(part.index.to_numpy() + shift_s, name="time_s"))
     if isinstance(part, tuple):
-        return tuple(later(one, shift_s) for one in part)
+        return tuple(shift_times(entry, shift_s) for entry in part)
     if isinstance(part, Mapping):
-        return {key: later(one, shift_s) for key, one in part.items()}
+        return {key: shift_times(entry, shift_s) for key, entry in part.items()}
     if not is_dataclass(part) or isinstance(part, type):
         return part
-    moved = {}
-    for name in (each.name for each in fields(part)):
+    shifted = {}
+    for name in (field.name for field in fields(part)):
         value = getattr(part, name)
-        moved[name] = value + shift_s if name in TIMES else later(value, shift_s)
+        shifted[name] = value + shift_s if name in TIMES else shift_times(value, shift_s)
     if isinstance(part, Ekf2):
-        moved["instances"] = tuple((time + shift_s, number) for time, number in part.instances)
+        shifted["instances"] = tuple((time + shift_s, number) for time, number in part.instances)
     if isinstance(part, Flight) and not isinstance(part.airborne, Unavailable):
         spans = part.airborne
-        moved["airborne"] = tuple((start + shift_s, end + shift_s) for start, end in spans)
-    return replace(part, **moved)
+        shifted["airborne"] = tuple((start + shift_s, end + shift_s) for start, end in spans)
+    return replace(part, **shifted)
 
 
 def _agreement(flight: Flight, other: Flight) -> str:
@@ -121,12 +138,18 @@ def _agreement(flight: Flight, other: Flight) -> str:
     Two flights may both count from a boot of their own, so that overlap alone proves nothing.
     """
     if isinstance(flight.ekf2, Ekf2) and isinstance(other.ekf2, Ekf2):
-        mine, theirs = flight.ekf2.state, other.ekf2.state
-        at = theirs.index[(theirs.index >= mine.index[0]) & (theirs.index <= mine.index[-1])]
-        if len(at) >= MIN_COMMON_SAMPLES:
-            ours = np.column_stack([np.interp(at, mine.index, mine[c]) for c in Columns.POSITION])
-            apart = np.linalg.norm(ours - theirs.loc[at, Columns.POSITION].to_numpy(), axis=1)
-            median = float(np.median(apart))
+        state_here, other_state = flight.ekf2.state, other.ekf2.state
+        common_s = other_state.index[
+            (other_state.index >= state_here.index[0]) & (other_state.index <= state_here.index[-1])
+        ]
+        if len(common_s) >= MIN_COMMON_SAMPLES:
+            position = np.column_stack(
+                [np.interp(common_s, state_here.index, state_here[c]) for c in Columns.POSITION]
+            )
+            distance_m = np.linalg.norm(
+                position - other_state.loc[common_s, Columns.POSITION].to_numpy(), axis=1
+            )
+            median = float(np.median(distance_m))
             if median > MAX_POSITION_DIFFERENCE_M:
                 raise MissingDataError.of("other_flight", flight=flight, other=other, median=median)
             return f"their EKF2 positions differ by {median:.3f} m (median)"

@@ -19,24 +19,26 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.alignment import matching, tracks
-from px4fuse.alignment.fitting import MIN_CONCORDANCE, capped_rms
-from px4fuse.alignment.matching import Match, Question
+from px4fuse.alignment.fitting import MIN_CONCORDANCE, truncated_rms
+from px4fuse.alignment.matching import AlignmentProblem, Match
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Alignment, Flight, PositionTrack, Unavailable
-from px4fuse.origin import GIVEN_FILE
+from px4fuse.origin import POSITION_FILE
 from px4fuse.readers.parts import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
 from px4fuse.recording import InputFile
 
 # Another lag whose residual is not larger by this factor can hardly be told apart
-NEAR_RESIDUAL = {EKF2_POSITION: 2.0, IMU: 1.4}  # the IMU's own noise leaves 1.4 to 1.7
-MIN_MIRRORED = 0.8  # correlation of the heights below minus which they run against each other
+NEAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}  # the IMU's own noise leaves 1.4 to 1.7
+MIN_MIRRORED_CORRELATION = (
+    0.8  # correlation of the heights below minus which they run against each other
+)
 MAX_UNIX_DIFFERENCE_S = 60.0  # computers in a lab keep time better than this
 
 
-def place(
+def align_position_file(
     flight: Flight,
     file: PositionRecording,
     *,
@@ -90,28 +92,30 @@ def place(
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
-        asked = Question(samples, frame or file.frame, yaw_rad, lag_s)
-        match = matching.find_match(flight, asked)
+        problem = AlignmentProblem(samples, frame or file.frame, yaw_rad, lag_s)
+        match = matching.find_match(flight, problem)
     except NoMatchError as error:
         raise MissingDataError(f"{file.name}: {error}; {spans}", f"{error.remedy}.") from None
-    alignment, placed = _describe(flight, file, asked, match, frame, yaw_deg, clock_offset_s)
-    how = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
-    turned = f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
+    alignment, placed = _describe_alignment(
+        flight, file, problem, match, frame, yaw_deg, clock_offset_s
+    )
+    clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
+    rotation_words = f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     track = PositionTrack(
         name=file.name,
-        origin=GIVEN_FILE,
-        description=f"external position file, {len(placed)} samples, {alignment.frame}{turned}",
+        origin=POSITION_FILE,
+        description=f"external position file, {len(placed)} samples, {alignment.frame}{rotation_words}",
         samples=placed,
         frame="NED",
         clock=f"the file's own {file.clock} clock, {alignment.clock_offset_s:+.3f} s to the boot "
-        f"clock, {how}",
+        f"clock, {clock_source}",
         topics=(file.name,),
         log=file.name,
         alignment=alignment,
     )
-    said = tuple(f"{file.name}: {text}" for text in (*file.detected, *file.notes))
+    reader_notes = tuple(f"{file.name}: {text}" for text in (*file.detected, *file.notes))
     dropped = {file.name: file.dropped} if file.dropped else {}
-    notes, dropped = (*flight.log.notes, *said), {**flight.log.dropped, **dropped}
+    notes, dropped = (*flight.log.notes, *reader_notes), {**flight.log.dropped, **dropped}
     log = structs.replace(flight.log, notes=notes, dropped=dropped)
     inputs = (*flight.inputs, InputFile(file.name, file.sha256, file.size_bytes, "position"))
     return replace(flight, log=log, positions=(track, *flight.positions), inputs=inputs)
@@ -129,18 +133,18 @@ def _check_options(
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
 
 
-def _describe(
+def _describe_alignment(
     flight: Flight,
     file: PositionRecording,
-    asked: Question,
+    problem: AlignmentProblem,
     match: Match | None,
     frame_option: str | None,
     yaw_deg: float | Literal["auto"] | None,
     clock_offset_s: float | None,
 ) -> tuple[Alignment, pd.DataFrame]:
     """Alignment, with the reason for each of its parts, and the placed samples."""
-    samples, frame, auto = asked.samples, asked.frame or "", asked.yaw_rad is None
-    yaw_rad, lag_s = asked.yaw_rad or 0.0, asked.lag_s or 0.0
+    samples, frame, is_yaw_free = problem.samples, problem.frame or "", problem.yaw_rad is None
+    yaw_rad, lag_s = problem.yaw_rad or 0.0, problem.lag_s or 0.0
     yaw_sigma_deg = clock_sigma_s = correlation = None
     origin_m, reference = np.zeros(3), ""
     yaw_reason, clock_reason = "given with --position-yaw", "given with --clock-offset"
@@ -153,9 +157,9 @@ def _describe(
         frame, reference = match.frame, match.reference.name
         if not (frame_option or file.frame):
             frame_reason = f"fits {reference} best; residuals: {match.misfits}"
-            if auto and frame == "enu":
+            if is_yaw_free and frame == "enu":
                 frame_reason += "; nwu differs from enu only by the yaw, which was found"
-        if auto:
+        if is_yaw_free:
             yaw_rad = match.fit.yaw_rad
             yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
             yaw_reason = f"matched with {reference}"
@@ -166,16 +170,21 @@ def _describe(
             clock_reason = f"matched with {reference}, so that a delay of that is part of it"
         correlation = float((np.exp(-1j * yaw_rad) * match.clock.coherence).real)
     placed = tracks.placed_samples(samples, frame, yaw_rad, origin_m, lag_s)
-    compared = None if reference == IMU else _compare(flight, placed)
-    if compared:
-        reference, correlation = EKF2_POSITION, compared[1]
-    other = [] if auto else [*_other_frame(match, compared, yaw_rad)]
-    hardly = compared[1] if compared and not other else None
+    comparison = None if reference == IMU else _compare(flight, placed)
+    if comparison:
+        reference, correlation = EKF2_POSITION, comparison[1]
+    frame_conflicts = [] if is_yaw_free else [*_frame_conflicts(match, comparison, yaw_rad)]
+    unexplained_correlation = comparison[1] if comparison and not frame_conflicts else None
     warnings = _warnings(
-        flight, file, match, auto, correlation=hardly, clock_offset_s=clock_offset_s
+        flight,
+        file,
+        match,
+        is_yaw_free,
+        correlation=unexplained_correlation,
+        clock_offset_s=clock_offset_s,
     )
     if not (match and match.better_frame):
-        other += _other_height(flight, placed)
+        frame_conflicts += _height_conflicts(flight, placed)
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
@@ -188,8 +197,8 @@ def _describe(
         clock_reason=clock_reason,
         reference=reference,
         correlation=correlation,
-        residual_rms_m=float(np.sqrt(np.mean(compared[0] ** 2) / 2.0)) if compared else None,
-        misplaced=tuple(other),
+        residual_rms_m=float(np.sqrt(np.mean(comparison[0] ** 2) / 2.0)) if comparison else None,
+        misplaced=tuple(frame_conflicts),
         warnings=tuple(warnings),
     )
     return alignment, placed
@@ -209,75 +218,92 @@ def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None]
         return None
     if np.count_nonzero(known) < tracks.MIN_SAMPLES:
         return None
-    ours = (placed["north_m"].to_numpy() + 1j * placed["east_m"].to_numpy())[known]
-    theirs = (ekf2[:, 0] + 1j * ekf2[:, 1])[known]
-    distance_m = np.abs(ours - theirs)
-    ours, theirs = ours - np.mean(ours), theirs - np.mean(theirs)
-    moves = max(np.ptp(theirs.real), np.ptp(theirs.imag)) >= tracks.MIN_MOTION_M
-    power = float(np.linalg.norm(ours) * np.linalg.norm(theirs))
-    return distance_m, float(np.vdot(ours, theirs).real) / power if moves and power > 0.0 else None
+    file_position = (placed["north_m"].to_numpy() + 1j * placed["east_m"].to_numpy())[known]
+    ekf2_position = (ekf2[:, 0] + 1j * ekf2[:, 1])[known]
+    distance_m = np.abs(file_position - ekf2_position)
+    file_position, ekf2_position = (
+        file_position - np.mean(file_position),
+        ekf2_position - np.mean(ekf2_position),
+    )
+    has_motion = max(np.ptp(ekf2_position.real), np.ptp(ekf2_position.imag)) >= tracks.MIN_MOTION_M
+    power = float(np.linalg.norm(file_position) * np.linalg.norm(ekf2_position))
+    return distance_m, float(
+        np.vdot(file_position, ekf2_position).real
+    ) / power if has_motion and power > 0.0 else None
 
 
-def _other_height(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
+def _height_conflicts(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
     """Whether the file's height runs against EKF2's: then its frame is another one."""
     if isinstance(flight.ekf2, Unavailable):
         return
     down = flight.ekf2.state["down_m"]
-    ours = placed["down_m"].loc[down.index[0] : down.index[-1]].dropna()
-    if len(ours) < tracks.MIN_SAMPLES:
+    file_down_m = placed["down_m"].loc[down.index[0] : down.index[-1]].dropna()
+    if len(file_down_m) < tracks.MIN_SAMPLES:
         return
-    theirs = np.interp(ours.index, down.index, down)
-    moved = min(np.ptp(np.percentile(ours, [2, 98])), np.ptp(theirs))
-    if moved >= tracks.MIN_MOTION_M and np.corrcoef(ours, theirs)[0, 1] <= -MIN_MIRRORED:
+    ekf2_down_m = np.interp(file_down_m.index, down.index, down)
+    range_m = min(np.ptp(np.percentile(file_down_m, [2, 98])), np.ptp(ekf2_down_m))
+    if (
+        range_m >= tracks.MIN_MOTION_M
+        and np.corrcoef(file_down_m, ekf2_down_m)[0, 1] <= -MIN_MIRRORED_CORRELATION
+    ):
         yield (
             "The file's height runs against EKF2's (one rises where the other sinks): its z points "
             "the other way. Give another --position-frame."
         )
 
 
-def _other_frame(
-    match: Match | None, compared: tuple[Array, float | None] | None, yaw_rad: float
+def _frame_conflicts(
+    match: Match | None, comparison: tuple[Array, float | None] | None, yaw_rad: float
 ) -> Iterator[str]:
     """Whether the file's frame is another one than EKF2's."""
     if match is None:
         return
-    name, turned = match.reference.name, match.turned
-    if compared:
-        rms_m = capped_rms(compared[0]) / np.sqrt(2.0)
-        turned = matching.is_sound(match.free, name) and matching.is_turned(rms_m, match.free, name)
-    if turned and match.better_frame:
+    name, is_rotated = match.reference.name, match.is_rotated
+    if comparison:
+        rms_m = truncated_rms(comparison[0]) / np.sqrt(2.0)
+        is_rotated = matching.is_good_fit(match.free_yaw_fit, name) and matching.needs_rotation(
+            rms_m, match.free_yaw_fit, name
+        )
+    if is_rotated and match.better_frame:
         yield (
             f"The file does not fit the {name} as {match.frame}, but it does as "
             f"{match.better_frame}: give --position-frame {match.better_frame}."
         )
-    elif turned:
-        yaw = np.degrees(np.angle(np.exp(1j * (match.free.yaw_rad - yaw_rad))))
-        shift = np.hypot(*match.free.origin_m[:2])
-        how = f"turned by {yaw:.1f}°" + (f" and shifted by {shift:.1f} m" if compared else "")
-        yield f"The file's frame seems {how} against the {name}: give --position-yaw auto."
+    elif is_rotated:
+        yaw = np.degrees(np.angle(np.exp(1j * (match.free_yaw_fit.yaw_rad - yaw_rad))))
+        shift = np.hypot(*match.free_yaw_fit.origin_m[:2])
+        frame_words = f"turned by {yaw:.1f}°" + (
+            f" and shifted by {shift:.1f} m" if comparison else ""
+        )
+        yield f"The file's frame seems {frame_words} against the {name}: give --position-yaw auto."
 
 
 def _warnings(
-    flight: Flight, file: PositionRecording, match: Match | None, auto: bool, *,
-    correlation: float | None, clock_offset_s: float | None,
-) -> Iterator[str]:  # fmt: skip
+    flight: Flight,
+    file: PositionRecording,
+    match: Match | None,
+    is_yaw_free: bool,
+    *,
+    correlation: float | None,
+    clock_offset_s: float | None,
+) -> Iterator[str]:
     """What makes the match doubtful, what it cannot tell, and whether the flight is the same."""
     if match:
         name, fit = match.reference.name, match.clock
         if fit.concordance < matching.GOOD_CONCORDANCE[name]:
             yield f"The file follows the {name} only roughly (concordance {fit.concordance:.2f})."
-        if fit.rival_ratio < NEAR_RESIDUAL[name]:
+        if fit.second_peak_ratio < NEAR_RESIDUAL_RATIO[name]:
             yield (
-                f"A clock offset {fit.rival_s:+.1f} s from this one fits nearly as well, with a "
-                f"residual only {fit.rival_ratio:.1f} times as large: if this one is wrong, give "
+                f"A clock offset {fit.second_peak_s:+.1f} s from this one fits nearly as well, with a "
+                f"residual only {fit.second_peak_ratio:.1f} times as large: if this one is wrong, give "
                 "--clock-offset SECONDS."
             )
-        if auto and name == IMU:
+        if is_yaw_free and name == IMU:
             yield (
                 "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
                 "and not the origin of the file's frame, which was left at 0."
             )
-    if not auto and correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
+    if not is_yaw_free and correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
         yield (
             f"The file hardly follows the EKF2 position (correlation {correlation:.2f}): check "
             "clock offset, frame and yaw."

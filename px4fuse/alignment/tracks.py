@@ -12,9 +12,9 @@ from px4fuse.arrays import Array, BoolArray, Complex
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.filter.signals import Segment, ned_acceleration
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable
-from px4fuse.origin import GIVEN_FILE
+from px4fuse.origin import POSITION_FILE
 from px4fuse.readers.parts import finite_rows
-from px4fuse.trajectory.association import bracketed, gap_limit
+from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.offset import STEP_S
 
 # Which of x, y, z is north, east, down, and with which sign
@@ -45,7 +45,7 @@ class NoMatchError(Exception):
 
 
 @dataclass(frozen=True)
-class OwnTrack:
+class SampledTrack:
     """Positions over time, of the file or of its reference.
 
     Attributes
@@ -77,56 +77,56 @@ class OwnTrack:
         return np.stack(position, axis=1), valid
 
 
-def file_track(samples: pd.DataFrame, frame: str) -> OwnTrack:
+def file_track(samples: pd.DataFrame, frame: str) -> SampledTrack:
     """Read the file's axes as north, east, down; time from its first sample on."""
     order, sign = FRAMES[frame]
     time = samples.index.to_numpy()
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
-    return OwnTrack(time - time[0], position, np.ones(len(time), dtype=bool))
+    return SampledTrack(time - time[0], position, np.ones(len(time), dtype=bool))
 
 
-def on_grid(track: OwnTrack) -> OwnTrack:
+def resample_to_grid(track: SampledTrack) -> SampledTrack:
     """Resample to the grid that begins with the track, gaps marked."""
     grid = np.arange(track.time_s[0], track.time_s[-1], STEP_S)
-    known = bracketed(grid, track.time_s, gap_limit(track.time_s, GAP_S))
-    return OwnTrack(grid, track.at(grid)[0], known)
+    known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, GAP_S))
+    return SampledTrack(grid, track.at(grid)[0], known)
 
 
-def despiked(track: OwnTrack, window: int = 3) -> OwnTrack:
+def remove_spikes(track: SampledTrack, window: int = 3) -> SampledTrack:
     """Without single outliers, or more with a longer median."""
     return replace(track, position_m=median_filter(track.position_m, size=(window, 1)))
 
 
-def band_passed(position_m: Array) -> Array:
+def band_pass(position_m: Array) -> Array:
     """Band-pass without delay."""
     sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / STEP_S, output="sos")
     padding = min(round(BAND_PADDING_S / STEP_S), len(position_m) - 1)
     return sosfiltfilt(sos, position_m, axis=0, padlen=padding)
 
 
-def without_edges(track: OwnTrack) -> OwnTrack:
+def remove_edges(track: SampledTrack) -> SampledTrack:
     """Without what the filter's transients spoil, next to gaps too."""
     edge = round(BAND_EDGE_S / STEP_S)
     return replace(track, valid=binary_erosion(track.valid, np.ones(2 * edge + 1, dtype=bool)))
 
 
-def horizontal_range_m(track: OwnTrack) -> float:
+def horizontal_range_m(track: SampledTrack) -> float:
     """Larger horizontal range (m), noise and outliers left out."""
-    return float(np.max(np.ptp(despiked(track, 5).position_m[:, :2], axis=0)))
+    return float(np.max(np.ptp(remove_spikes(track, 5).position_m[:, :2], axis=0)))
 
 
-def _ekf2_track(state: pd.DataFrame) -> OwnTrack:
+def _ekf2_track(state: pd.DataFrame) -> SampledTrack:
     """EKF2's position on the grid, smoothed."""
     known = finite_rows(state, Columns.POSITION[:2])
     if len(known) < MIN_SAMPLES:
         raise NoMatchError("EKF2 has no horizontal position in this log")
     time, position = known.index.to_numpy(), known[Columns.POSITION].to_numpy()
-    grid = on_grid(OwnTrack(time, position, np.ones(len(known), dtype=bool)))
+    grid = resample_to_grid(SampledTrack(time, position, np.ones(len(known), dtype=bool)))
     smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / STEP_S, axis=0, mode="nearest")
     return replace(grid, position_m=smooth, name=EKF2_POSITION)
 
 
-def ekf2_references(flight: Flight) -> list[OwnTrack]:
+def ekf2_references(flight: Flight) -> list[SampledTrack]:
     """EKF2's position as published and, where it was reset horizontally, without those resets.
 
     Height is always as published: most of its resets correct an error of before take-off.
@@ -137,27 +137,29 @@ def ekf2_references(flight: Flight) -> list[OwnTrack]:
     states = [state]
     resets = [r for r in flight.ekf2.resets if r.quantity == "position" and any(r.delta[:2])]
     if resets:
-        after = state.index.to_numpy()[:, None] >= np.array([reset.time_s for reset in resets])
-        moved = after @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
-        states.append(state.assign(**(state[Columns.POSITION] - moved)))
+        is_after_reset = state.index.to_numpy()[:, None] >= np.array(
+            [reset.time_s for reset in resets]
+        )
+        reset_sum_m = is_after_reset @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
+        states.append(state.assign(**(state[Columns.POSITION] - reset_sum_m)))
     references = [_ekf2_track(state) for state in states]
     if max(map(horizontal_range_m, references)) < MIN_MOTION_M:
         raise NoMatchError("EKF2's position hardly moves")
     return references
 
 
-def imu_references(flight: Flight) -> list[OwnTrack]:
+def imu_references(flight: Flight) -> list[SampledTrack]:
     """Acceleration integrated twice, band-passed after each integration."""
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError("the log has no acceleration in NED")
     time = acceleration.index.to_numpy()
     velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
-    grid = on_grid(OwnTrack(time, velocity, np.ones(len(time), dtype=bool)))
+    grid = resample_to_grid(SampledTrack(time, velocity, np.ones(len(time), dtype=bool)))
     if len(grid.time_s) * STEP_S < MIN_OVERLAP_S:
         raise NoMatchError("the IMU's record is too short")
-    position = cumulative_trapezoid(band_passed(grid.position_m), dx=STEP_S, axis=0, initial=0)
-    return [without_edges(replace(grid, position_m=band_passed(position), name=IMU))]
+    position = cumulative_trapezoid(band_pass(grid.position_m), dx=STEP_S, axis=0, initial=0)
+    return [remove_edges(replace(grid, position_m=band_pass(position), name=IMU))]
 
 
 def placed_samples(
@@ -179,8 +181,8 @@ def placed_samples(
     return pd.DataFrame(dict(zip(columns, values.T, strict=True)), index=times)
 
 
-def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> OwnTrack:
+def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> SampledTrack:
     """EKF2's track with its resets treated as the placed file has it."""
-    track = PositionTrack("", GIVEN_FILE, "", placed, "NED", "", ())
-    whole = Segment(float(placed.index[0]), float(placed.index[-1]), "")
-    return _ekf2_track(continuous_state(ekf2, track, whole)[0])
+    track = PositionTrack("", POSITION_FILE, "", placed, "NED", "", ())
+    segment = Segment(float(placed.index[0]), float(placed.index[-1]), "")
+    return _ekf2_track(continuous_state(ekf2, track, segment)[0])

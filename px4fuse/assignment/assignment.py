@@ -7,27 +7,35 @@ from dataclasses import asdict
 from pathlib import Path
 
 from px4fuse.answers import form_name, form_text
-from px4fuse.assignment.drawing import Drawn, Kinds, draw
+from px4fuse.assignment.drawing import AssignedFlight, Kinds, draw
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key
-from px4fuse.assignment.roster import Person, folded
-from px4fuse.assignment.truth import truth_of
+from px4fuse.assignment.roster import Person, normalise_text
+from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.plain import plain
+from px4fuse.input_files import own_files
+from px4fuse.plain import to_json_types
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.writing import write_all
 
 # Of the numbers that only the instructor knows
-TRUTH = ("duration_s", "sigma_z_m", "sigma_a_m_s2", "reported_sigma_m", "clock_offset_to_add_s",
-         "path_length_m", "closure_error_m")  # fmt: skip
+TRUTH = (
+    "duration_s",
+    "sigma_z_m",
+    "sigma_a_m_s2",
+    "reported_sigma_m",
+    "clock_offset_to_add_s",
+    "path_length_m",
+    "closure_error_m",
+)
 
 
 def fly(
     secret: bytes, student: Person, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
     """One student's log, and the answer to it."""
-    drawn = draw(secret, student.student_id, kind, count, truth)
-    simulation = flights.simulate(drawn.scenario, parse(drawn.typed))
+    assigned_flight = draw(secret, student.student_id, kind, count, truth)
+    simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.typed))
     log = flights.to_ulog(simulation)
     sha256 = hashlib.sha256(log).hexdigest()
     known = flights.answer(simulation)["truth"]
@@ -36,15 +44,15 @@ def fly(
         name=student.name,
         file=student.file,
         sha256=sha256,
-        scenario=plain(asdict(drawn.scenario)),
-        mistakes=drawn.typed,
+        scenario=to_json_types(asdict(assigned_flight.scenario)),
+        mistakes=assigned_flight.typed,
         truth={name: float(known[name]) for name in TRUTH},
-        difficulty=drawn.difficulty,
-        form=truth_of(simulation, sha256),
+        difficulty=assigned_flight.difficulty,
+        form=form_truth(simulation, sha256),
     )
 
 
-def key_path(folder: Path, given: Path | None) -> Path:
+def key_path(folder: Path, key_option: Path | None) -> Path:
     """Where the answer key goes: beside the students' folder, never into it.
 
     Raises
@@ -52,9 +60,9 @@ def key_path(folder: Path, given: Path | None) -> Path:
     OutputError
         It would be among the students' files.
     """
-    whole = folder.resolve()
-    path = given or whole.parent / f"{whole.name}_answers.json"
-    if whole in (path.resolve(), *path.resolve().parents):
+    resolved_folder = folder.resolve()
+    path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
+    if resolved_folder in (path.resolve(), *path.resolve().parents):
         raise OutputError.of("key_among_students", path=path)
     return path
 
@@ -71,9 +79,9 @@ def assign(
 ) -> tuple[AnswerKey, int]:
     """Write everyone's log and form into a folder, and the answer key.
 
-    Each student's log, form and answer are put in their places together, so that a run that is
-    interrupted can go on. What is there already is never replaced: a log must be the same to the
-    byte, and a key may only gain students.
+    Each student's answer is written before log and form, so that a run that is interrupted can go
+    on. What is there already is never replaced: a log must be the same to the byte, and a key may
+    only gain students.
 
     Parameters
     ----------
@@ -99,29 +107,34 @@ def assign(
     OutputError
         A file is there already with other content, or cannot be written.
     """
-    key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
-    answers = {folded(answer.student_id): answer for answer in key.answers}
+    with own_files():
+        key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+    answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     _check_extends(
-        key_file, key.kind == kind and answers.keys() <= {folded(s.student_id) for s in students}
+        key_file,
+        key.kind == kind and answers.keys() <= {normalise_text(s.student_id) for s in students},
     )
-    made_up = key.secret
+    new_secret = key.secret
     if secret is None:
-        made_up = made_up or secrets.token_urlsafe(24)
-        secret = made_up.encode()
-    elif made_up.encode() != secret:
-        made_up = ""
+        new_secret = new_secret or secrets.token_urlsafe(24)
+        secret = new_secret.encode()
+    elif new_secret.encode() != secret:
+        new_secret = ""
     written = 0
     for done, student in enumerate(students, start=1):
         log, answer = fly(secret, student, kind, count, truth)
-        known = answers.setdefault(folded(student.student_id), answer)
+        known = answers.setdefault(normalise_text(student.student_id), answer)
         _check_extends(key_file, known.sha256 == answer.sha256)
         form = form_text(student.file, answer.sha256).encode()
         contents = {folder / student.file: log, folder / form_name(student.file): form}
-        new = {path: content for path, content in contents.items() if not _there(path, content)}
-        key = AnswerKey(kind, tuple(answers.values()), made_up)
-        write_all({**new, key_file: key_text(key).encode()})
-        # of no use to anyone but the instructor
-        key_file.chmod(0o600)
+        new = {
+            path: content for path, content in contents.items() if not _is_written(path, content)
+        }
+        key = AnswerKey(kind, tuple(answers.values()), new_secret)
+        # the key first: it contains the secret, without which a run that was ended cannot go on
+        write_all({key_file: key_text(key).encode()})
+        key_file.chmod(0o600)  # for the instructor only
+        write_all(new)
         written += folder / student.file in new
         step(done, len(students))
     return key, written
@@ -133,7 +146,7 @@ def preview(
     secret: bytes | None,
     kind: Kinds,
     count: int | None = None,
-) -> list[Drawn]:
+) -> list[AssignedFlight]:
     """What :func:`assign` would draw for each, without a flight and without a file.
 
     Raises
@@ -151,7 +164,7 @@ def preview(
     return [draw(secret, student.student_id, kind, count) for student in students]
 
 
-def _there(target: Path, log: bytes) -> bool:
+def _is_written(target: Path, log: bytes) -> bool:
     """Whether a log is there already; another one in its place is not replaced."""
     if not target.exists() and not target.is_symlink():
         return False

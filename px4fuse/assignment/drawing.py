@@ -15,25 +15,25 @@ from functools import partial
 from itertools import accumulate
 from typing import Any, Literal
 
-from px4fuse.assignment.roster import folded
+from px4fuse.assignment.roster import normalise_text
 from px4fuse.errors import SettingsError
 from px4fuse.record import Record, table
-from px4fuse.simulation.scenario import Kind, Scenario, scenario_of
+from px4fuse.simulation.scenario import Kind, Scenario, make_scenario
 
 # Of a class: one kind of flight for all, or drawn for each
 Kinds = Literal["aisle", "loop", "mixed"]
 
 MIN_SECRET = 8
 # Named in every draw: another text gives other flights, and keys of another text cannot be extended
-DRAWN = "px4fuse assignment 2"
+DRAW_LABEL = "px4fuse assignment 2"
 # Shares of flights with so many mistakes, where the number is not given. The loop has one mistake
 # to offer; with fewer flights without it, "false closure" would be a safe guess.
 COUNTS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
 # Of a class of both kinds
-LOOPS = 1 / 3
+LOOP_SHARE = 1 / 3
 # Of the smallest size of a mistake that px4fuse finds in 19 of 20 flights, over the size in the
 # flight: between these everyone's lies
-EASIEST, HARDEST = 0.6, 1.0
+EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 
 
 class AssignableMistake(Record, frozen=True):
@@ -88,7 +88,7 @@ class AssignableMistake(Record, frozen=True):
         return f"{text},{first + at * (last - first):.0f}s"
 
 
-class OfKind(Record, frozen=True):
+class DrawingRules(Record, frozen=True):
     """What may be drawn for a kind of flight: numbers of the scenario, and mistakes.
 
     Numbers are (low, high, decimals), by field.
@@ -98,12 +98,12 @@ class OfKind(Record, frozen=True):
     numbers: dict[str, tuple[float, float, int]]
 
 
-_OF_KIND = table(__file__, "drawn.toml", dict[Kind, OfKind])
-CHOICES = {kind: of.mistakes for kind, of in _OF_KIND.items()}
+_OF_KIND = table(__file__, "drawn.toml", dict[Kind, DrawingRules])
+ASSIGNABLE_MISTAKES = {kind: of.mistakes for kind, of in _OF_KIND.items()}
 
 
 @dataclass(frozen=True)
-class Drawn:
+class AssignedFlight:
     """What was drawn for a student.
 
     Attributes
@@ -123,14 +123,14 @@ class Drawn:
 
 def uniform(secret: bytes, student_id: str, kind: Kinds, label: str) -> float:
     """A number in [0, 1) that only those who know the secret can tell."""
-    message = "\0".join((DRAWN, kind, folded(student_id), label))
+    message = "\0".join((DRAW_LABEL, kind, normalise_text(student_id), label))
     digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
     return int.from_bytes(digest[:7], "big") / 2**56
 
 
 def draw(
     secret: bytes, student_id: str, kind: Kinds, count: int | None = None, truth: bool = True
-) -> Drawn:
+) -> AssignedFlight:
     """Draw one student's flight.
 
     Parameters
@@ -147,33 +147,44 @@ def draw(
     SettingsError
         So many mistakes cannot be in one flight.
     """
-    most = min(len(COUNTS[one]) for one in (COUNTS if kind == "mixed" else (kind,))) - 1
+    most = (
+        min(len(COUNTS[draw_number]) for draw_number in (COUNTS if kind == "mixed" else (kind,)))
+        - 1
+    )
     if count is not None and not 0 <= count <= most:
         raise SettingsError.of("mistakes_many", count=count, kind=kind, most=most)
     if kind == "mixed":
-        kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOPS else "aisle"
-    one = partial(uniform, secret, student_id, kind)
+        kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOP_SHARE else "aisle"
+    draw_number = partial(uniform, secret, student_id, kind)
     if count is None:
-        count = bisect(list(accumulate(COUNTS[kind][:-1])), one("count"))
-    made: list[tuple[AssignableMistake, float, str]] = []
-    for choice in sorted(CHOICES[kind], key=lambda c: one(f"order {c.mistake}")):
-        if len(made) < count and all(choice.goes_with(other) for other, *_ in made):
+        count = bisect(list(accumulate(COUNTS[kind][:-1])), draw_number("count"))
+    chosen_mistakes: list[tuple[AssignableMistake, float, str]] = []
+    for choice in sorted(
+        ASSIGNABLE_MISTAKES[kind], key=lambda c: draw_number(f"order {c.mistake}")
+    ):
+        if len(chosen_mistakes) < count and all(
+            choice.goes_with(other) for other, *_ in chosen_mistakes
+        ):
             name = choice.mistake
-            share = 0.0 if choice.limit is None else one(f"size {name}")
-            sign = -1.0 if choice.either_sign and one(f"sign {name}") < 0.5 else 1.0
-            hard = EASIEST + (HARDEST - EASIEST) * share
-            made.append((choice, hard, choice.typed(hard, sign, one(f"at {name}"))))
+            share = 0.0 if choice.limit is None else draw_number(f"size {name}")
+            sign = -1.0 if choice.either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
+            difficulty = EASIEST_DIFFICULTY + (HARDEST_DIFFICULTY - EASIEST_DIFFICULTY) * share
+            chosen_mistakes.append(
+                (choice, difficulty, choice.typed(difficulty, sign, draw_number(f"at {name}")))
+            )
     numbers: dict[str, Any] = {
-        name: round(low + (high - low) * one(name), decimals)
+        name: round(low + (high - low) * draw_number(name), decimals)
         for name, (low, high, decimals) in _OF_KIND[kind].numbers.items()
     }
-    told, seed = truth and kind == "aisle", int(one("seed") * 2**32)
-    scenario = scenario_of(kind, truth=told, seed=seed, **numbers)
-    hardest = max((hard for _, hard, _ in made), default=HARDEST)
-    return Drawn(scenario, tuple(typed for *_, typed in made), round(hardest, 2))
+    has_truth, seed = truth and kind == "aisle", int(draw_number("seed") * 2**32)
+    scenario = make_scenario(kind, truth=has_truth, seed=seed, **numbers)
+    hardest = max((difficulty for _, difficulty, _ in chosen_mistakes), default=HARDEST_DIFFICULTY)
+    return AssignedFlight(
+        scenario, tuple(typed for *_, typed in chosen_mistakes), round(hardest, 2)
+    )
 
 
-def secret_of(text: str, where: str) -> bytes:
+def encode_secret(text: str, where: str) -> bytes:
     """A secret as bytes, from an option or a file.
 
     Raises

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.assignment.roster import MAX_STUDENTS, Person, Register, folded
+from px4fuse.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
 from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
@@ -41,7 +41,7 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
         Numbers that the log does not say: ``sigma_z_m``, ``sigma_a_m_s2`` and
         ``clock_offset_to_add_s`` among them.
     difficulty : float or None
-        See :class:`px4fuse.assignment.drawing.Drawn`.
+        See :class:`px4fuse.assignment.drawing.AssignedFlight`.
     form : FormTruth or None
         The right answers to the form.
     """
@@ -86,8 +86,10 @@ class AnswerKey(msgspec.Struct, frozen=True):
 
     def of_student(self, student_id: str) -> Answer | None:
         """The answer for an id, as a :class:`Register` knows it."""
-        place = Register(Person(a.student_id) for a in self.answers).place(Person(student_id))
-        return None if place is None else self.answers[place]
+        student_index = Register(Person(a.student_id) for a in self.answers).student_index(
+            Person(student_id)
+        )
+        return None if student_index is None else self.answers[student_index]
 
     def of_log(self, sha256: str) -> Answer | None:
         """The answer for a log."""
@@ -110,7 +112,7 @@ def read_key(path: Path) -> AnswerKey:
     text = read_text(path, SettingsError, MAX_KEY_BYTES, name=str(path))
     try:
         key = msgspec.json.decode(text, type=AnswerKey)
-        if len({folded(answer.student_id) for answer in key.answers}) < len(key.answers):
+        if len({normalise_text(answer.student_id) for answer in key.answers}) < len(key.answers):
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
         raise SettingsError.of("no_key", path=path, error=error) from error

@@ -55,7 +55,7 @@ class Person:
         return f"{file_stem(self.student_id)}.ulg"
 
 
-def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
+def read_people(sheet: Sheet) -> tuple[Person, ...]:
     """The class list that a learning platform exports, or any table with a column of ids or names.
 
     Columns are found by their titles: id (Student ID, ID number, Matrikelnummer, SIS User ID),
@@ -72,10 +72,10 @@ def people_of_sheet(sheet: Sheet) -> tuple[Person, ...]:
     rows: dict[str, int] = {}
     people = []
     for number, row in enumerate(sheet.rows, start=2):
-        person = person_of_row(sheet, row)
+        person = read_student(sheet, row)
         if person is None:
             continue
-        wanted = folded(person.student_id)
+        wanted = normalise_text(person.student_id)
         if wanted and rows.setdefault(wanted, number) != number:
             raise SettingsError.of(
                 "id_twice",
@@ -94,10 +94,10 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     Raises
     ------
     SettingsError
-        From :func:`~px4fuse.assignment.sheet.read_sheet` and :func:`people_of_sheet`, or no file
+        From :func:`~px4fuse.assignment.sheet.read_sheet` and :func:`read_people`, or no file
         can be named after an id.
     """
-    people = people_of_sheet(read_sheet(path))
+    people = read_people(read_sheet(path))
     if not people or len(people) > MAX_STUDENTS:
         raise SettingsError(f"{path}: {len(people)} students", f"Give 1 to {MAX_STUDENTS}.")
     stems: dict[str, Person] = {}
@@ -109,10 +109,10 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     return people
 
 
-def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
+def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     """The student in a row of a table; None for a row without one."""
-    said = {what: one_line(sheet.cell(row, titles), MAX_NAME) for what, titles in COLUMNS.items()}
-    name = said["name"] or f"{said['first']} {said['last']}".strip()
+    cells = {what: one_line(sheet.cell(row, titles), MAX_NAME) for what, titles in COLUMNS.items()}
+    name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
     if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
         return None
     numbers = {}
@@ -120,10 +120,10 @@ def person_of_row(sheet: Sheet, row: Sequence[str]) -> Person | None:
         numbers["moodle"] = participant[0]
     if sheet.column(("sisuserid", "sisloginid")) is not None:
         numbers |= {"canvas": user} if (user := sheet.cell(row, ("id",))) else {}
-        said["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME)
-    student_id = said["student_id"] or said["login"] or said["email"]
+        cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME)
+    student_id = cells["student_id"] or cells["login"] or cells["email"]
     submitted = sheet.cell(row, ("lastmodifiedsubmission",))
-    found = Person(student_id, name, said["email"], said["login"], numbers, submitted)
+    found = Person(student_id, name, cells["email"], cells["login"], numbers, submitted)
     return found if student_id or name or numbers else None
 
 
@@ -134,66 +134,73 @@ class Register:
         self.people = list(people)
         # what other lists know of the same people; who is not among them is left out
         for other in chain.from_iterable(lists):
-            if (place := self.place(other)) is not None:
-                known = self.people[place]
-                whole = {name: getattr(known, name) or getattr(other, name) for name in ADDED}
-                numbers = {**other.numbers, **known.numbers}
-                self.people[place] = replace(known, numbers=numbers, **whole)
+            if (student_index := self.student_index(other)) is not None:
+                known_person = self.people[student_index]
+                combined_fields = {
+                    name: getattr(known_person, name) or getattr(other, name) for name in ADDED
+                }
+                numbers = {**other.numbers, **known_person.numbers}
+                self.people[student_index] = replace(
+                    known_person, numbers=numbers, **combined_fields
+                )
 
-    def place(self, other: Person) -> int | None:
+    def student_index(self, other: Person) -> int | None:
         """Where somebody stands of whom another list knows: by number, id, email, login or name.
 
         By the first of these that exactly one of the class has. Leading zeros, which spreadsheets
         take away from ids, may be missing.
         """
         numbers = other.numbers.items()
-        looks: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
-            *((_same, lambda one, at=at: one.numbers.get(at, ""), said) for at, said in numbers),
-            (_same, attrgetter("student_id"), other.student_id),
-            (same_id, attrgetter("student_id"), other.student_id),
-            (_same, attrgetter("email"), other.email),
+        criteria: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
+            *(
+                (_is_same_text, lambda one, at=at: one.numbers.get(at, ""), value)
+                for at, value in numbers
+            ),
+            (_is_same_text, attrgetter("student_id"), other.student_id),
+            (is_same_id, attrgetter("student_id"), other.student_id),
+            (_is_same_text, attrgetter("email"), other.email),
             # Blackboard's user name and ILIAS's login are ids where the roster has no other
-            (_same, lambda one: one.login or one.student_id, other.login),
-            (same_name, attrgetter("name"), other.name),
+            (_is_same_text, lambda one: one.login or one.student_id, other.login),
+            (is_same_name, attrgetter("name"), other.name),
         )
-        for same, known, said in looks:
-            places = [at for at, one in enumerate(self.people) if same(known(one), said)]
+        for same, known_person, value in criteria:
+            places = [at for at, one in enumerate(self.people) if same(known_person(one), value)]
             if len(places) == 1:
                 return places[0]
         return None
 
 
-def folded(text: str) -> str:
+def normalise_text(text: str) -> str:
     """Id or name for comparison: one spelling per character, case and outer spaces ignored."""
     return unicodedata.normalize("NFKC", text).strip().casefold()
 
 
-def _same(known: str, said: str) -> bool:
-    return folded(known) == folded(said) != ""
+def _is_same_text(known: str, other: str) -> bool:
+    return normalise_text(known) == normalise_text(other) != ""
 
 
-def same_id(one: str, other: str) -> bool:
+def is_same_id(one: str, other: str) -> bool:
     """Whether two ids are the same; spreadsheets take away leading zeros.
 
-    >>> same_id("0042", "42"), same_id("S1", "s1 "), same_id("00", "0")
+    >>> is_same_id("0042", "42"), is_same_id("S1", "s1 "), is_same_id("00", "0")
     (True, True, False)
     """
-    return folded(one).lstrip("0") == folded(other).lstrip("0") != ""
+    return normalise_text(one).lstrip("0") == normalise_text(other).lstrip("0") != ""
 
 
-def same_name(one: str, other: str) -> bool:
+def is_same_name(one: str, other: str) -> bool:
     """Whether two names have the same words in any order, or run together as Canvas has them.
 
-    >>> same_name("Ada Lovelace", "Lovelace, Ada"), same_name("Ada Lovelace", "lovelaceada")
+    >>> is_same_name("Ada Lovelace", "Lovelace, Ada"), is_same_name("Ada Lovelace", "lovelaceada")
     (True, True)
-    >>> same_name("Ada", "ada lovelace"), same_name("", "")
+    >>> is_same_name("Ada", "ada lovelace"), is_same_name("", "")
     (False, False)
     """
-    mine, theirs = (re.findall(r"[^\W_]+", folded(name)) for name in (one, other))
-    short, long = sorted((mine, theirs), key=len)
-    turned = ("".join(long[at:] + long[:at]) for at in range(len(long)))
-    together = len(short) == 1 < len(long) and short[0] in turned
-    return bool(short) and (sorted(mine) == sorted(theirs) or together)
+    words, other_words = (re.findall(r"[^\W_]+", normalise_text(name)) for name in (one, other))
+    short, long = sorted((words, other_words), key=len)
+    rotated_words = ("".join(long[at:] + long[:at]) for at in range(len(long)))
+    is_run_together = len(short) == 1 < len(long) and short[0] in rotated_words
+    return bool(short) and (sorted(words) == sorted(other_words) or is_run_together)
 
 
 def file_stem(student_id: str) -> str | None:
@@ -205,30 +212,30 @@ def file_stem(student_id: str) -> str | None:
     ('_com1.txt', 'rf', 'a', 48)
     """
     text = unicodedata.normalize("NFC", student_id.strip())
-    kept = "".join(c if c.isalnum() or c in "-_.@+" else "_" for c in text)
-    if not any(c.isalnum() for c in kept):
+    safe_characters = "".join(c if c.isalnum() or c in "-_.@+" else "_" for c in text)
+    if not any(c.isalnum() for c in safe_characters):
         return None
-    stem = kept[:MAX_STEM].lstrip(".-+@").rstrip(".")
+    stem = safe_characters[:MAX_STEM].lstrip(".-+@").rstrip(".")
     return f"_{stem}" if stem.split(".")[0].casefold() in RESERVED else stem
 
 
-def distinct(names: Iterable[str], form: str = "{} ({})") -> list[str]:
+def make_unique(names: Iterable[str], form: str = "{} ({})") -> list[str]:
     """Names with a number behind those that came before, however they are capitalised.
 
-    >>> distinct(["notes", "cover", "Notes"])
+    >>> make_unique(["notes", "cover", "Notes"])
     ['notes', 'cover', 'Notes (2)']
     """
-    made: dict[str, str] = {}
+    unique_names: dict[str, str] = {}
     count: Counter[str] = Counter()
     for name in names:
         new, plain = name, name.casefold()
-        while new.casefold() in made:
+        while new.casefold() in unique_names:
             count[plain] += 1
             new = form.format(name, count[plain] + 1)
-        made[new.casefold()] = new
-    return list(made.values())
+        unique_names[new.casefold()] = new
+    return list(unique_names.values())
 
 
 def file_names(stems: Iterable[str]) -> list[str]:
     """A name for each one's files on any system, unique ignoring case."""
-    return distinct((file_stem(stem) or "report" for stem in stems), "{}-{}")
+    return make_unique((file_stem(stem) or "report" for stem in stems), "{}-{}")

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from px4fuse.errors import SettingsError
-from px4fuse.reading import read_whole
+from px4fuse.reading import read_bytes_limited
 
 MAX_BYTES = 20_000_000
 SEPARATORS = ",;\t|"
@@ -41,13 +41,13 @@ class Sheet:
 
     def column(self, titles: Sequence[str]) -> int | None:
         """Place of the first of these titles that is there, letters and digits compared."""
-        plain = [bare(title) for title in self.head]
-        return next((plain.index(title) for title in titles if title in plain), None)
+        plain_titles = [normalise_title(title) for title in self.head]
+        return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
         """What stands in a row under the first of these titles; "" where there is none."""
-        place = self.column(titles)
-        return "" if place is None else row[place].strip()
+        column_index = self.column(titles)
+        return "" if column_index is None else row[column_index].strip()
 
     @property
     def text(self) -> str:
@@ -64,10 +64,10 @@ class Sheet:
             return self.text.encode("utf-8-sig")
 
 
-def bare(title: str) -> str:
+def normalise_title(title: str) -> str:
     """A column title for comparison.
 
-    >>> bare("SIS User ID"), bare("Last modified (grade)"), bare("E-Mail-Adresse")
+    >>> normalise_title("SIS User ID"), normalise_title("Last modified (grade)"), normalise_title("E-Mail-Adresse")
     ('sisuserid', 'lastmodifiedgrade', 'emailadresse')
     """
     return "".join(filter(str.isalnum, title.casefold()))
@@ -81,8 +81,8 @@ def read_sheet(path: Path) -> Sheet:
     SettingsError
         It cannot be read, is not text, or has no header.
     """
-    content = read_whole(
-        path, SettingsError, MAX_BYTES, name=str(path), smaller="Give a CSV file of one class"
+    content = read_bytes_limited(
+        path, SettingsError, MAX_BYTES, name=str(path), size_remedy="Give a CSV file of one class"
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path}: a spreadsheet", "Save it as CSV.")
@@ -106,8 +106,8 @@ def read_sheet(path: Path) -> Sheet:
     head, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
     if not head:
         raise SettingsError(f"{path}: empty", "Give a CSV file with a header.")
-    filled = (tuple(cells + [""] * (len(head) - len(cells))) for cells in rows)
-    return Sheet(path, tuple(head), tuple(filled), encoding, separator)
+    padded_rows = (tuple(cells + [""] * (len(head) - len(cells))) for cells in rows)
+    return Sheet(path, tuple(head), tuple(padded_rows), encoding, separator)
 
 
 def number(value: float | None) -> str:

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.answers import GATED, AskedNumber, asked
+from px4fuse.answers import GATE_UPDATES, FormQuestion, draw_questions
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import replay
-from px4fuse.filter.model import COVARIANCES, matrix, noise, transition
+from px4fuse.filter.model import COVARIANCES, process_noise_unit, symmetric_matrix, transition
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.analysis import analyse
@@ -27,13 +27,13 @@ TOLERANCE = 0.15
 # How closely a closure error can be read off
 CLOSURE_WITHIN_M = 0.3
 # EKF2 has rejected samples from this share on
-REJECTED = 0.005
+MIN_REJECTED_SHARE = 0.005
 # A reset of position that is seen, after EKF2 has found its first position
-RESET_M, SETTLED_S = 0.2, 5.0
-DID = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
+MIN_RESET_M, SETTLED_S = 0.2, 5.0
+EKF2_BEHAVIOUR = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
-class Wrong(Record, frozen=True):
+class TrueMistake(Record, frozen=True):
     """One mistake of a flight.
 
     Attributes
@@ -69,10 +69,10 @@ class FormTruth(Record, frozen=True):
     ekf2_did, ekf2_did_also : tuple of str
         What has to be said, and what may be.
     quantities : tuple
-        As :func:`px4fuse.answers.asked` asks them; None where the flight is too short.
+        As :func:`px4fuse.answers.draw_questions` asks them; None where the flight is too short.
     """
 
-    mistakes: tuple[Wrong, ...]
+    mistakes: tuple[TrueMistake, ...]
     sigma_z_m: float
     ours: VerdictTruth
     ekf2: VerdictTruth
@@ -81,12 +81,13 @@ class FormTruth(Record, frozen=True):
     quantities: tuple[float | tuple[float, ...] | None, ...]
 
 
-def truth_of(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
+def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     """The right answers, from what was simulated and from the report as it comes."""
     known = flights.answer(simulation)
     comparison = compare(flights.to_flight(simulation), Settings())
     mistakes = tuple(
-        _wrong(name, given, known["truth"], comparison) for name, given in known["mistakes"].items()
+        _true_mistake(name, values, known["truth"], comparison)
+        for name, values in known["mistakes"].items()
     )
     sigma_z_m = known["truth"]["sigma_z_m"]
     return FormTruth(
@@ -94,23 +95,23 @@ def truth_of(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
         sigma_z_m,
         _verdict(comparison, "kf"),
         _verdict(comparison, "ekf2"),
-        *_ekf2_did(comparison, mistakes, sigma_z_m),
-        tuple(quantity_truth(comparison.main, each) for each in asked(log_sha256)),
+        *_ekf2_behaviour(comparison, mistakes, sigma_z_m),
+        tuple(quantity_truth(comparison.main, question) for question in draw_questions(log_sha256)),
     )
 
 
-def _wrong(
-    name: str, given: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
-) -> Wrong:
+def _true_mistake(
+    name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
+) -> TrueMistake:
     sizes = SIMULATED[name].sizes
     if not sizes:
-        return Wrong(name)
-    size, off = given[sizes[0]], TOLERANCE * abs(given[sizes[0]])
+        return TrueMistake(name)
+    size, tolerance = values[sizes[0]], TOLERANCE * abs(values[sizes[0]])
     if name == "open-end":  # the log tells it with the drift of the odometry in it
         odometry = trajectory_of(comparison.flight, "vio")
         measured = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
-        size, off = measured if isinstance(measured, float) else size, CLOSURE_WITHIN_M
-    low, high = size - off, size + off
+        size, tolerance = measured if isinstance(measured, float) else size, CLOSURE_WITHIN_M
+    low, high = size - tolerance, size + tolerance
     if name == "clock-offset":  # what an ideal analysis of the log can tell
         _, found = noises_and_clock(comparison)
         if isinstance(found, ClockOffset) and found.determinable:
@@ -124,48 +125,52 @@ def _wrong(
         case "nlos" if truth["outlier_time_s"]:
             from_s, *_, until_s = truth["outlier_time_s"] * 2
         case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
-            from_s = given[sizes[1]]
+            from_s = values[sizes[1]]
             until_s = from_s + abs(size) if name.endswith("dropout") else None
-    return Wrong(name, size, low, high, from_s, until_s)
+    return TrueMistake(name, size, low, high, from_s, until_s)
 
 
 def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
-    judged = comparison.main.filters[which]
-    if not isinstance(judged, FilterSummary):
+    filter_summary = comparison.main.filters[which]
+    if not isinstance(filter_summary, FilterSummary):
         return VerdictTruth("")
-    word = judged.verdict.removeprefix("variance ")
-    return VerdictTruth(word, None if word == "consistent" else judged.times_off)
+    word = filter_summary.verdict.removeprefix("variance ")
+    return VerdictTruth(word, None if word == "consistent" else filter_summary.sigma_error_factor)
 
 
-def _ekf2_did(
-    comparison: Comparison, mistakes: tuple[Wrong, ...], sigma_z_m: float
+def _ekf2_behaviour(
+    comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What EKF2 did in this flight: by what is wrong with it, and by what the log shows."""
     size_of = {wrong.kind: wrong.size or 0.0 for wrong in mistakes}
-    must, also = (
-        [said for said, kinds in DID[which].items() if kinds & size_of.keys()]
+    required, allowed = (
+        [behaviour for behaviour, kinds in EKF2_BEHAVIOUR[which].items() if kinds & size_of.keys()]
         for which in ("does", "may_do")
     )
     if size_of.get("ekf2-noise", 0.0) > sigma_z_m:
-        must.append("trusted the positions too little")
+        required.append("trusted the positions too little")
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
-        bad = "nlos" in size_of or "jump" in size_of
-        if (innovations["rejected"] > 0).mean() > REJECTED:
-            must.append("rejected the bad samples" if bad else "rejected good samples")
+        has_bad_samples = "nlos" in size_of or "jump" in size_of
+        if (innovations["rejected"] > 0).mean() > MIN_REJECTED_SHARE:
+            required.append(
+                "rejected the bad samples" if has_bad_samples else "rejected good samples"
+            )
     ekf2 = comparison.flight.ekf2
     since_s = comparison.segment.start_s + SETTLED_S
     for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
-        large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > RESET_M
-        if large and reset.time_s > since_s:
-            must.append("coasted, then reset")
-    if not must:
-        must, also = ["nothing unusual"], ["followed the positions", *also]
-    return tuple(dict.fromkeys(must)), tuple(one for one in dict.fromkeys(also) if one not in must)
+        is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
+        if is_large and reset.time_s > since_s:
+            required.append("coasted, then reset")
+    if not required:
+        required, allowed = ["nothing unusual"], ["followed the positions", *allowed]
+    return tuple(dict.fromkeys(required)), tuple(
+        one for one in dict.fromkeys(allowed) if one not in required
+    )
 
 
 def quantity_truth(
-    result: AxisComparison, quantity: AskedNumber
+    result: AxisComparison, quantity: FormQuestion
 ) -> float | tuple[float, ...] | None:
     """The answer to a question, from a replay with its settings; None where it never comes so far.
 
@@ -180,13 +185,17 @@ def quantity_truth(
     row, covariance = updates.iloc[at], run.steps.loc[updates.index[at], COVARIANCES]
     match quantity.kind:
         case "gate":
-            part = updates.iloc[at : at + GATED + 1]
+            part = updates.iloc[at : at + GATE_UPDATES + 1]
             nis = part["innovation_m"] ** 2 / part["innovation_variance_m2"]
             outside = np.flatnonzero(nis > quantity.extra**2) + quantity.update
             return tuple(outside.astype(float).tolist())
         case "silence":
-            p, f = matrix(tuple(covariance)), transition(settings.dt_s)
-            q = settings.sigma_a_m_s2**2 * settings.dt_s * matrix(noise(settings.dt_s))
+            p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
+            q = (
+                settings.sigma_a_m_s2**2
+                * settings.dt_s
+                * symmetric_matrix(process_noise_unit(settings.dt_s))
+            )
             for _ in range(round(quantity.extra / settings.dt_s)):
                 p = f @ p @ f.T + q
             return math.sqrt(p[0, 0])

@@ -1,18 +1,20 @@
 """The command line: parses and prints; it computes nothing."""
 
 import atexit
+import errno
 import gc
 import importlib
 import os
 import signal
 import sys
+from pathlib import Path
 
 import click
 
 from px4fuse.cli.outputs import Interrupted, written_so_far
-from px4fuse.errors import OutputError, Px4FuseError, on_one_line
+from px4fuse.errors import OutputError, Px4FuseError, SettingsError, to_one_line
+from px4fuse.input_files import inputs_protected
 from px4fuse.threads import ONE_THREAD
-from px4fuse.writing import STOPPING
 
 # Commands, each in a module of its name, and their help: --help must not import what they need
 COMMANDS = {
@@ -37,8 +39,18 @@ COMMANDS = {
 }
 
 
+#: Signals that end a run: Ctrl-C, termination, and (not on Windows) a closed terminal
+STOPPING = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
+
+HELP = ["-h", "--help"]
+# Variables that stop matplotlib and pymavlink while they are imported if their value is wrong; no
+# output depends on them: figures are SVG, and contain no date
+UNUSED = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
+# Address space for the libraries and the sample's report, which takes 0.7 GB
+LEAST_BYTES = 800_000_000
+
 # pandas loads pyarrow wherever it is installed: 70 MB that only these need
-PARQUET = ("batch", "extract")
+PARQUET_COMMANDS = ("batch", "extract")
 
 
 class LazyGroup(click.Group):
@@ -64,32 +76,32 @@ class LazyGroup(click.Group):
         if name not in COMMANDS and not name.startswith("-"):
             import difflib
             import shlex
-            from pathlib import Path
 
-            said = f"No such command {name!r}."
-            if near := difflib.get_close_matches(name.lower(), COMMANDS):
-                said += f" Did you mean {near[0]!r}?"
+            message = f"No such command {name!r}."
+            if close_matches := difflib.get_close_matches(name.lower(), COMMANDS):
+                message += f" Did you mean {close_matches[0]!r}?"
             elif Path(name).is_file():
-                said = f"Say what to do with it: {shlex.join(['px4fuse', 'compare', *args])}."
-            ctx.fail(said)
+                message = f"Say what to do with it: {shlex.join(['px4fuse', 'compare', *args])}."
+            ctx.fail(message)
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
         """Invoke a command; what ends it early is told apart before click sees it."""
         try:
-            return super().invoke(ctx)
+            with inputs_protected():
+                return super().invoke(ctx)
         except Px4FuseError as error:
-            error.args = (_in_options(str(error), ctx.invoked_subcommand),)
+            error.args = (_with_option_names(str(error), ctx.invoked_subcommand),)
             raise
         except BrokenPipeError as error:
             # click itself ends with exit code 1 where it sees errno EPIPE
             raise BrokenPipeError from error
         except KeyboardInterrupt as stopped:  # click itself would print an empty line
             raise Interrupted(stopped, written_so_far(ctx)) from None
+        except MemoryError as error:
+            raise _system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
         except OSError as error:
-            raise OutputError(
-                f"standard output: cannot be written ({error.strerror}), {written_so_far(ctx)}"
-            ) from error
+            raise _system_error(error, written_so_far(ctx)) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands from the table above, without importing them."""
@@ -97,9 +109,7 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
 
-@click.group(
-    cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}
-)
+@click.group(cls=LazyGroup, context_settings={"help_option_names": HELP, "show_default": True})
 @click.version_option(package_name="px4fuse")
 def cli() -> None:
     """Replay a PX4 flight through a two-state Kalman filter and compare it with EKF2.
@@ -108,54 +118,95 @@ def cli() -> None:
     """
 
 
+def _system_error(error: OSError, written: str) -> Px4FuseError:
+    """Error of a system call, with its cause."""
+    if error.errno == errno.ENOMEM:
+        return Px4FuseError(
+            f"not enough memory, {written}", "Close other programs, or raise the limit (ulimit -v)."
+        )
+    try:
+        Path.cwd()
+    except OSError:
+        return SettingsError(
+            f"the current folder no longer exists, {written}", "Change to another folder."
+        )
+    if error.filename is not None:
+        return OutputError(f"{error.filename}: cannot be used ({error.strerror}), {written}")
+    return OutputError(f"standard output: cannot be written ({error.strerror}), {written}")
+
+
+def _check_memory() -> None:
+    """Refuse a limit under which libraries end the process without a message."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < LEAST_BYTES:
+        raise SettingsError(
+            f"the memory limit is {limit / 1e6:.0f} MB, at least {LEAST_BYTES / 1e6:.0f} MB of "
+            "address space are required",
+            "Raise it, for example with ulimit -v unlimited.",
+        )
+
+
 def main() -> None:
     """Run the command line; bad input is one line on standard error and exit code 2."""
     # one short job per process: looking for garbage while importing and drawing costs a tenth
     gc.disable()
     atexit.register(gc.freeze)  # and while everything is thrown away, as much again
-    for name, one in ONE_THREAD.items():  # commands load the libraries later
-        os.environ.setdefault(name, one)
-    if not set(PARQUET) & set(sys.argv[1:2]):
-        sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # as if there were none
+    _prepare_libraries()
     _open_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # σ and ν on a Windows console with a legacy code page
             stream.reconfigure(errors="replace")
     for number in STOPPING:
         if signal.getsignal(number) is signal.SIG_DFL:  # not where nohup ignores it
-            signal.signal(number, _stop)
+            signal.signal(number, _interrupt)
     try:
+        if not {*HELP, "--version"} & set(sys.argv):
+            _check_memory()
         code = cli.main(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         code = 2
     except click.UsageError as error:
-        where = error.ctx.command_path if error.ctx else "px4fuse"
-        _say(f"{error.format_message()} See {where} --help.")
+        command_name = error.ctx.command_path if error.ctx else "px4fuse"
+        _print_error(f"{error.format_message()} See {command_name} --help.")
         code = 2
     except Px4FuseError as error:
-        _say(str(error))
+        _print_error(str(error))
         code = 2
     except Interrupted as stopped:
-        _say(str(stopped))
+        _print_error(str(stopped))
         code = stopped.exit_code
     except BrokenPipeError:  # the reader of a pipe has gone, as with | head; the files are written
         _abandon_output()
         code = 0
     except OSError as error:  # of --help and --version, which click writes itself
-        _say(f"standard output: cannot be written ({error.strerror}), nothing was written.")
+        _print_error(f"standard output: cannot be written ({error.strerror}), nothing was written.")
         code = 2
-    sys.exit(_flushed(code if isinstance(code, int) else 0))
+    sys.exit(_flush_output(code if isinstance(code, int) else 0))
 
 
-def _flushed(code: int) -> int:
+def _prepare_libraries() -> None:
+    """Set what libraries read when commands import them later."""
+    for name, one in ONE_THREAD.items():
+        os.environ.setdefault(name, one)
+    for name in UNUSED:
+        os.environ.pop(name, None)
+    if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
+        sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # as if there were none
+
+
+def _flush_output(code: int) -> int:
     """The exit code once all that was said is out."""
     try:
         sys.stdout.flush()
     except OSError as error:
         _abandon_output()
         if code == 0:  # else said before
-            _say(f"standard output: cannot be written ({error.strerror}).")
+            _print_error(f"standard output: cannot be written ({error.strerror}).")
             return 2
     return code
 
@@ -164,14 +215,14 @@ def _open_streams() -> None:
     """Give a stream that was closed (``>&-``) a place where what is written is lost."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
-            lost = os.open(os.devnull, os.O_WRONLY)
-            if lost != number:
-                os.dup2(lost, number)
-                os.close(lost)
+            null_device = os.open(os.devnull, os.O_WRONLY)
+            if null_device != number:
+                os.dup2(null_device, number)
+                os.close(null_device)
             setattr(sys, name, open(number, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - for good
 
 
-def _in_options(text: str, command: str | None) -> str:
+def _with_option_names(text: str, command: str | None) -> str:
     """The text of an error as somebody who typed a command reads it."""
     from px4fuse.request import EVALUATION_OPTIONS, LOOP_OPTIONS, OPTIONS, with_options
 
@@ -179,11 +230,11 @@ def _in_options(text: str, command: str | None) -> str:
     return with_options(text, tables.get(command or "", OPTIONS))
 
 
-def _say(text: str) -> None:
-    click.echo(f"px4fuse: {on_one_line(text)}", err=True)
+def _print_error(text: str) -> None:
+    click.echo(f"px4fuse: {to_one_line(text)}", err=True)
 
 
-def _stop(number: int, _: object) -> None:
+def _interrupt(number: int, _: object) -> None:
     """End the run by termination as by Ctrl-C, so that it clears up."""
     raise KeyboardInterrupt(number)
 

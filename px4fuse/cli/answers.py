@@ -5,12 +5,12 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import Named, options
+from px4fuse.cli.inputs import InputPath, options
 from px4fuse.cli.outputs import write_new
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @options("answers")
 def answers(log: Path, output: Path | None) -> None:
     """Write the form about a flight: what is wrong with it, what EKF2 did, three numbers.

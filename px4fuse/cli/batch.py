@@ -36,7 +36,7 @@ def batch(
     memory: float = 4.0,
     scheduler: str | None,
     fail_on: Literal["failed", Severity] | None,
-    **given: Any,
+    **option_values: Any,
 ) -> None:
     """Compare many logs, as px4fuse compare does each, into one table.
 
@@ -67,20 +67,20 @@ def batch(
                 scheduler=scheduler,
                 workers=workers,
                 memory_gb=memory,
-                progress=partial(_shown, step, time.monotonic()),
-                **given,
+                progress=partial(_show_rate, step, time.monotonic()),
+                **option_values,
             )
     except KeyboardInterrupt as stopped:
-        left = f"what is done is kept in {output}. The same command goes on from there."
-        raise outputs.Interrupted(stopped, left) from None
-    outputs.finish({}, summary(fleet), written=fleet.written)
+        message = f"what is done is kept in {output}. The same command goes on from there."
+        raise outputs.Interrupted(stopped, message) from None
+    outputs.write_and_print({}, summary(fleet), written=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
     if failed or fleet.severities & set(severities):
         sys.exit(1)
 
 
-def _shown(step: outputs.ShowStep, since_s: float, what: str, done: int, of: int) -> None:
+def _show_rate(step: outputs.ShowStep, since_s: float, what: str, done: int, of: int) -> None:
     """How far it is, with its rate."""
     per_minute = 60.0 * done / (time.monotonic() - since_s)
     step(f"{what}, {per_minute:.3g} per minute" if done else what, done, of)

@@ -15,7 +15,7 @@ SEVERITIES = get_args(Severity)
 
 
 @click.command()
-@click.argument("log", type=inputs.Named())
+@click.argument("log", type=inputs.InputPath())
 @inputs.analysis_options
 @inputs.person_options
 @inputs.report_options(
@@ -29,35 +29,37 @@ def compare(
     json_path: Path | None,
     fail_on: Severity | None,
     checks: bool,
-    **given: Any,
+    **option_values: Any,
 ) -> None:
     """Compare a flight's EKF2 with a two-state Kalman filter over IMU and position.
 
     LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
     results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
     """
-    from px4fuse.analysis import bad_verdicts, run_or_judge_aids
-    from px4fuse.memory import give_back
+    from px4fuse.analysis import failed_checks, run_or_evaluate_aids
+    from px4fuse.memory import release_free_memory
     from px4fuse.report.terminal import summary
-    from px4fuse.results.build import judged_results
+    from px4fuse.results.build import outcome_results
 
-    person = inputs.read_person(given)
-    request = inputs.comparison_request(log, given)
+    person = inputs.read_student(option_values)
+    request = inputs.comparison_request(log, option_values)
     outputs.report_paths(output, json_path)  # before the work, not after it
     with outputs.progress(json_path) as step:
-        found = run_or_judge_aids(request, step)
-        results = judged_results(request, found, person)
-        give_back()  # before anything of the report is imported
+        outcome = run_or_evaluate_aids(request, step)
+        results = outcome_results(request, outcome, person)
+        release_free_memory()  # before anything of the report is imported
         if output is None and json_path != STANDARD_OUTPUT:
-            output = outputs.free_report(log.stem, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, found, step)
-    outputs.finish(contents, summary(found, results, output), request)
-    bad = bad_verdicts(found) if checks else {}
+            output = outputs.default_report(log.stem, settings_name(request), results)
+        contents = outputs.result_files(results, json_path, output, outcome, step)
+    outputs.write_and_print(contents, summary(outcome, results, output), request)
+    bad = failed_checks(outcome) if checks else {}
     for name, verdict in bad.items():
         click.echo(f"{name}: {verdict}", err=True)
     if bad:
         sys.exit(1)
     if fail_on is not None:
-        worst = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
-        if any(one.severity in worst and one.caused_by is None for one in results.findings):
+        failing_severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
+        if any(
+            one.severity in failing_severities and one.caused_by is None for one in results.findings
+        ):
             sys.exit(1)

@@ -9,8 +9,8 @@ from px4fuse.cli import inputs, outputs
 
 
 @click.command()
-@click.argument("a", type=inputs.Named())
-@click.argument("b", type=inputs.Named())
+@click.argument("a", type=inputs.InputPath())
+@click.argument("b", type=inputs.InputPath())
 @inputs.max_size_option
 @inputs.json_option
 def diff(a: Path, b: Path, json_path: Path | None) -> None:
@@ -27,8 +27,9 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
     from px4fuse.fleet.changes import diff as compared
     from px4fuse.fleet.terminal import differences
 
+    outputs.check_targets([json_path])  # fail early if the output cannot be written
     with outputs.progress(json_path) as step:
         results = compared(a, b, progress=step)
-    outputs.finish(outputs.result_files(results, json_path), differences(results))
+    outputs.write_and_print(outputs.result_files(results, json_path), differences(results))
     if results.worse:
         sys.exit(1)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 MAX_DELTA = 1e6
 # What the score takes by the names of the options
-AS_GIVEN = ("alignment", "association", "max_gap_s", "time_offset_s")
+SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
@@ -35,8 +35,8 @@ def delta(text: str) -> Delta:
 
 
 @click.command()
-@click.argument("estimate", type=inputs.Named())
-@click.argument("reference", type=inputs.Named())
+@click.argument("estimate", type=inputs.InputPath())
+@click.argument("reference", type=inputs.InputPath())
 @inputs.options("evaluate", rpe={"type": delta, "multiple": True})
 @inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @inputs.max_size_option
@@ -47,7 +47,7 @@ def evaluate(
     reference: Path,
     output: Path | None,
     json_path: Path | None,
-    **given: Any,
+    **option_values: Any,
 ) -> None:
     """Score a trajectory against a reference: ATE and RPE, with intervals.
 
@@ -61,9 +61,12 @@ def evaluate(
     from px4fuse.results.build import evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as score
 
-    deltas = given.pop("rpe")
+    deltas = option_values.pop("rpe")
     request = EvaluationRequest(
-        estimate=str(estimate), reference=str(reference), rpe=tuple(map(str, deltas)), **given
+        estimate=str(estimate),
+        reference=str(reference),
+        rpe=tuple(map(str, deltas)),
+        **option_values,
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
@@ -73,18 +76,18 @@ def evaluate(
         first = read_source(request.estimate, system=request.system)
         second = read_source(request.reference, default="truth", system=request.system)
         step("scoring")
-        found = score(
+        score_result = score(
             first.trajectory,
             second.trajectory,
             rpe_deltas=deltas or None,
             all_pairs=not request.consecutive,
-            **{name: given[name] for name in AS_GIVEN},
+            **{name: option_values[name] for name in SCORE_OPTIONS},
         )
-        results = evaluation_results(request, found)
+        results = evaluation_results(request, score_result)
         if output is None and json_path is None:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
-            output = outputs.free_report(name, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, found, step)
+            output = outputs.default_report(name, settings_name(request), results)
+        contents = outputs.result_files(results, json_path, output, score_result, step)
     page = Page()
-    write_evaluation(page, found)
-    outputs.finish(contents, page)
+    write_evaluation(page, score_result)
+    outputs.write_and_print(contents, page)

@@ -12,11 +12,11 @@ from px4fuse.request import settings_name
 
 
 @click.command()
-@click.argument("logs", nargs=-1, type=inputs.Named())
+@click.argument("logs", nargs=-1, type=inputs.InputPath())
 @inputs.analysis_options
 @inputs.options("explore")
 @inputs.open_option
-def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
+def explore(logs: tuple[Path, ...], output: Path | None, **option_values: Any) -> None:
     """Write a web page with sliders for SIGMA_A, SIGMA_Z, DT and the clock offset.
 
     LOG is a PX4 ULog or a MAVLink recording; with two of them, both stand side by side; without one
@@ -28,17 +28,19 @@ def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
 
     if len(logs) > 2:
         raise SettingsError(f"{len(logs)} logs: give one, or two to see them side by side.")
-    if len(logs) == 2 and (given["mavlink"] is not None or given["position"] is not None):
+    if len(logs) == 2 and (
+        option_values["mavlink"] is not None or option_values["position"] is not None
+    ):
         raise SettingsError("--mavlink and --position belong to one log: give only one LOG.")
     logs = logs or (sample_log(),)
-    requests = [inputs.comparison_request(log, dict(given)) for log in logs]
+    requests = [inputs.comparison_request(log, dict(option_values)) for log in logs]
     stems = "_".join(log.stem for log in logs)
     target = outputs.web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
     with outputs.progress(target) as step:
-        found = [run(request, step) for request in requests]
+        analyses = [run(request, step) for request in requests]
         step("writing the page")
         # Bokeh takes long to import, and bad input needs none of it
         from px4fuse.explore.page import html_text
 
-        content = html_text(found).encode()
-    outputs.finish({target: content})
+        content = html_text(analyses).encode()
+    outputs.write_and_print({target: content})

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, comparison_request, options, recording_options
+from px4fuse.cli.inputs import InputPath, comparison_request, options, recording_options
 from px4fuse.cli.outputs import write_outputs
-from px4fuse.errors import OutputError, on_one_line
+from px4fuse.errors import OutputError, to_one_line
+from px4fuse.input_files import check_output_folder, own_files
 from px4fuse.reading import read_text
 
 if TYPE_CHECKING:
@@ -23,20 +24,21 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @options("extract")
 @recording_options
 def extract(
     log: Path,
     output: Path,
     format: Literal["csv", "parquet"] = "csv",  # noqa: A002 - the name of the option
-    **given: Any,
+    **option_values: Any,
 ) -> None:
     """Write everything that a log holds as tidy tables, one file each.
 
     With data_dictionary.csv, which says the unit, frame, meaning, source topic and clock of every
     column, and flight.json, which says what the log is and what is missing from it.
     """
+    check_output_folder(output)
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is a file. Give a folder with -o.")
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
@@ -45,26 +47,27 @@ def extract(
     from px4fuse.inspect import tables as extraction
     from px4fuse.results.contract import to_json
 
-    flight = extraction.of_best_source(read_flight(comparison_request(log, given)))
-    _refuse_mixture(output, flight.log.sha256)
+    flight = extraction.with_best_source(read_flight(comparison_request(log, option_values)))
+    _require_same_flight(output, flight.log.sha256)
     tables = extraction.tables(flight)
-    encode = _parquet if format == "parquet" else _csv
+    encode = _parquet_bytes if format == "parquet" else _csv_bytes
     contents = {output / f"{name}.{format}": encode(table) for name, table in tables.items()}
-    contents[output / "data_dictionary.csv"] = _csv(extraction.data_dictionary(flight))
+    contents[output / "data_dictionary.csv"] = _csv_bytes(extraction.data_dictionary(flight))
     contents[output / "flight.json"] = to_json(extraction.description(flight)).encode()
     write_outputs(contents)
-    click.echo(f"Wrote to {on_one_line(str(output))}:")
+    click.echo(f"Wrote to {to_one_line(str(output))}:")
     for name, table in tables.items():
         click.echo(f"  {f'{name}.{format}':44} {len(table):8} rows")
     click.echo("  data_dictionary.csv, flight.json")
-    for part in extraction.absent(flight):
+    for part in extraction.unavailable_parts(flight):
         click.echo(f"Not in this log: {part.what} ({part.reason})")
 
 
-def _refuse_mixture(folder: Path, sha256: str) -> None:
+def _require_same_flight(folder: Path, sha256: str) -> None:
     """Tables of two flights in one folder would pass for one."""
     try:
-        text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
+        with own_files():
+            text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         before = json.loads(text)["log"]
         other = before["sha256"] != sha256
         name = str(before["name"])
@@ -74,12 +77,12 @@ def _refuse_mixture(folder: Path, sha256: str) -> None:
         raise OutputError.of("tables_of_another", folder=folder, name=name)
 
 
-def _csv(table: pd.DataFrame) -> bytes:
+def _csv_bytes(table: pd.DataFrame) -> bytes:
     # without a format, pandas writes the shortest text that reads back as the same float64
     return table.to_csv(index=False, lineterminator="\n").encode()
 
 
-def _parquet(table: pd.DataFrame) -> bytes:
+def _parquet_bytes(table: pd.DataFrame) -> bytes:
     buffer = io.BytesIO()
     table.to_parquet(buffer, engine="pyarrow", index=False)
     return buffer.getvalue()

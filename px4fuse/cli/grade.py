@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from px4fuse.cli.inputs import Named, max_size_option, open_option, options
-from px4fuse.cli.outputs import Interrupted, finish, progress, write_new
+from px4fuse.cli.inputs import InputPath, max_size_option, open_option, options
+from px4fuse.cli.outputs import Interrupted, progress, write_and_print, write_new
 from px4fuse.errors import OutputError, SettingsError
+from px4fuse.input_files import add_input, check_output_folder
+from px4fuse.reading import files_below
 
 if TYPE_CHECKING:
     from px4fuse.grading.grade import GradeOutcome
@@ -18,10 +20,15 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("submissions", nargs=-1, type=Named())
-@options("grade-reads")
+@click.argument("submissions", nargs=-1, type=InputPath())
+@options("grade-reads", logs={"type": InputPath(), "multiple": True}, rubric={"type": InputPath()})
 @max_size_option
-@options("grade")
+@options(
+    "grade",
+    key={"type": InputPath()},
+    roster={"type": InputPath()},
+    worksheet={"type": InputPath(), "multiple": True},
+)
 @open_option
 def grade(
     submissions: tuple[Path, ...],
@@ -41,8 +48,6 @@ def grade(
     anonymous: bool,
     jobs: int | None,
     write_rubric: Path | None,
-    write_autograder: Path | None,
-    gradescope: Path | None,
 ) -> None:
     """Verify and score reports: PDFs, folders of them, and zip files of learning platforms.
 
@@ -53,37 +58,30 @@ def grade(
     nothing in it is executed.
     """
     from px4fuse.assignment.key import read_key
-    from px4fuse.assignment.roster import people_of_sheet
+    from px4fuse.assignment.roster import read_people
     from px4fuse.assignment.sheet import read_sheet
     from px4fuse.grading.entries import Course, due_time, late_rule
     from px4fuse.grading.grade import grade as grade_all
-    from px4fuse.grading.gradescope import autograder_zip, run_autograder
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
         return
     costs = late_rule(late) if late else None
-    if gradescope is not None:
-        run_autograder(gradescope, costs)
-        return
-    if write_autograder is not None:
-        write_new(write_autograder, autograder_zip(logs, rubric, key, costs))
-        return
     if costs is not None and due is None:
         raise SettingsError("--late: say with --due when it was due.")
     if not submissions:
         raise SettingsError("nothing to grade: give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("say with -o where the class table goes.")
-    _check_place(output, (*submissions, *logs))
+    _require_output_outside(output, (*submissions, *logs))
     answers = None if key is None else read_key(key)
     course = Course(
         read_rubric(rubric),
         answers,
         logs,
         title or "",
-        roster=None if roster is None else people_of_sheet(read_sheet(roster)),
+        roster=None if roster is None else read_people(read_sheet(roster)),
         worksheets=tuple(map(read_sheet, worksheet)),
         column=column or "",
         attempt=attempt,
@@ -98,44 +96,49 @@ def grade(
                 submissions, course, output, processes=jobs, progress=partial(step, "grading")
             )
     except KeyboardInterrupt as stopped:
-        left = "but what is graded is kept. The same command goes on from there."
-        raise Interrupted(stopped, left) from None
-    finish({}, _page(outcome), written=outcome.written)
+        message = "but what is graded is kept. The same command goes on from there."
+        raise Interrupted(stopped, message) from None
+    write_and_print({}, _page(outcome), written=outcome.written)
 
 
-def _check_place(output: Path, given: tuple[Path, ...]) -> None:
+def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
     if output.exists() and not output.is_dir():
         raise OutputError(f"-o {output}: is not a folder. Give another place.")
-    for path in given:
-        if path.is_dir() and output.resolve().is_relative_to(path.resolve()):
+    whole = output.resolve()
+    above = [folder for folder in (whole, *whole.parents) if folder.is_dir()]
+    for path in input_paths:
+        if path.is_dir() and any(map(path.samefile, above)):
             raise OutputError.of("output_within", output=output, path=path)
+        for file in files_below(path):
+            add_input(file)
+    check_output_folder(output)
 
 
 def _page(outcome: GradeOutcome) -> Page:
     from collections import Counter
 
     from px4fuse.report.page import Page
-    from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
+    from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
     from px4fuse.results.reading import one_line
 
     page, rows = Page(), []
     for entry in outcome.entries:
-        one = entry.counting
-        pending = ", pending" if one and entry.total is None else ""
-        status = one.status + pending if one else "missing"
-        look = GOOD if status == "verified" else SEVERITY_COLOURS["warning"]
+        attempt = entry.counting
+        pending = ", pending" if attempt and entry.total is None else ""
+        status = attempt.status + pending if attempt else "missing"
+        status_colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
         total = "–" if entry.total is None else f"{entry.total:g}"
         name = one_line(entry.student or entry.student_id, 60)
-        file, flags = one.submission if one else "", f"{len(entry.flags) or ''}"
-        rows.append((name, file, (status, look), f"{total} / {entry.of:g}", flags))
+        file, flags = attempt.submission if attempt else "", f"{len(entry.flags) or ''}"
+        rows.append((name, file, (status, status_colour), f"{total} / {entry.of:g}", flags))
     page.table(("student", "submission", "status", "points", "flags"), rows, right=(3, 4))
-    counts = Counter(one.status for one in outcome.graded)
-    said = ", ".join(f"{count} {status}" for status, count in counts.most_common())
+    counts = Counter(attempt.status for attempt in outcome.graded)
+    status_counts = ", ".join(f"{count} {status}" for status, count in counts.most_common())
     missing = sum(entry.counting is None for entry in outcome.entries)
     page.write(
-        f"{len(outcome.graded)} submissions: {said or 'none'}; {missing} of "
+        f"{len(outcome.graded)} submissions: {status_counts or 'none'}; {missing} of "
         f"{len(outcome.entries)} students handed in nothing; {outcome.reused} as verified before"
     )
     for note in outcome.notes:
-        page.write(note, colour=MUTED)
+        page.write(note, colour=MUTED_COLOUR)
     return page

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, comparison_request, json_option, recording_options
-from px4fuse.cli.outputs import finish, progress, result_files
-from px4fuse.plain import few_words
+from px4fuse.cli.inputs import InputPath, comparison_request, json_option, recording_options
+from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
+from px4fuse.plain import join_first
 from px4fuse.record import Unavailable
 
 if TYPE_CHECKING:
@@ -21,63 +21,73 @@ if TYPE_CHECKING:
 SOURCES_HEAD = ("", "source", "samples", "Hz", "gaps", "span (s)")
 
 
-def _versions(context: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if not wanted:
+def _print_versions(context: click.Context, _: click.Parameter, is_requested: bool) -> None:
+    if not is_requested:
         return
     import platform
 
     from px4fuse.results.model import provenance
 
-    made = provenance("")
-    libraries = ", ".join(f"{name} {version}" for name, version in made.libraries.items())
-    click.echo(f"px4fuse {made.px4fuse}, Python {made.python}, {platform.platform()}")
+    versions = provenance("")
+    libraries = ", ".join(f"{name} {version}" for name, version in versions.libraries.items())
+    click.echo(f"px4fuse {versions.px4fuse}, Python {versions.python}, {platform.platform()}")
     click.echo(libraries)
     context.exit()
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @click.option(
-    "--versions", is_flag=True, is_eager=True, expose_value=False, callback=_versions,
+    "--versions",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_versions,
     help="Print versions, system and libraries, for a bug report, and exit.",
-)  # fmt: skip
+)
 @json_option
 @recording_options
-def info(log: Path, json_path: Path | None, **given: Any) -> None:
+def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """Say what is in a log, what px4fuse can do with it, and what to log next time."""
     from px4fuse.analysis import read_flight
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
-    request = comparison_request(log, given)
+    request = comparison_request(log, option_values)
+    check_targets([json_path])
     with progress(json_path) as step:
         flight = read_flight(request, step)
         step("looking at what is in it")
         inventory = take_inventory(flight)
     contents = result_files(to_plain(inventory), json_path)
-    finish(contents, _page(inventory, request))
+    write_and_print(contents, _page(inventory, request))
 
 
 def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     from px4fuse.report.page import Page
-    from px4fuse.report.style import GOOD, SEVERITY_COLOURS
+    from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
     from px4fuse.request import command_line
 
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
-    for label, text in _facts(inventory):
+    for label, text in _log_facts(inventory):
         page.labelled(label, text)
     if inventory.flight.log.senders:
-        page.table(("sender", "what it is", "messages", "lost"), _senders(inventory), right=(2, 3))
-    page.table(SOURCES_HEAD, list(_sources(inventory)), right=(2, 3, 4, 5))
-    looks = {True: ("yes", GOOD), False: ("no", SEVERITY_COLOURS["warning"])}
-    rows = [(looks[can.possible], can.name, can.reason) for can in inventory.abilities]
+        page.table(
+            ("sender", "what it is", "messages", "lost"), _sender_rows(inventory), right=(2, 3)
+        )
+    page.table(SOURCES_HEAD, list(_source_rows(inventory)), right=(2, 3, 4, 5))
+    answer_styles = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
+    rows = [
+        (answer_styles[option.possible], option.name, option.reason)
+        for option in inventory.abilities
+    ]
     page.table(("", "", "What px4fuse can do with it"), rows)
     if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
         command = command_line(request, "compare", typed=True)
         page.add("command", text=command, label="Compare")
     lists = {
         "Next": [f"{one.remedy} ({'; '.join(one.improves)})" for one in inventory.advice],
-        "Clocks": _clocks(inventory),
+        "Clocks": _clock_lines(inventory),
         "Not used": [
             f"{one.name}, {one.count} messages: {one.reason}" for one in inventory.flight.unused
         ],
@@ -89,7 +99,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     return page
 
 
-def _facts(inventory: Inventory) -> list[tuple[str, str]]:
+def _log_facts(inventory: Inventory) -> list[tuple[str, str]]:
     log = inventory.flight.log
     size = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
     version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
@@ -98,8 +108,8 @@ def _facts(inventory: Inventory) -> list[tuple[str, str]]:
     facts = [
         ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
         ("Vehicle", f"{version}{git}, {hardware}"),
-        ("Data", f"{_duration(log.duration_s)}, {_start(inventory)}"),
-        ("Flying", _flying(inventory)),
+        ("Data", f"{_duration_text(log.duration_s)}, {_start_text(inventory)}"),
+        ("Flying", _airborne_text(inventory)),
     ]
     if log.dropouts:
         lost_s = sum(dropout.duration_s for dropout in log.dropouts)
@@ -114,27 +124,27 @@ def _facts(inventory: Inventory) -> list[tuple[str, str]]:
     return facts
 
 
-def _duration(seconds: float) -> str:
+def _duration_text(seconds: float) -> str:
     return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "a single moment"
 
 
-def _start(inventory: Inventory) -> str:
+def _start_text(inventory: Inventory) -> str:
     if inventory.start_utc is None:
         return f"from {inventory.flight.log.boot_time_s:.1f} s after boot (no UTC in the log)"
     return f"from {inventory.start_utc[:19].replace('T', ' ')} UTC"
 
 
-def _flying(inventory: Inventory) -> str:
+def _airborne_text(inventory: Inventory) -> str:
     airborne = inventory.flight.airborne
     if isinstance(airborne, Unavailable):
         return "unknown, no land detector"
     if not airborne:
         return "never, by the land detector"
     spans = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne]
-    return few_words(spans, 3)
+    return join_first(spans, 3)
 
 
-def _senders(inventory: Inventory) -> list[tuple[str, ...]]:
+def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
     return [
         (
             f"{sender.system}/{sender.component}",
@@ -146,40 +156,40 @@ def _senders(inventory: Inventory) -> list[tuple[str, ...]]:
     ]
 
 
-def _sources(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
-    from px4fuse.report.style import MUTED
+def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
+    from px4fuse.report.style import MUTED_COLOUR
 
     previous = ""
     for source in inventory.sources:
         part = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
-            yield part, ("none", MUTED), "", "", "", ""  # why not stands below
+            yield part, ("none", MUTED_COLOUR), "", "", "", ""  # why not stands below
             continue
         yield (
             f"{part:9}->" if source.chosen else part,
             source.name,
             "" if source.samples is None else f"{source.samples}",
-            "" if source.rate_hz is None else _short(source.rate_hz),
-            _gaps(source),
-            _span(source),
+            "" if source.rate_hz is None else _format_short(source.rate_hz),
+            _gaps_text(source),
+            _span_text(source),
         )
 
 
-def _gaps(source: Source) -> str:
+def _gaps_text(source: Source) -> str:
     if source.gaps is None:
         return ""
     if not source.gaps.count:
         return "0"
-    return f"{source.gaps.count} ({_short(source.gaps.longest_s)} s)"
+    return f"{source.gaps.count} ({_format_short(source.gaps.longest_s)} s)"
 
 
-def _short(value: float) -> str:
+def _format_short(value: float) -> str:
     """Two digits or more, four characters as a rule."""
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 
-def _span(source: Source) -> str:
+def _span_text(source: Source) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0
@@ -188,13 +198,15 @@ def _span(source: Source) -> str:
     return f"{start:.{digits}f}..{end:.{digits}f}"
 
 
-def _clocks(inventory: Inventory) -> list[str]:
-    from px4fuse.report.words import clock_words
+def _clock_lines(inventory: Inventory) -> list[str]:
+    from px4fuse.report.words import format_clock_map
 
-    on: dict[str, dict[str, None]] = {}
+    names_by_clock: dict[str, dict[str, None]] = {}
     for source in inventory.sources:
         if source.clock:
             name = source.name if source.part == "position" else source.part
-            on.setdefault(source.clock, {})[name] = None
-    lines = [f"{clock}: {', '.join(parts)}" for clock, parts in on.items()]
-    return lines + [clock_words(clock) for clock in inventory.flight.clocks]
+            names_by_clock.setdefault(source.clock, {})[name] = None
+    lines = [
+        f"{clock}: {', '.join(names_on_clock)}" for clock, names_on_clock in names_by_clock.items()
+    ]
+    return lines + [format_clock_map(clock) for clock in inventory.flight.clocks]

@@ -17,8 +17,9 @@ from click.core import ParameterSource
 from msgspec import NODEFAULT, Struct
 from msgspec.structs import fields
 
-from px4fuse.cli.outputs import OPENED
+from px4fuse.cli.outputs import OPEN_KEY
 from px4fuse.errors import SettingsError
+from px4fuse.input_files import add_input
 from px4fuse.reading import max_log_bytes, read_text
 from px4fuse.record import table
 from px4fuse.request import (
@@ -47,7 +48,7 @@ def column_names(text: str) -> tuple[str, ...]:
 Option = Callable[[Callable[..., None]], Callable[..., None]]
 
 
-def _together(*options: Option) -> Option:
+def _combine_options(*options: Option) -> Option:
     """Several options as one, in the order in which the help lists them."""
 
     def add(command: Callable[..., None]) -> Callable[..., None]:
@@ -58,7 +59,7 @@ def _together(*options: Option) -> Option:
     return add
 
 
-class Named(click.Path):
+class NonEmptyPath(click.Path):
     """A file or folder; an empty name, which would be the current folder, is a slip."""
 
     def __init__(self, path_type: type[Path | str] = Path) -> None:
@@ -69,6 +70,20 @@ class Named(click.Path):
         if value == "":
             self.fail("the name is empty.", param, ctx)
         return super().convert(value, param, ctx)
+
+
+class InputPath(NonEmptyPath):
+    """A file or folder to read, which is registered before the command begins.
+
+    A log may have a part of it after a colon, as ``LOG:vio``.
+    """
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert what was typed."""
+        path = super().convert(value, param, ctx)
+        file, colon, _ = str(path).rpartition(":")
+        add_input(Path(file) if colon and not Path(path).exists() else Path(path))
+        return path
 
 
 class TypedQuantity(click.ParamType["float | str"]):
@@ -104,10 +119,12 @@ class TypedQuantity(click.ParamType["float | str"]):
         try:
             number = float(value)
         except ValueError:
-            meant = in_unit(value, self.unit)
-            shown = f"{self.example if meant is None else meant:.12g}"
+            parsed = in_unit(value, self.unit)
+            example_text = f"{self.example if parsed is None else parsed:.12g}"
             self.fail(
-                f"{value!r}: give {name}, as {shown}{', or auto' if self.auto else ''}.", param, ctx
+                f"{value!r}: give {name}, as {example_text}{', or auto' if self.auto else ''}.",
+                param,
+                ctx,
             )
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number.", param, ctx)
@@ -145,20 +162,20 @@ def option(
         details: dict[str, Any] = {"help": meaning, "metavar": metavar or None}
         if "type" not in more and (hint := get_type_hints(command).get(field)) is not None:
             default = signature(command).parameters[field].default
-            details |= _taken(hint)
+            details |= _click_type(hint)
             if default is not Parameter.empty:
                 details["default"] = default
             elif hint is Path:
                 details["required"] = True
         if (least, most) != (None, None):
-            within: Any = click.FloatRange if details.get("type") is float else click.IntRange
-            details["type"] = within(least, most)
+            range_type: Any = click.FloatRange if details.get("type") is float else click.IntRange
+            details["type"] = range_type(least, most)
         return click.option(*names.split(","), field, **details | more)(command)
 
     return add
 
 
-class _Typed(Struct, frozen=True):
+class _OptionRow(Struct, frozen=True):
     """A row of ``options.toml``; as :func:`option` takes it."""
 
     typed: str
@@ -167,12 +184,12 @@ class _Typed(Struct, frozen=True):
     most: int | float | None = None
 
 
-_TABLES = table(__file__, "options.toml", dict[str, dict[str, _Typed]])
+_TABLES = table(__file__, "options.toml", dict[str, dict[str, _OptionRow]])
 
 
 def options(title: str, **more: Mapping[str, Any]) -> Option:
     """The options of a table of ``options.toml``; of some more, as click has it."""
-    return _together(
+    return _combine_options(
         *(
             option(one.typed, one.meaning, one.least, one.most, name=name, **more.get(name, {}))
             for name, one in _TABLES[title].items()
@@ -183,22 +200,22 @@ def options(title: str, **more: Mapping[str, Any]) -> Option:
 def request_options(kind: type[Struct], options: Mapping[str, Declared]) -> Option:
     """The options of some fields of a request: what each takes and its default are the field's."""
     hints, defaults = get_type_hints(kind), {field.name: field for field in fields(kind)}
-    return _together(
+    return _combine_options(
         *(
-            _declared(name, one, hints[name], defaults[name].default)
+            _declared_option(name, one, hints[name], defaults[name].default)
             for name, one in options.items()
             if one.meaning
         )
     )
 
 
-def _declared(field: str, declared: Declared, hint: Any, default: Any) -> Option:
+def _declared_option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
     """One of them; the parameters of a position file begin with what file they are about."""
     name = declared.name[2:].replace("-", "_") if declared.name.startswith("--position") else field
     details = {"default": default or None} if default is not NODEFAULT else {}
-    details |= _taken(hint) | {"help": declared.meaning, "metavar": declared.metavar}
+    details |= _click_type(hint) | {"help": declared.meaning, "metavar": declared.metavar}
     if field in ("path", "mavlink", "reference"):
-        details["type"] = Named(str)
+        details["type"] = InputPath(str)
     elif declared.unit:
         auto = len(get_args(hint)) > 2
         details["type"] = TypedQuantity(declared.unit, declared.example, auto=auto)
@@ -209,20 +226,20 @@ def _declared(field: str, declared: Declared, hint: Any, default: Any) -> Option
     return click.option(declared.name, name, **details)
 
 
-def _taken(hint: Any) -> dict[str, Any]:
+def _click_type(hint: Any) -> dict[str, Any]:
     """What a parameter of a type takes: of a Literal one of its words, of a tuple several."""
-    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    inner = next(part for part in parts if part is not NoneType)
+    types = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    inner = next(member for member in types if member is not NoneType)
     if get_origin(inner) is tuple:
-        return _taken(get_args(inner)[0]) | {"multiple": True}
+        return _click_type(get_args(inner)[0]) | {"multiple": True}
     if get_origin(inner) is Literal:
         return {"type": click.Choice(get_args(inner), case_sensitive=False)}
     if inner is bool:
         return {"is_flag": True, "default": False}
-    return {"type": Named() if inner is Path else inner}
+    return {"type": NonEmptyPath() if inner is Path else inner}
 
 
-def _allow_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
+def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
     if megabytes is not None:
         before = max_log_bytes.set(megabytes * 1_000_000)
         ctx.call_on_close(lambda: max_log_bytes.reset(before))
@@ -231,9 +248,11 @@ def _allow_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -
 # It says what this machine can take, not what is analysed, so it is no setting of the analysis
 max_size_option = option(
     "--max-size MB",
-    f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]", 1,
-    expose_value=False, callback=_allow_size,
-)  # fmt: skip
+    f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
+    1,
+    expose_value=False,
+    callback=_set_max_size,
+)
 #: The results, which stand beside a report where there is one
 json_option = option(
     "--json FILE",
@@ -243,46 +262,50 @@ json_option = option(
 )
 
 
-def _opened(typed: str, name: str) -> Option:
-    """That what was written is to be opened; :func:`~px4fuse.cli.outputs.finish` does."""
+def _open_flag(option_text: str, name: str) -> Option:
+    """That what was written is to be opened; :func:`~px4fuse.cli.outputs.write_and_print` does."""
     return option(
-        typed, "Open what was written, in the program for it.", name=name, is_flag=True,
-        expose_value=False, callback=lambda ctx, _, value: ctx.meta.update({OPENED: value}),
-    )  # fmt: skip
+        option_text,
+        "Open what was written, in the program for it.",
+        name=name,
+        is_flag=True,
+        expose_value=False,
+        callback=lambda ctx, _, value: ctx.meta.update({OPEN_KEY: value}),
+    )
 
 
 #: Of every command that writes something to look at
-open_option = _opened("--open, --show", "opened")
+open_option = _open_flag("--open, --show", "opened")
 #: Of the command whose --open is of a loop that did not close
-show_option = _opened("--show", "shown")
+show_option = _open_flag("--show", "shown")
 #: Whose report it is
-person_options = options("person", notes={"type": Named()}, answers={"type": Named()})
+person_options = options("person", notes={"type": InputPath()}, answers={"type": InputPath()})
 
 
 def report_options(meaning: str) -> Option:
     """Of every command that makes a report: the PDF and its results."""
-    return _together(option("-o, --output FILE.pdf", meaning), json_option)
+    return _combine_options(option("-o, --output FILE.pdf", meaning), json_option)
 
 
 system_option = request_options(EvaluationRequest, {"system": OPTIONS["system"]})
-_FILTER = request_options(ComparisonRequest, FILTER_OPTIONS)
-_CLOCK = request_options(ComparisonRequest, CLOCK_OPTION)
+_FILTER_GROUP = request_options(ComparisonRequest, FILTER_OPTIONS)
+_CLOCK_GROUP = request_options(ComparisonRequest, CLOCK_OPTION)
 #: Of commands that read a flight as it was recorded
-flight_options = _together(request_options(ComparisonRequest, RECORDINGS), max_size_option)
+flight_options = _combine_options(request_options(ComparisonRequest, RECORDINGS), max_size_option)
 #: Which recordings of the flight are read, and how
-recording_options = _together(
+recording_options = _combine_options(
     request_options(ComparisonRequest, RECORDINGS),
     request_options(PositionFile, POSITION_OPTIONS),
-    _CLOCK,
+    _CLOCK_GROUP,
     max_size_option,
 )
 #: Of every command that runs the filter: settings, segment and recordings
-analysis_options = _together(_FILTER, recording_options)
+analysis_options = _combine_options(_FILTER_GROUP, recording_options)
 #: Of an analysis that hold for many logs: no other files of one flight
-settings_options = _together(_FILTER, system_option, _CLOCK, max_size_option)
+settings_options = _combine_options(_FILTER_GROUP, system_option, _CLOCK_GROUP, max_size_option)
 
 
-def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
+def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRequest:
     """What :func:`recording_options`, or :func:`analysis_options` with them, gave as a request.
 
     Raises
@@ -290,17 +313,19 @@ def comparison_request(log: Path, given: dict[str, Any]) -> ComparisonRequest:
     SettingsError
         An option is about a position file, and none is given.
     """
-    return ComparisonRequest(log=str(log), position=_position(given), **given)
+    return ComparisonRequest(log=str(log), position=_position_file(option_values), **option_values)
 
 
-def _position(given: dict[str, Any]) -> PositionFile | None:
-    typed = {field: option.name for field, option in POSITION_OPTIONS.items()}
-    how = {field: given.pop(name[2:].replace("-", "_")) for field, name in typed.items()}
-    if how["path"] is not None:
-        return PositionFile(**how)
-    for field, value in how.items():
+def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
+    option_names = {field: option.name for field, option in POSITION_OPTIONS.items()}
+    fields_of_file = {
+        field: option_values.pop(name[2:].replace("-", "_")) for field, name in option_names.items()
+    }
+    if fields_of_file["path"] is not None:
+        return PositionFile(**fields_of_file)
+    for field, value in fields_of_file.items():
         if value is not None:
-            raise SettingsError(f"{typed[field]} requires --position.")
+            raise SettingsError(f"{option_names[field]} requires --position.")
     return None
 
 
@@ -312,39 +337,42 @@ def typed_parameters() -> Iterator[click.Parameter]:
             yield parameter
 
 
-def read_person(given: dict[str, Any]) -> Student:
+def read_student(option_values: dict[str, Any]) -> Student:
     """Whose report it is, taken out of what :func:`person_options` gave.
 
     Raises
     ------
     SettingsError
-        The notes or the answers cannot be read.
+        The notes or the answers cannot be read, or the notes cannot be drawn.
     """
     from msgspec import UNSET
 
     from px4fuse.answers import read_answers
     from px4fuse.results.model import MAX_NOTES_BYTES, Student
 
-    name, number = given.pop("student") or "", given.pop("student_id") or ""
-    path, form, notes = given.pop("notes"), given.pop("answers"), ""
+    name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
+    path, form, notes = option_values.pop("notes"), option_values.pop("answers"), ""
     if path is not None:
+        from px4fuse.report.notes import parse  # the report takes long to import
+
         notes = read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
+        parse(notes, f"--notes {path}")  # before the analysis
     answers = UNSET if form is None else read_answers(form)
-    person = Student(encodable(name), encodable(number), notes, answers)
-    _tell_fonts(person.name + person.id + person.notes)
+    person = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
+    _warn_missing_fonts(person.name + person.id + person.notes)
     return person
 
 
-def _tell_fonts(text: str) -> None:
+def _warn_missing_fonts(text: str) -> None:
     """Say before all work that the report will lack characters, and what to install."""
     if text.isascii():
         return
-    from px4fuse.report.fonts import advice, missing
+    from px4fuse.report.fonts import font_advice, missing_characters
 
-    if lacking := missing(text):
-        click.echo(f"px4fuse: {advice(lacking)}", err=True)
+    if characters := missing_characters(text):
+        click.echo(f"px4fuse: {font_advice(characters)}", err=True)
 
 
-def encodable(text: str) -> str:
+def replace_unencodable(text: str) -> str:
     """Text without the stray bytes that a terminal may hand over."""
     return text.encode(errors="replace").decode()

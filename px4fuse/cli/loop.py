@@ -10,7 +10,7 @@ import click
 
 from px4fuse.cli import inputs, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.reading import shown
+from px4fuse.reading import display_name
 from px4fuse.request import (
     LOOP_OPTIONS,
     GivenClosure,
@@ -25,39 +25,41 @@ if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
 # Nobody's tape is longer
-MAX_LANDED_AT = 10_000.0
+MAX_LANDING_DISTANCE_M = 10_000.0
 # What may be given with a pose graph
-FOR_GRAPHS = ("source", "json_path", "g2o", "robust")
+GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
 
 
-def _numbers(text: str, meant: str, most: float) -> list[float]:
+def _parse_numbers(text: str, expected: str, most: float) -> list[float]:
     """Two or three finite numbers between commas."""
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [float(text_part) for text_part in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (2, 3) or not all(abs(number) <= most for number in numbers):
-        raise click.BadParameter(f"{text!r} is not {meant}.")
+        raise click.BadParameter(f"{text!r} is not {expected}.")
     return numbers
 
 
-def landing(text: str) -> Landing:
+def parse_landing(text: str) -> Landing:
     """Read ``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
-    return Landing(*_numbers(text, "FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG", MAX_LANDED_AT))
+    return Landing(
+        *_parse_numbers(text, "FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG", MAX_LANDING_DISTANCE_M)
+    )
 
 
-def closure(text: str) -> GivenClosure:
+def parse_closure(text: str) -> GivenClosure:
     """Read ``T1,T2`` or ``T1,T2,SIGMA``."""
-    return GivenClosure(*_numbers(text, "T1,T2 in s, or T1,T2,SIGMA", sys.float_info.max))
+    return GivenClosure(*_parse_numbers(text, "T1,T2 in s, or T1,T2,SIGMA", sys.float_info.max))
 
 
 @click.command()
-@click.argument("source", type=inputs.Named())
+@click.argument("source", type=inputs.InputPath())
 @inputs.options(
     "loop",
-    landed_at={"type": landing},
+    landed_at={"type": parse_landing},
     opened={"is_flag": True},
-    closures={"type": closure, "multiple": True},
+    closures={"type": parse_closure, "multiple": True},
     robust={"is_flag": True},
 )
 @inputs.request_options(LoopRequest, LOOP_OPTIONS)
@@ -72,7 +74,7 @@ def loop(
     json_path: Path | None,
     tum: Path | None,
     g2o: Path | None,
-    **given: Any,
+    **option_values: Any,
 ) -> None:
     """Measure how far a loop fails to close, and correct its path.
 
@@ -85,50 +87,56 @@ def loop(
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
-    person = inputs.read_person(given)
+    person = inputs.read_student(option_values)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
             raise SettingsError(f"{name} -: only --json can print", "Give a file name.")
     if is_g2o(split_part(str(source))[0]):
-        _solve(source, json_path, g2o, True if given["robust"] else None)
+        _solve_graph(source, json_path, g2o, True if option_values["robust"] else None)
         return
-    request = loop_request(source, given)
+    request = loop_request(source, option_values)
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
     with outputs.progress(json_path) as step:
-        found = run_loop(request, step)
-        made = loop_results(request, found, person)
+        loop_result = run_loop(request, step)
+        loop_output = loop_results(request, loop_result, person)
         if output is None and json_path is None:
-            output = outputs.free_report(f"{file_name(source)}_loop", settings_name(request), made)
-        contents = _files(found, tum, g2o)
-        contents |= outputs.result_files(made, json_path, output, found, step)
-    outputs.finish(contents, summary(found, made.findings), request)
+            output = outputs.default_report(
+                f"{file_name(source)}_loop", settings_name(request), loop_output
+            )
+        contents = _output_files(loop_result, tum, g2o)
+        contents |= outputs.result_files(loop_output, json_path, output, loop_result, step)
+    outputs.write_and_print(contents, summary(loop_result, loop_output.findings), request)
 
 
-def loop_request(source: Path, given: dict[str, Any]) -> LoopRequest:
+def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
     """What the command's options gave, as a request."""
-    del given["robust"]
-    return LoopRequest(source=str(source), came_back=not given.pop("opened"), **given)
+    del option_values["robust"]
+    return LoopRequest(
+        source=str(source), came_back=not option_values.pop("opened"), **option_values
+    )
 
 
-def _files(found: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
+def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
     """The corrected path and the solved graph, as files for other tools."""
     from px4fuse.errors import MissingDataError
-    from px4fuse.loop.closure import in_frame
+    from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import g2o_text
     from px4fuse.readers.trajectory import tum_text
 
     contents = {}
     if tum is not None:
-        best = found.best
-        if best is found.odometry:
-            raise MissingDataError.of("no_corrected_path", tum=shown(tum))
-        contents[tum] = tum_text(in_frame(best.trajectory, found.given_frame)).encode()
+        best = loop_result.best
+        if best is loop_result.odometry:
+            raise MissingDataError.of("no_corrected_path", tum=display_name(tum))
+        contents[tum] = tum_text(from_z_down(best.trajectory, loop_result.original_frame)).encode()
     if g2o is not None:
-        contents[g2o] = g2o_text(found.solved_graph()).encode()
+        contents[g2o] = g2o_text(loop_result.solved_graph()).encode()
     return contents
 
 
-def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None) -> None:
+def _solve_graph(
+    source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
+) -> None:
     """Solve a pose graph from a file."""
     from px4fuse.loop.tracks import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
@@ -138,17 +146,19 @@ def _solve(source: Path, json_path: Path | None, g2o: Path | None, robust: bool 
 
     path, part = split_part(str(source))
     if part is not None:
-        raise SettingsError(f"{shown(source)}: a pose graph has no part {part!r}", "Leave it out.")
+        raise SettingsError(
+            f"{display_name(source)}: a pose graph has no part {part!r}", "Leave it out."
+        )
     for parameter in inputs.typed_parameters():
-        if parameter.name not in FOR_GRAPHS:
+        if parameter.name not in GRAPH_PARAMETERS:
             raise SettingsError.of(
-                "not_for_graphs", source=shown(source), option=parameter.opts[-1]
+                "not_for_graphs", source=display_name(source), option=parameter.opts[-1]
             )
     outputs.check_targets([json_path, g2o])
     with outputs.progress(json_path) as step:
-        step(f"reading {shown(source)}")
-        solved = analyse_graph(shown(source), read_g2o(path), step, robust=robust)
+        step(f"reading {display_name(source)}")
+        solved = analyse_graph(display_name(source), read_g2o(path), step, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
     contents |= outputs.result_files(graph_results(solved, command), json_path)
-    outputs.finish(contents, graph_summary(solved))
+    outputs.write_and_print(contents, graph_summary(solved))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import shutil
 import signal
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,8 +14,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
-from px4fuse.errors import OutputError, ResultsError, on_one_line
-from px4fuse.writing import STANDARD_OUTPUT, write_all
+from px4fuse.errors import OutputError, ResultsError, to_one_line
+from px4fuse.input_files import check_outputs
+from px4fuse.writing import STANDARD_OUTPUT, write_all, written_before
 
 if TYPE_CHECKING:
     from msgspec import Struct
@@ -22,21 +26,18 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Of a report with and without the settings in its name: file systems take 255 bytes
-LONGEST_NAME, LONGEST_STEM = 200, 240
+# Limit of the name of a report in bytes, and what is kept of a longer one: file systems take 255
+LONGEST_NAME, LONGEST_STEM = 200, 180
+# Name and id on a report without a student
+NOBODY = ("", "")
 # Columns of a line that no paragraph fills
-UNWRAPPED = 10_000
-# Parameters that name files to read; some name a part of a log after a colon
-INPUTS = (
-    "log", "logs", "report", "mavlink", "position", "notes", "source", "estimate", "reference",
-    "a", "b",
-)  # fmt: skip
+UNWRAPPED_WIDTH = 10_000
 # Under it a run keeps which files it has written, for what is said where it then ends early
-WRITTEN = "px4fuse.written"
+WRITTEN_KEY = "px4fuse.written"
 # And under this one whether what was written is to be opened
-OPENED = "px4fuse.opened"
+OPEN_KEY = "px4fuse.opened"
 # What is looked at first, of all that a command writes
-TO_LOOK_AT = (".html", ".htm", ".pdf", ".png")
+OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 
 class Interrupted(Exception):  # noqa: N818 - no error of anybody
@@ -58,11 +59,11 @@ class Interrupted(Exception):  # noqa: N818 - no error of anybody
 class ShowStep(Protocol):
     """Says what is being done, and how much of it is done where that can be counted."""
 
-    def __call__(self, what: str, done: int = 0, of: int | None = None) -> None:
+    def __call__(self, activity: str, done_count: int = 0, total_count: int | None = None) -> None:
         """Show it."""
 
 
-def silent(what: str, done: int = 0, of: int | None = None) -> None:
+def show_nothing(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
     """Show nothing."""
 
 
@@ -77,66 +78,66 @@ def progress(output: Path | None = None) -> Iterator[ShowStep]:
     console = Console(stderr=True)
     # an older rich ends a disabled bar with an empty line
     if not console.is_terminal or output == STANDARD_OUTPUT:
-        yield silent
+        yield show_nothing
         return
     from rich import progress as bars
 
     columns = (
-        bars.SpinnerColumn(), bars.TextColumn("{task.description}", markup=False), bars.BarColumn(),
-        bars.TextColumn("{task.fields[count]}"), bars.TimeElapsedColumn(),
+        bars.SpinnerColumn(),
+        bars.TextColumn("{task.description}", markup=False),
+        bars.BarColumn(),
+        bars.TextColumn("{task.fields[count]}"),
+        bars.TimeElapsedColumn(),
         bars.TimeRemainingColumn(),
-    )  # fmt: skip
+    )
     with bars.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 
-        def show(what: str, done: int = 0, of: int | None = None) -> None:
-            count = "" if of is None else f"{done} of {of}"
-            bar.update(task, description=what, completed=done, total=of, count=count)
+        def show(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
+            count = "" if total_count is None else f"{done_count} of {total_count}"
+            bar.update(
+                task, description=activity, completed=done_count, total=total_count, count=count
+            )
 
         yield show
 
 
-def free_report(stem: str, settings: str, mine: Results) -> Path:
-    """Where a report goes that was given no name: what is not at its default is in its name.
+def default_report(stem: str, settings: str, results: Results) -> Path:
+    """Path of a report without -o: the name of the log and the settings that are not defaults.
 
-    What an earlier run wrote of the same files, settings and student is written over. Where another
-    file has the name, a number is added.
+    Raises
+    ------
+    OutputError
+        A file of that name exists that is not a report of the same files and student.
     """
-    name = f"{stem}{settings}"
-    if len(os.fsencode(name)) > LONGEST_NAME:
-        name = os.fsencode(stem)[:LONGEST_STEM].decode(errors="ignore")
-    number, path = 1, Path("reports", f"{name}.pdf")
-    while not all(_is_ours(file, mine) for file in (path, path.with_suffix(".json"))):
-        number += 1
-        path = Path("reports", f"{name}_{number}.pdf")
-    return path
-
-
-def _is_ours(file: Path, mine: Results) -> bool:
-    """Whether a report or its results are of the same, or not there yet."""
+    from px4fuse.results.contract import file_hashes_in, to_json
     from px4fuse.results.reading import read_results
     from px4fuse.verification.intake import attached_results
 
-    if not file.exists():
-        return True
-    read = read_results if file.suffix == ".json" else attached_results
-    try:
-        found = read(file.read_bytes(), file.name)
-        (asked, names), (ours, our_names) = map(_of_what, (found, mine))
-    except (OSError, ResultsError):
-        return False  # not a report, or not one that this version reads
-    return asked == ours and names in ((), our_names)  # a name is added to what had none
+    name = f"{stem}{settings}"
+    if len(os.fsencode(name)) > LONGEST_NAME:
+        kept = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
+        name = f"{kept}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
+    path = Path("reports", f"{name}.pdf")
+    for file, read in ((path, attached_results), (path.with_suffix(".json"), read_results)):
+        if not file.exists():
+            continue
+        try:
+            old = read(file.read_bytes(), file.name)
+        except (OSError, ResultsError):
+            is_same = False
+        else:
+            is_same = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
+            is_same &= _person(old) in (NOBODY, _person(results))
+        if not is_same:
+            raise OutputError.of("default_name_taken", file=file)
+    return path
 
 
-def _of_what(results: Results) -> tuple[object, tuple[str, ...]]:
-    """What was asked of which files, and whose report it is."""
-    from px4fuse.results.contract import files_named, to_json
-
+def _person(results: Results) -> tuple[str, str]:
+    """Name and id on a report."""
     student = getattr(results, "student", None)
-    names = (student.name, student.id) if student is not None else ()
-    asked = getattr(results, "request", results.provenance.command)
-    files = files_named(to_json(results))
-    return (type(results), asked, files), names if any(names) else ()
+    return NOBODY if student is None else (student.name, student.id)
 
 
 def web_page(output: Path | None, default: Path) -> Path:
@@ -166,20 +167,20 @@ def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     """
     if output is not None and output.suffix.lower() != ".pdf":
         raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
-    beside = json_path
+    results_path = json_path
     if output is not None and json_path in (None, STANDARD_OUTPUT):
-        beside = output.with_suffix(".json")
-    known = [path for path in (output, beside) if path is not None]
-    check_targets(known)
-    return known
+        results_path = output.with_suffix(".json")
+    paths = [path for path in (output, results_path) if path is not None]
+    check_targets(paths)
+    return paths
 
 
 def result_files(
     results: Struct | dict[str, Any],
     json_path: Path | None,
     output: Path | None = None,
-    found: object = None,
-    step: ShowStep = silent,
+    subject: object = None,
+    step: ShowStep = show_nothing,
 ) -> dict[Path, bytes]:
     """Results where --json says, and a document as a PDF that holds them and has them beside it.
 
@@ -188,7 +189,7 @@ def result_files(
     results : Struct or dict
     json_path, output : Path or None
         As given with --json and -o.
-    found : object, optional
+    subject : object, optional
         What the results are of, which is drawn.
     step : callable
         Told what is being done.
@@ -196,34 +197,34 @@ def result_files(
     from px4fuse.results.contract import to_json
 
     text, contents = to_json(results), dict[Path, bytes]()
-    if output is not None and found is not None:
+    if output is not None and subject is not None:
         from px4fuse.report.pdf import render
 
         step("drawing the report")
-        output, beside = report_paths(output, json_path)
-        contents |= {output: render(found, results, text), beside: text.encode()}
+        output, results_path = report_paths(output, json_path)
+        contents |= {output: render(subject, results, text), results_path: text.encode()}
     if json_path is not None:
         contents[json_path] = text.encode()
     return contents
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write results, all or none, and never over a file that this run has read.
+    """Write results.
 
     Raises
     ------
     OutputError
-        A target is one of the inputs, or cannot be written.
+        As :func:`check_targets`, or a target cannot be written.
     """
     check_targets(contents)
-    written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN, [])
+    written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_KEY, [])
     write_all(contents, written.append)
 
 
 def written_so_far(context: click.Context) -> str:
-    """Which files this run has put in their places, for a run that ends early."""
-    written: list[Path] = context.meta.get(WRITTEN, [])
-    return f"{', '.join(map(str, written))} written before." if written else "nothing was written."
+    """List the files that this run has written, for a run that ends early."""
+    written: list[Path] = context.meta.get(WRITTEN_KEY, [])
+    return f"{written_before(written)}." if written else "nothing was written."
 
 
 def write_new(path: Path, content: bytes) -> None:
@@ -236,45 +237,39 @@ def write_new(path: Path, content: bytes) -> None:
     """
     if path.exists():
         raise OutputError(f"{path}: exists already; it was not overwritten. Give another name.")
-    finish({path: content})
+    write_and_print({path: content})
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:
-    """Refuse outputs that name the same file, or one that this command reads.
+    """Refuse outputs before the analysis.
 
     Raises
     ------
     OutputError
-        Two targets are the same file, or a target is one of the inputs.
+        Two targets are the same file, a target is a folder or one of the inputs so far, or its
+        path is not possible.
     """
     files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
     if len({file.resolve() for file in files}) < len(files):
         raise OutputError("two outputs name the same file. Give each a name of its own.")
-    params = click.get_current_context().params
-    given = [params[name] for name in INPUTS if params.get(name) is not None]
-    several = [one if isinstance(one, tuple) else (one,) for one in given]
-    paths = [Path(path) for some in several for path in some]  # URLs are texts
-    read = [path if path.exists() else Path(str(path).rpartition(":")[0]) for path in paths]
     for target in files:
-        there = False
         try:
-            there = bool(target.stat())
+            if stat.S_ISDIR(target.stat().st_mode):
+                raise OutputError(f"{target}: is a folder. Give a file name.")
         except FileNotFoundError:
-            pass
+            continue
         except OSError as error:  # a name that is too long, a file in the place of a folder
             raise OutputError.of("cannot_be_written", target=target, error=error) from error
-        for source in read:
-            if there and source.exists() and target.samefile(source):
-                raise OutputError.of("output_is_input", target=target)
+    check_outputs(files)
 
 
-def finish(
+def write_and_print(
     contents: Mapping[Path, bytes],
     page: Page | None = None,
     request: Request | None = None,
     written: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs or none; then tell people what was found and written, and open it if asked.
+    """Write all outputs; then print the results and the names of the files; open one on request.
 
     Nothing is told where the results have standard output to themselves. Commands in the words are
     printed so that they run, where the request is given. ``written`` is what is there already.
@@ -288,17 +283,19 @@ def finish(
         if page is not None:
             show(console, page.blocks, request)
         for path in files:
-            print_line(console, "Wrote", on_one_line(str(path)), "bold")
-    seen = [path for ending in TO_LOOK_AT for path in files if path.suffix.lower() == ending]
-    if click.get_current_context().meta.get(OPENED) and seen:
-        click.launch(str(seen[0].resolve()))
+            print_line(console, "Wrote", to_one_line(str(path)), "bold")
+    openable = [
+        path for ending in OPENABLE_SUFFIXES for path in files if path.suffix.lower() == ending
+    ]
+    if click.get_current_context().meta.get(OPEN_KEY) and openable:
+        click.launch(str(openable[0].resolve()))
 
 
 def terminal() -> Console:
     """Standard output for people; a reader that has gone, as with ``| head``, is no error.
 
-    As wide as the terminal. In a pipe lines do not wrap, unless COLUMNS says how wide they are: a
-    paragraph is one line.
+    As wide as the terminal. In a pipe lines do not wrap, unless COLUMNS is their width, a number
+    above 0: a paragraph is one line.
     """
     from rich.console import Console
 
@@ -307,6 +304,9 @@ def terminal() -> Console:
             raise BrokenPipeError
 
     console = PipeConsole(highlight=False)
-    if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = UNWRAPPED
+    columns = os.environ.get("COLUMNS", "")
+    if not console.is_terminal and not (columns.isdecimal() and int(columns)):
+        console.width = UNWRAPPED_WIDTH
+    elif console.width < 1:  # COLUMNS=0
+        console.width = shutil.get_terminal_size().columns
     return console

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.inputs import options
-from px4fuse.cli.outputs import OPENED, finish, progress, web_page
+from px4fuse.cli.outputs import OPEN_KEY, progress, web_page, write_and_print
 
 
 @click.command()
@@ -29,9 +29,9 @@ def practice(
     """
     seed = secrets.randbelow(10**6) if seed is None else seed
     target = web_page(output, Path("reports", f"practice_{seed}.html"))
-    ctx.meta[OPENED] = sys.stdout.isatty() if opened is None else opened
+    ctx.meta[OPEN_KEY] = sys.stdout.isatty() if opened is None else opened
     with progress(target) as step:
         from px4fuse.practice import practice_text
 
         content = practice_text(seed, level, flights, step).encode()
-    finish({target: content})
+    write_and_print({target: content})

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.inputs import options
-from px4fuse.cli.outputs import finish
+from px4fuse.cli.outputs import write_and_print
 
 FOLDER = Path("sample_logs")
 SAMPLE = "aisle_uwb.ulg"
@@ -24,17 +24,17 @@ def sample_log() -> Path:
 
     from px4fuse.errors import MissingDataError
 
-    here = FOLDER / SAMPLE
-    if here.is_file():
-        found = here
+    local_path = FOLDER / SAMPLE
+    if local_path.is_file():
+        sample_path = local_path
     else:
         try:
             with as_file(files("px4fuse_samples") / SAMPLE) as installed:
-                found = installed
+                sample_path = installed
         except ModuleNotFoundError:
             raise MissingDataError.of("no_sample", install=INSTALL) from None
     click.echo(f"No log was given: this is the sample flight, {SAMPLE}.", err=True)
-    return found
+    return sample_path
 
 
 @click.command()
@@ -59,4 +59,4 @@ def sample(output: Path = FOLDER) -> None:
     command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
     page = Page()
     page.add("command", text=command, label="Next")
-    finish(contents, page)
+    write_and_print(contents, page)

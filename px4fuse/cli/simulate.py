@@ -10,12 +10,20 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import click
 
-from px4fuse.cli.inputs import TypedQuantity, options, typed_parameters
-from px4fuse.cli.outputs import check_targets, finish, progress
-from px4fuse.errors import OutputError, SettingsError, on_one_line
+from px4fuse.cli.inputs import InputPath, TypedQuantity, options, typed_parameters
+from px4fuse.cli.outputs import check_targets, progress, write_and_print
+from px4fuse.errors import OutputError, SettingsError, to_one_line
+from px4fuse.input_files import check_output_folder
 from px4fuse.reading import read_text
-from px4fuse.simulation.mistakes import MISTAKES, as_typed, made, parse
-from px4fuse.simulation.scenario import OF_KIND, Kind, Scenario, Yaw, quantities, scenario_of
+from px4fuse.simulation.mistakes import MISTAKES, active_mistakes, format_mistake, parse
+from px4fuse.simulation.scenario import (
+    DEFAULTS_OF_KIND,
+    Kind,
+    Scenario,
+    Yaw,
+    make_scenario,
+    quantities,
+)
 
 if TYPE_CHECKING:
     from px4fuse.assignment.drawing import Kinds
@@ -27,22 +35,29 @@ MIXED = "mixed"
 OUTDOOR: Kind = "outdoor"
 SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
 # What goes with --assignment, and what goes with nothing else
-ONLY_ASSIGNMENTS = ("secret_file", "mistakes", "preview")
-OF_ASSIGNMENTS = ("output", "assignment", "kind", "answer", "no_truth", *ONLY_ASSIGNMENTS)
+ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes", "preview")
+ASSIGNMENT_OPTIONS = (
+    "output",
+    "assignment",
+    "kind",
+    "answer",
+    "no_truth",
+    *ASSIGNMENT_ONLY_OPTIONS,
+)
 MAX_SECRET_BYTES = 10_000
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
 def _scenario_options(command: Command) -> Command:
     """The options that set a real number of the scenario; its field has the default and help."""
-    for field, taken in reversed(quantities(Scenario).items()):
-        if not taken.meaning:
+    for field, quantity in reversed(quantities(Scenario).items()):
+        if not quantity.meaning:
             continue
-        usual, outdoors = getattr(_DEFAULT, field), OF_KIND[OUTDOOR].get(field)
-        shown = f"{usual:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
-        told = f"{taken.meaning}  [default: {shown}]"
-        kind = TypedQuantity(taken.unit, usual)
-        command = click.option(taken.typed, field, type=kind, help=told)(command)
+        default, outdoors = getattr(_DEFAULT, field), DEFAULTS_OF_KIND[OUTDOOR].get(field)
+        default_text = f"{default:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
+        help_text = f"{quantity.meaning}  [default: {default_text}]"
+        kind = TypedQuantity(quantity.unit, default)
+        command = click.option(quantity.typed, field, type=kind, help=help_text)(command)
     return command
 
 
@@ -64,7 +79,7 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@options("simulate")
+@options("simulate", assignment={"type": InputPath()}, secret_file={"type": InputPath()})
 @_scenario_options
 def simulate(
     output: Path,
@@ -97,7 +112,9 @@ def simulate(
     _check_options(assignment)
     if assignment is not None:
         drawn_from = _read_secret(secret_file), cast("Kinds", kind), mistakes
-        _assign(assignment, output, answer, *drawn_from, truth=not no_truth, preview=preview)
+        _write_assignment(
+            assignment, output, answer, *drawn_from, truth=not no_truth, preview=preview
+        )
         return
     if kind == MIXED:
         raise SettingsError(f"--kind {MIXED} requires --assignment ROSTER.csv.")
@@ -106,7 +123,7 @@ def simulate(
     check_targets([output, answer])
     parsed = parse(mistake)
     chosen |= {"seed": seed, "passes": passes, "yaw": yaw}
-    scenario = scenario_of(
+    scenario = make_scenario(
         cast(Kind, kind),
         truth=not no_truth,
         ekf2=not no_ekf2,
@@ -122,7 +139,7 @@ def simulate(
         contents = {output: flights.to_ulog(simulation)}
     if answer is not None:
         contents[answer] = to_json(flights.answer(simulation)).encode()
-    finish(contents, _page(simulation, answer))
+    write_and_print(contents, _page(simulation, answer))
 
 
 def _check_options(assignment: Path | None) -> None:
@@ -130,25 +147,25 @@ def _check_options(assignment: Path | None) -> None:
     if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR:
         raise SettingsError.of("kind_is_single", outdoor=OUTDOOR, mixed=MIXED)
     for parameter in typed_parameters():
-        if assignment is not None and parameter.name not in OF_ASSIGNMENTS:
+        if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError.of("option_is_single", parameter=parameter)
-        if assignment is None and parameter.name in ONLY_ASSIGNMENTS:
+        if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:
             raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
 
 
 def _read_secret(file: Path | None) -> bytes | None:
-    from px4fuse.assignment.drawing import secret_of
+    from px4fuse.assignment.drawing import encode_secret
 
     if file is None:
         return None
     name = f"--secret-file {file}"
     text = read_text(
-        file, SettingsError, MAX_SECRET_BYTES, name=name, smaller="Give a line of text"
+        file, SettingsError, MAX_SECRET_BYTES, name=name, size_remedy="Give a line of text"
     )
-    return secret_of(text, name)
+    return encode_secret(text, name)
 
 
-def _assign(
+def _write_assignment(
     roster: Path,
     folder: Path,
     answer_path: Path | None,
@@ -161,54 +178,63 @@ def _assign(
 ) -> None:
     """Write a flight for everyone and the answer key, or only say what would be drawn."""
     from px4fuse.assignment import assignment
-    from px4fuse.assignment.drawing import EASIEST, HARDEST
+    from px4fuse.assignment.drawing import EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     from px4fuse.assignment.roster import read_roster
     from px4fuse.report.page import Page
 
     students, page, ends = read_roster(roster), Page(), dict[str, str]()
     key_file = assignment.key_path(folder, answer_path)
-    if key_file.exists() and key_file.samefile(roster):
-        raise OutputError(f"{key_file}: is the roster. Give another name with --answer.")
-    drawn: list[tuple[tuple[str, ...], float | None]]
+    check_targets([key_file])
+    check_output_folder(folder)
+    drawn_flights: list[tuple[tuple[str, ...], float | None]]
     if preview:
-        found = assignment.preview(students, key_file, secret, kind, count)
-        drawn = [(one.typed, one.difficulty) for one in found]
+        previews = assignment.preview(students, key_file, secret, kind, count)
+        drawn_flights = [(one.typed, one.difficulty) for one in previews]
         rows = [
-            (student.student_id, student.name, one.scenario.kind, " ".join(one.typed) or "none",
-             f"{one.difficulty:.2f}")
-            for student, one in zip(students, found, strict=True)
-        ]  # fmt: skip
+            (
+                student.student_id,
+                student.name,
+                one.scenario.kind,
+                " ".join(one.typed) or "none",
+                f"{one.difficulty:.2f}",
+            )
+            for student, one in zip(students, previews, strict=True)
+        ]
         page.table(("student", "name", "flight", "mistakes", "difficulty"), rows, right=(4,))
         ends["Preview"] = (
             "Nothing was written. Not for students: this says what is wrong in every flight."
         )
     else:
         with progress() as step:
-            told = partial(step, "simulating")
+            show_progress = partial(step, "simulating")
             key, written = assignment.assign(
-                students, folder, key_file, secret, kind, count, truth, told
+                students, folder, key_file, secret, kind, count, truth, show_progress
             )
-        drawn = [(answer.mistakes, answer.difficulty) for answer in key.answers]
-        at, key_at = (on_one_line(str(path)) for path in (folder, key_file))
-        there = len(drawn) - written
-        ends["Flights"] = f"{at} ({written} written, {there} were there already)"
+        drawn_flights = [(answer.mistakes, answer.difficulty) for answer in key.answers]
+        at, key_at = (to_one_line(str(path)) for path in (folder, key_file))
+        existing_count = len(drawn_flights) - written
+        ends["Flights"] = f"{at} ({written} written, {existing_count} were there already)"
         ends["Answers"] = f"{key_at} (not for students: it says what is wrong in every flight)"
         if key.secret:
             ends["Secret"] = (
                 "made up, and kept in the answers: the same flights can be made again, and later "
                 "students added, while that file is there"
             )
-    counts = Counter(one.partition("=")[0] for typed, _ in drawn for one in typed or ("none",))
-    difficulties = [difficulty for _, difficulty in drawn if difficulty is not None]
-    page.advice({
-        "Class": f"{len(drawn)} student{'s' * (len(drawn) != 1)}, {kind}",
-        "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
-        "How hard": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
-        f"{EASIEST:g} and {HARDEST:g} for everyone: the smallest size that px4fuse finds in 19 of "
-        "20 flights over the size that was drawn, of the hardest mistake",
-        **ends,
-    })  # fmt: skip
-    finish({}, page)
+    counts = Counter(
+        one.partition("=")[0] for typed, _ in drawn_flights for one in typed or ("none",)
+    )
+    difficulties = [difficulty for _, difficulty in drawn_flights if difficulty is not None]
+    page.advice(
+        {
+            "Class": f"{len(drawn_flights)} student{'s' * (len(drawn_flights) != 1)}, {kind}",
+            "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
+            "How hard": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
+            f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g} for everyone: the smallest size that px4fuse finds in 19 "
+            "of 20 flights over the size that was drawn, of the hardest mistake",
+            **ends,
+        }
+    )
+    write_and_print({}, page)
 
 
 def _page(simulation: Simulation, answer: Path | None) -> Page:
@@ -216,24 +242,28 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     from px4fuse.report.page import Page
 
     scenario, page = simulation.scenario, Page()
-    names = made(simulation.mistakes)
+    names = active_mistakes(simulation.mistakes)
     loop, many = scenario.kind == "loop", scenario.passes > 1
     path = f"{scenario.passes} lap{'s' * many} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
         path = f"{scenario.passes} pass{'es' * many} of {scenario.length_m:g} m"
-    page.advice({
-        "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
-        f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
-        "Position": f"{SOURCES[scenario.kind]}, {scenario.source_sigma_m:g} m at "
-        f"{scenario.source_rate_hz:g} Hz"
-        + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
-        "IMU": f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
-    })  # fmt: skip
-    told = [f"{as_typed(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names]
-    page.labelled("Mistakes", *(told or ["none"]))
+    page.advice(
+        {
+            "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
+            f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
+            "Position": f"{SOURCES[scenario.kind]}, {scenario.source_sigma_m:g} m at "
+            f"{scenario.source_rate_hz:g} Hz"
+            + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
+            "IMU": f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",
+        }
+    )
+    mistake_texts = [
+        f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names
+    ]
+    page.labelled("Mistakes", *(mistake_texts or ["none"]))
     page.labelled("Truth", "in the log" if scenario.truth else "not in the log")
     none = "none: there is nothing of it in the log"
     page.labelled("EKF2", "px4fuse's model of it" if scenario.ekf2 else none)
     if answer is not None:
-        page.labelled("Answer", f"{on_one_line(str(answer))} (not for students)")
+        page.labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
     return page

@@ -5,21 +5,21 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
-from px4fuse.cli.outputs import finish, progress, result_files
+from px4fuse.cli.inputs import InputPath, analysis_options, comparison_request, json_option
+from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @analysis_options
 @json_option
-def sync(log: Path, json_path: Path | None, **given: Any) -> None:
+def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """Estimate what must be added to the position source's time stamps, with its interval.
 
     From the acceleration that the IMU felt; EKF2 and its attitude are not asked. LOG is a PX4 ULog
     or a MAVLink recording.
     """
-    from px4fuse.analysis import run_preparation
+    from px4fuse.analysis import prepare_comparison
     from px4fuse.comparison.estimates import noises_and_clock
     from px4fuse.errors import MissingDataError
     from px4fuse.flight import Unavailable
@@ -27,13 +27,23 @@ def sync(log: Path, json_path: Path | None, **given: Any) -> None:
     from px4fuse.report.page import Page
     from px4fuse.results.build import sync_results
 
-    request = comparison_request(log, given)
+    request = comparison_request(log, option_values)
+    check_targets([json_path])
     with progress(json_path) as step:
-        compared = run_preparation(request, step)
-        _, found = noises_and_clock(compared, step)
-    results = sync_results(request, compared, found)
+        compared = prepare_comparison(request, step)
+        _, clock_result = noises_and_clock(compared, step)
+    advice = clock_advice(compared, clock_result)
+    if isinstance(clock_result, Unavailable) or not clock_result.determinable:
+        name = compared.flight.log.name
+        remedy = (
+            clock_result.remedy
+            if isinstance(clock_result, Unavailable)
+            else advice["Next"].capitalize()
+        )
+        raise MissingDataError(
+            f"{name}: no clock offset could be determined: {clock_result.reason}", remedy
+        )
+    results = sync_results(request, compared, clock_result)
     page = Page()
-    page.advice(clock_advice(compared, found))
-    finish(result_files(results, json_path), page, request)
-    if isinstance(found, Unavailable) or not found.determinable:
-        raise MissingDataError(f"{compared.flight.log.name}: no clock offset could be determined.")
+    page.advice(advice)
+    write_and_print(result_files(results, json_path), page, request)

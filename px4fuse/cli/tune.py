@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import Named, analysis_options, comparison_request, json_option
-from px4fuse.cli.outputs import finish, progress, result_files
+from px4fuse.cli.inputs import InputPath, analysis_options, comparison_request, json_option
+from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.record import Unavailable
 
 if TYPE_CHECKING:
@@ -16,39 +16,48 @@ if TYPE_CHECKING:
     from px4fuse.filter.tuning import AxisTuning, Noise
     from px4fuse.report.page import Page
 
-HEAD = (
-    "axis", "SIGMA_A (m/s²)\nvalue, 95 %", "SIGMA_Z (m)\nvalue, 95 %", "\ngain", "held\nout",
+TUNING_HEAD = (
+    "axis",
+    "SIGMA_A (m/s²)\nvalue, 95 %",
+    "SIGMA_Z (m)\nvalue, 95 %",
+    "\ngain",
+    "held\nout",
     "lag 1\nbefore after",
-)  # fmt: skip
-NOTE = (
+)
+TUNING_NOTE = (
     "gain: log-likelihood per measurement above the chosen settings; held out: the same on "
     "the second half, tuned on the first; lag 1: autocorrelation of the innovations."
 )
 
 
 @click.command()
-@click.argument("log", type=Named())
+@click.argument("log", type=InputPath())
 @analysis_options
 @json_option
-def tune(log: Path, json_path: Path | None, **given: Any) -> None:
+def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """Find the SIGMA_A and SIGMA_Z of greatest likelihood, with their 95 % intervals.
 
     --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
     recording.
     """
-    from px4fuse.analysis import run_preparation
+    from px4fuse.analysis import prepare_comparison
     from px4fuse.comparison.estimates import tuned as tuned_noises
     from px4fuse.errors import MissingDataError
     from px4fuse.results.build import tuning_results
 
-    request = comparison_request(log, given)
+    request = comparison_request(log, option_values)
+    check_targets([json_path])
     with progress(json_path) as step:
-        compared = run_preparation(request, step)
+        compared = prepare_comparison(request, step)
         tuned = tuned_noises(compared, progress=step)
+    missing = [
+        noise_result for noise_result in tuned.values() if isinstance(noise_result, Unavailable)
+    ]
+    if len(missing) == len(tuned):
+        name, reason = compared.flight.log.name, missing[0].reason
+        raise MissingDataError(f"{name}: no noise could be determined: {reason}", missing[0].remedy)
     results = tuning_results(request, compared, tuned)
-    finish(result_files(results, json_path), _page(compared, tuned), request)
-    if all(isinstance(found, Unavailable) for found in tuned.values()):
-        raise MissingDataError(f"{compared.flight.log.name}: no noise could be determined.")
+    write_and_print(result_files(results, json_path), _page(compared, tuned), request)
 
 
 def noise_text(noise: Noise) -> str:
@@ -64,27 +73,29 @@ def noise_text(noise: Noise) -> str:
 
 def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> Page:
     from px4fuse.report.page import Page
-    from px4fuse.report.style import MUTED
-    from px4fuse.report.words import settings_words, tuning_advice
+    from px4fuse.report.style import MUTED_COLOUR
+    from px4fuse.report.words import format_settings, tuning_advice
 
-    page, rows, below = Page(), [], list[str]()
-    for name, found in tuned.items():
-        if isinstance(found, Unavailable):
-            below.append(f"{name}: {found.reason}. {found.remedy}")
+    page, rows, notes = Page(), [], list[str]()
+    for name, tuning in tuned.items():
+        if isinstance(tuning, Unavailable):
+            notes.append(f"{name}: {tuning.reason}. {tuning.remedy}")
             continue
-        held, judged = found.held_out, (found.before, found.after)
+        validation, consistencies = tuning.held_out, (tuning.before, tuning.after)
         lags = [
-            f"{one.lag1_autocorrelation:+.2f}" for one in judged if not isinstance(one, Unavailable)
+            f"{one.lag1_autocorrelation:+.2f}"
+            for one in consistencies
+            if not isinstance(one, Unavailable)
         ]
-        white = " ".join(lags) if len(lags) == len(judged) else ""
-        gain = "" if isinstance(held, Unavailable) else f"{held.gain_nats:+.3f}"
-        noises = [noise_text(noise) for noise in (found.filter_sigma_a, found.sigma_z)]
-        rows.append([name, *noises, f"{found.gain_nats:.3f}", gain, white])
-    page.labelled("Chosen", settings_words(compared.settings))
+        lag_text = " ".join(lags) if len(lags) == len(consistencies) else ""
+        gain = "" if isinstance(validation, Unavailable) else f"{validation.gain_nats:+.3f}"
+        noises = [noise_text(noise) for noise in (tuning.filter_sigma_a, tuning.sigma_z)]
+        rows.append([name, *noises, f"{tuning.gain_nats:.3f}", gain, lag_text])
+    page.labelled("Chosen", format_settings(compared.settings))
     if rows:
-        page.table(HEAD, rows, right=(1, 2, 3, 4, 5))
-        below.append(NOTE)
-    for text in below:
-        page.write(text, colour=MUTED)
+        page.table(TUNING_HEAD, rows, right=(1, 2, 3, 4, 5))
+        notes.append(TUNING_NOTE)
+    for text in notes:
+        page.write(text, colour=MUTED_COLOUR)
     page.advice(tuning_advice(compared, tuned))
     return page

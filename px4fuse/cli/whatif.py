@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("log", type=inputs.Named())
+@click.argument("log", type=inputs.InputPath())
 @inputs.options("whatif", since={"type": inputs.TypedQuantity("s", 60.0)})
 @inputs.flight_options
 @inputs.report_options("A page, and its results beside it.")
@@ -29,7 +29,7 @@ def whatif(
     since: float | None,
     output: Path | None,
     json_path: Path | None,
-    **given: Any,
+    **option_values: Any,
 ) -> None:
     """Replay EKF2 from LOG as flown and with other parameters, side by side.
 
@@ -48,48 +48,48 @@ def whatif(
         raise SettingsError("--from says when --without begins: give that too.")
     request = WhatIfRequest(
         log=str(log),
-        changes=_changes(changes),
-        sweep=None if sweep is None else _sweep(sweep),
+        changes=_parse_changes(changes),
+        sweep=None if sweep is None else _parse_sweep(sweep),
         without=dict.fromkeys(without, since or 0.0),
-        **given,
+        **option_values,
     )
     with outputs.progress(json_path) as step:
-        found = run_what_if(request, step)
-        results = whatif_results(request, found)
-        contents = outputs.result_files(results, json_path, output, found, step)
-    outputs.finish(contents, summary(found))
+        counterfactual = run_what_if(request, step)
+        results = whatif_results(request, counterfactual)
+        contents = outputs.result_files(results, json_path, output, counterfactual, step)
+    outputs.write_and_print(contents, summary(counterfactual))
 
 
-def _changes(given: tuple[str, ...]) -> dict[str, float]:
+def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:
     changes: dict[str, float] = {}
-    for text in given:
+    for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
             raise SettingsError(f"--set {text}: give NAME=VALUE, for example EKF2_EVP_NOISE=0.1.")
         if name in changes:
             raise SettingsError(f"--set {name} is given twice.")
-        changes[name] = _number(f"--set {text}", name, value)
+        changes[name] = _parse_number(f"--set {text}", name, value)
     return changes
 
 
-def _sweep(text: str) -> Sweep:
+def _parse_sweep(text: str) -> Sweep:
     from px4fuse.request import Sweep
 
     name, _, ends = text.partition("=")
-    parts = ends.split(":")
-    if len(parts) not in (2, 3) or (len(parts) == 3 and not parts[2].isdecimal()):
+    limits = ends.split(":")
+    if len(limits) not in (2, 3) or (len(limits) == 3 and not limits[2].isdecimal()):
         raise SettingsError.of("sweep_wrong", text=text)
-    low, high = (_number(f"--sweep {text}", name, part) for part in parts[:2])
-    return Sweep(name, low, high, *map(int, parts[2:]))
+    low, high = (_parse_number(f"--sweep {text}", name, limit) for limit in limits[:2])
+    return Sweep(name, low, high, *map(int, limits[2:]))
 
 
-def _number(typed: str, name: str, value: str) -> float:
+def _parse_number(option_text: str, name: str, value: str) -> float:
     from px4fuse.ekf2_parameters import PARAMETERS
 
     try:
         return float(value)
     except ValueError as error:
         unit = PARAMETERS[name].unit.replace("^2", "²") if name in PARAMETERS else ""
-        meant = in_unit(value, unit)
-        told = " is not a number" if meant is None else f": give {NAMES[unit]}, as {meant:g}"
-        raise SettingsError(f"{typed}: {value!r}{told}.") from error
+        parsed = in_unit(value, unit)
+        problem = " is not a number" if parsed is None else f": give {NAMES[unit]}, as {parsed:g}"
+        raise SettingsError(f"{option_text}: {value!r}{problem}.") from error

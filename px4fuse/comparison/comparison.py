@@ -25,7 +25,7 @@ from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 
 STATE = ("position_m", "velocity_m_s")
 VARIANCES = ("position_variance_m2", "velocity_variance_m2_s2")
@@ -64,43 +64,45 @@ def compare_prepared(
         notes += [f"EKF2 {statement}"] if statement else []
         notes += ekf2.notes
         # where resets are undone, positions of the horizon are in other frames
-        same = state.equals(ekf2.state)
-        ekf2 = ekf2 if same else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
+        is_unchanged = state.equals(ekf2.state)
+        ekf2 = (
+            ekf2 if is_unchanged else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
+        )
     progress(", ".join(line.name for line in prepared.lines))
     axes = {
         line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
         for line in prepared.lines
     }
-    both: dict[FilterName, HorizontalNis | None] = {
-        "kf": _horizontal({name: axis.replay.updates for name, axis in axes.items()}),
-        "ekf2": _horizontal({name: axis.ekf2_innovations for name, axis in axes.items()}),
+    by_filter: dict[FilterName, HorizontalNis | None] = {
+        "kf": _horizontal_nis({name: axis.replay.updates for name, axis in axes.items()}),
+        "ekf2": _horizontal_nis({name: axis.ekf2_innovations for name, axis in axes.items()}),
     }
-    horizontal = {name: nis for name, nis in both.items() if nis is not None}
+    horizontal = {name: nis for name, nis in by_filter.items() if nis is not None}
     return replace(prepared, notes=tuple(notes), axes=axes, horizontal=horizontal)
 
 
-def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -> AxisComparison:
+def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
     """Everything about one axis; ``ekf2`` is the flight's, its resets treated."""
-    axis, segment, flight = run.axis, prepared.segment, prepared.flight
+    axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
     truth = projection.project_truth(flight.truth, axis, segment)
     state: Frame
     variance: Frame
     innovations: Frame
-    apart: Difference | Unavailable
+    axis_difference: Difference | Unavailable
     horizon, gate = None, GATE_SIGMA if isinstance(ekf2, Unavailable) else ekf2.gate
     if isinstance(ekf2, Unavailable):
-        state = variance = innovations = apart = ekf2
+        state = variance = innovations = axis_difference = ekf2
     else:
         state = projection.project(ekf2.state, axis, segment)
         variance = projection.project_variance(ekf2, axis, segment)
         horizon = projection.project_horizon(ekf2, axis, segment)
         innovations = projection.project_innovations(flight, ekf2, prepared.source, axis, segment)
-        apart = difference(run, state)
-    updates = run.updates.assign(
-        prior_variance_m2=run.updates["prior_position_variance_m2"],
-        posterior_variance_m2=run.steps["position_variance_m2"].reindex(run.updates.index),
+        axis_difference = difference(kf_run, state)
+    updates = kf_run.updates.assign(
+        prior_variance_m2=kf_run.updates["prior_position_variance_m2"],
+        posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
     )
-    (north, east, down), rejected = axis.direction.tolist(), _known(innovations, "rejected")
+    (north, east, down), rejected = axis.direction.tolist(), _known_values(innovations, "rejected")
     return AxisComparison(
         heading_deg=axis.heading_deg,
         direction=(north, east, down),
@@ -110,18 +112,20 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
             first_s=float(updates.index[0]),
             last_s=float(updates.index[-1]),
             rate_hz=sample_rate(updates) if len(updates) > 1 else None,
-            input_gap_s=run.input_gap_s,
+            input_gap_s=kf_run.input_gap_s,
         ),
         filters={
-            "kf": _summary(updates, run.steps, kf_against_truth(run, truth, state), GATE_SIGMA),
-            "ekf2": _summary(
-                innovations, variance, against_truth(state, variance, truth, horizon), gate
+            "kf": _summarise_filter(
+                updates, kf_run.steps, kf_error_statistics(kf_run, truth, state), GATE_SIGMA
+            ),
+            "ekf2": _summarise_filter(
+                innovations, variance, error_statistics(state, variance, truth, horizon), gate
             ),
         },
-        difference=apart,
+        difference=axis_difference,
         rejected_share=float(rejected.mean()) if len(rejected) else None,
         axis=axis,
-        replay=run,
+        replay=kf_run,
         ekf2_state=state,
         ekf2_variance=variance,
         ekf2_innovations=innovations,
@@ -129,39 +133,41 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, run: Replay) -
     )
 
 
-def _summary(
+def _summarise_filter(
     innovations: Frame, variance: Frame, truth: AgainstTruth | Unavailable, gate: float
 ) -> FilterSummary | UnjudgedFilter:
     """What a filter did, from its innovations, its variances, and those around each update."""
     sigmas: dict[str, Any] = {
-        name: float(np.sqrt(known.median())) if len(known) else None
-        for name, known in (
-            ("sigma_p_median_m", _known(variance, "position_variance_m2")),
-            ("sigma_v_median_m_s", _known(variance, "velocity_variance_m2_s2")),
-            ("sigma_p_before_update_m", _known(innovations, "prior_variance_m2")),
-            ("sigma_p_after_update_m", _known(innovations, "posterior_variance_m2")),
+        name: float(np.sqrt(values.median())) if len(values) else None
+        for name, values in (
+            ("sigma_p_median_m", _known_values(variance, "position_variance_m2")),
+            ("sigma_v_median_m_s", _known_values(variance, "velocity_variance_m2_s2")),
+            ("sigma_p_before_update_m", _known_values(innovations, "prior_variance_m2")),
+            ("sigma_p_after_update_m", _known_values(innovations, "posterior_variance_m2")),
         )
     }
     if not isinstance(innovations, Unavailable):
         nu, s = innovations["innovation_m"], innovations["innovation_variance_m2"]
-        judged = assess(nu.to_numpy(), s.to_numpy(), gate)
-        if not isinstance(judged, Unavailable):
-            return FilterSummary(**structs.asdict(judged), **sigmas, truth=truth)
-        innovations = judged
+        consistency = assess(nu.to_numpy(), s.to_numpy(), gate)
+        if not isinstance(consistency, Unavailable):
+            return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
+        innovations = consistency
     return UnjudgedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
-def _known(frame: Frame, column: str) -> pd.Series:
+def _known_values(frame: Frame, column: str) -> pd.Series:
     """What is known of a column; nothing of one that is not there."""
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
 def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
     """Our filter minus EKF2 along one axis, at EKF2's own sample times."""
-    apart = np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
-    position, velocity = apart[:, np.isfinite(apart).all(axis=0)]
+    kf_minus_ekf2 = (
+        np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
+    )
+    position, velocity = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
     if len(position) < projection.MIN_COMMON_SAMPLES:
-        return lacking("difference_few", count=len(position))
+        return missing_data("difference_few", count=len(position))
     return Difference(
         count=len(position),
         position_rmse_m=_rmse(position),
@@ -177,17 +183,17 @@ def _rmse(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def kf_against_truth(run: Replay, truth: Frame, beside: Frame) -> AgainstTruth | Unavailable:
+def kf_error_statistics(run: Replay, truth: Frame, ekf2_state: Frame) -> AgainstTruth | Unavailable:
     """Our filter against the truth along one axis, when EKF2 is known beside it or at its steps."""
-    times = (run.steps if isinstance(beside, Unavailable) else beside).index.to_numpy()
+    times = (run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index.to_numpy()
     state, variance = (
-        pd.DataFrame(dict(zip(columns, of(run, times), strict=True)), index=times)
-        for columns, of in ((STATE, state_at), (VARIANCES, variance_at))
+        pd.DataFrame(dict(zip(columns, state_function(run, times), strict=True)), index=times)
+        for columns, state_function in ((STATE, state_at), (VARIANCES, variance_at))
     )
-    return against_truth(state, variance, truth)
+    return error_statistics(state, variance, truth)
 
 
-def against_truth(
+def error_statistics(
     state: Frame, variance: Frame, truth: Frame, horizon: pd.DataFrame | None = None
 ) -> AgainstTruth | Unavailable:
     """A filter against the truth along one axis: its errors, and NEES at its variances' times.
@@ -199,25 +205,25 @@ def against_truth(
         return state
     if isinstance(truth, Unavailable):
         return truth
-    at_s = state.index.to_numpy()
+    time_s = state.index.to_numpy()
     errors = [
-        state[column].to_numpy() - np.interp(at_s, truth.index, truth[column], np.nan, np.nan)
+        state[column].to_numpy() - np.interp(time_s, truth.index, truth[column], np.nan, np.nan)
         for column in STATE
     ]
     position, velocity = (error[np.isfinite(error)] for error in errors)
     if len(position) < projection.MIN_COMMON_SAMPLES:
-        return lacking("truth_not_common")
+        return missing_data("truth_not_common")
     # EKF2's variances are logged at a tenth of the state's rate: NEES at their own times
     nees = {
-        stated: _nees(at_s, error, variance[stated])
-        for stated, error in zip(VARIANCES, errors, strict=True)
+        variance_column: _mean_nees(time_s, error, variance[variance_column])
+        for variance_column, error in zip(VARIANCES, errors, strict=True)
         if not isinstance(variance, Unavailable)
     }
     if horizon is not None:
         true_m = np.interp(horizon.index, truth.index, truth["position_m"], np.nan, np.nan)
         error = horizon["position_m"].to_numpy() - true_m
-        stated = horizon["position_variance_m2"]
-        nees[VARIANCES[0]] = _nees(horizon.index.to_numpy(), error, stated)
+        variance_column = horizon["position_variance_m2"]
+        nees[VARIANCES[0]] = _mean_nees(horizon.index.to_numpy(), error, variance_column)
     return AgainstTruth(
         count=len(position),
         position_rmse_m=_rmse(position),
@@ -227,21 +233,24 @@ def against_truth(
     )
 
 
-def _nees(at_s: Array, error: Array, variance: pd.Series) -> float | None:
-    known = np.isfinite(error)
-    if not known.any():
+def _mean_nees(at_s: Array, error: Array, variance: pd.Series) -> float | None:
+    is_known = np.isfinite(error)
+    if not is_known.any():
         return None
-    there = np.interp(variance.index, at_s[known], error[known], np.nan, np.nan)
-    normalised = np.square(there) / variance.to_numpy()
+    error_at_variance = np.interp(variance.index, at_s[is_known], error[is_known], np.nan, np.nan)
+    normalised = np.square(error_at_variance) / variance.to_numpy()
     return float(np.nanmean(normalised)) if np.isfinite(normalised).any() else None
 
 
-def _horizontal(frames: Mapping[str, Frame]) -> HorizontalNis | None:
+def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     columns = ["innovation_m", "innovation_variance_m2"]
-    pair = [frame[columns] for name in ("north", "east")
-            if isinstance(frame := frames.get(name), pd.DataFrame)]  # fmt: skip
-    if len(pair) < 2:
+    frames_of_axes = [
+        frame[columns]
+        for name in ("north", "east")
+        if isinstance(frame := frames.get(name), pd.DataFrame)
+    ]
+    if len(frames_of_axes) < 2:
         return None
     # only updates that both axes have, at the very same times
-    both = pd.concat(pair, axis=1, join="inner").to_numpy().T
-    return assess_horizontal((both[0], both[1]), (both[2], both[3]))
+    joint = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
+    return assess_horizontal((joint[0], joint[1]), (joint[2], joint[3]))

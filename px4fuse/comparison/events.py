@@ -63,26 +63,27 @@ def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
     rate_hz : float
         Of the source between gaps.
     """
-    long = np.diff(time_s) > longest_s(1.0 / rate_hz)
-    return tuple(zip(time_s[:-1][long].tolist(), time_s[1:][long].tolist(), strict=True))
+    is_gap = np.diff(time_s) > longest_s(1.0 / rate_hz)
+    return tuple(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
 
 
-def happened(comparison: Comparison) -> Events:
+def collect_events(comparison: Comparison) -> Events:
     """Everything that is worth a mark on a time axis."""
     flight, segment = comparison.flight, comparison.segment
     low, high = segment.start_s, segment.end_s
 
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     edges = [low, *(time for span in airborne for time in span), high]
-    known = not isinstance(flight.airborne, Unavailable)
+    is_known = not isinstance(flight.airborne, Unavailable)
     modes = () if isinstance(flight.modes, Unavailable) else flight.modes
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
         gaps=source_gaps(comparison.lines[0].measurement_time_s, comparison.source.rate_hz),
         dropouts=segment.cut(
-            (lost.start_s, lost.start_s + lost.duration_s) for lost in flight.log.dropouts
+            (dropout.start_s, dropout.start_s + dropout.duration_s)
+            for dropout in flight.log.dropouts
         ),
-        ground=segment.cut(zip(edges[::2], edges[1::2], strict=True)) if known else (),
+        ground=segment.cut(zip(edges[::2], edges[1::2], strict=True)) if is_known else (),
         take_off_s=tuple(start for start, _ in airborne if low <= start <= high),
         landing_s=tuple(end for _, end in airborne if low <= end <= high),
         modes=tuple(

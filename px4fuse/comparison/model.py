@@ -6,8 +6,8 @@ from typing import Literal
 
 import pandas as pd
 
-from px4fuse.display import brief
-from px4fuse.errors import MissingDataError, did_you_mean
+from px4fuse.display import one_line_repr
+from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
@@ -15,11 +15,11 @@ from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight import Flight, PositionTrack
 from px4fuse.record import (
     Count,
-    Either,
-    Maybe,
     NotNegative,
+    OrUnavailable,
     Positive,
     Record,
+    RecordOrUnavailable,
     Share,
     Unavailable,
     Vector,
@@ -62,7 +62,7 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
     sigma_v_median_m_s: Positive | None = None
     sigma_p_before_update_m: Positive | None = None
     sigma_p_after_update_m: Positive | None = None
-    truth: Maybe[AgainstTruth]
+    truth: OrUnavailable[AgainstTruth]
 
 
 class UnjudgedFilter(Unavailable, frozen=True, kw_only=True):
@@ -72,7 +72,7 @@ class UnjudgedFilter(Unavailable, frozen=True, kw_only=True):
     sigma_v_median_m_s: Positive | None = None
     sigma_p_before_update_m: Positive | None = None
     sigma_p_after_update_m: Positive | None = None
-    truth: Maybe[AgainstTruth]
+    truth: OrUnavailable[AgainstTruth]
 
 
 class Difference(Record, frozen=True, kw_only=True):
@@ -117,8 +117,8 @@ class AxisResult(Record, frozen=True, kw_only=True):
     direction: Vector
     note: str
     updates: Updates
-    filters: Mapping[FilterName, Either[FilterSummary, UnjudgedFilter]]
-    difference: Maybe[Difference]
+    filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UnjudgedFilter]]
+    difference: OrUnavailable[Difference]
     rejected_share: Share | None = None
 
 
@@ -140,7 +140,7 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
         ``position_m, velocity_m_s`` in the segment.
     """
 
-    written_as = AxisResult
+    schema_type = AxisResult
     axis: Axis
     replay: Replay
     ekf2_state: pd.DataFrame | Unavailable
@@ -148,7 +148,7 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
     ekf2_innovations: pd.DataFrame | Unavailable
     truth: pd.DataFrame | Unavailable
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class Comparison:
     axes: Mapping[str, AxisComparison] = field(default_factory=dict)
     horizontal: Mapping[FilterName, HorizontalNis] = field(default_factory=dict)
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     def __getitem__(self, axis: str) -> AxisComparison:
         """Everything about one axis, by its name.
@@ -198,7 +198,7 @@ class Comparison:
             raise MissingDataError.of(
                 "no_such_axis",
                 axis=axis,
-                near=did_you_mean(axis, self.axes),
+                near=suggest_name(axis, self.axes),
                 known=", ".join(self.axes),
             )
         return self.axes[axis]

@@ -10,22 +10,27 @@ from px4fuse.comparison import say
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
-from px4fuse.errors import MissingDataError, SettingsError, did_you_mean
+from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.origin import GIVEN_FILE, PositionKind
-from px4fuse.plain import capital
+from px4fuse.origin import POSITION_FILE, PositionKind
+from px4fuse.plain import capitalise_first
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
-from px4fuse.readers.px4_innovations import GNSS, GNSS_AND_BAROMETER, fuses, with_gnss
+from px4fuse.readers.px4_innovations import (
+    GNSS,
+    GNSS_AND_BAROMETER,
+    fused_aid,
+    with_gnss_innovations,
+)
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 from px4fuse.request import HeightName
 from px4fuse.trajectory.rotation import interpolate, matrix
 
 # Of the names under which logs have external positions, PX4's topics and MAVLink's messages
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
-NOT_ITS_OWN_TRUTH = lacking("own_truth")
+NOT_ITS_OWN_TRUTH = missing_data("own_truth")
 
 
 # A receiver's height is much noisier than its position, and SIGMA_Z is one number
@@ -94,19 +99,19 @@ def prepare(
     track, reason = choose_source(flight, choices.get("position_source"))
     if kind := choices.get("source_kind"):
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
-    track = _of_vehicle(shift_clock(track, settings.clock_offset_s), flight)
-    track = _by_barometer(track, flight, choices.get("height"))
-    flight = of_source(flight, track)
+    track = _move_to_vehicle(shift_clock(track, settings.clock_offset_s), flight)
+    track = _use_barometer_height(track, flight, choices.get("height"))
+    flight = flight_for_source(flight, track)
     missing = flight.missing
     segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
     names, heading_deg = choices.get("axes"), choices.get("heading_deg")
-    if names is None and track.origin.by_gnss:
+    if names is None and track.origin.fused_as_gnss:
         names = GNSS_AXES
     lines = make_axes(flight, track, segment, names=names, heading_deg=heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
     notes = (*flight.log.notes, *track.notes)
-    if track.origin.by_gnss and not choices.get("sigma_z_given", True):
+    if track.origin.fused_as_gnss and not choices.get("sigma_z_given", True):
         usual_m = PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = observation_variance(flight, track, lines[0], segment, usual_m) ** 0.5
         if sigma_z_m >= SIGMA_Z_RANGE_M[0]:
@@ -121,20 +126,24 @@ def prepare(
     return Comparison(flight, track, reason, segment, settings, lines, notes, missing)
 
 
-def of_source(flight: Flight, track: PositionTrack) -> Flight:
+def flight_for_source(flight: Flight, track: PositionTrack) -> Flight:
     """The flight with EKF2's innovations of GNSS where that is the source, else as it is."""
-    if isinstance(flight.ekf2, Unavailable) or not track.origin.by_gnss:
+    if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
     # what the log lacks of another source is no lack here
-    of_vision, streams = _lacking(flight.ekf2), dict(flight.streams)
-    ekf2 = with_gnss(flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER)
-    missing = tuple(part for part in flight.missing if not part.source and part not in of_vision)
+    missing_of_vision, streams = _missing_of_vision(flight.ekf2), dict(flight.streams)
+    ekf2 = with_gnss_innovations(
+        flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
+    )
+    missing = tuple(
+        part for part in flight.missing if not part.source and part not in missing_of_vision
+    )
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
-    return replace(flight, ekf2=ekf2, streams=streams, missing=missing + _lacking(ekf2))
+    return replace(flight, ekf2=ekf2, streams=streams, missing=missing + _missing_of_vision(ekf2))
 
 
-def _lacking(ekf2: Ekf2) -> tuple[Unavailable, ...]:
+def _missing_of_vision(ekf2: Ekf2) -> tuple[Unavailable, ...]:
     """Innovations that are not there, each with the reason."""
     return tuple(part for part in ekf2.innovations.values() if isinstance(part, Unavailable))
 
@@ -161,10 +170,10 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     """
     if name is None:
         for track in flight.positions:
-            if track.origin.automatic:
-                return track, _why_best(flight, track)
-        lacking = no_source(flight)
-        raise MissingDataError(f"{flight.log.name}: {lacking.reason}", lacking.remedy)
+            if track.origin.is_automatic:
+                return track, _reason_for_choice(flight, track)
+        no_track = explain_missing_source(flight)
+        raise MissingDataError(f"{flight.log.name}: {no_track.reason}", no_track.remedy)
     for track in flight.positions:
         if track.name == name:
             return track, "chosen with --position-source"
@@ -172,53 +181,61 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     reasons = {missing.source: missing.reason for missing in flight.missing}
     raise MissingDataError(
         f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
-        f"{did_you_mean(name, names)}This log has: {', '.join(names) or 'none'}.",
+        f"{suggest_name(name, names)}This log has: {', '.join(names) or 'none'}.",
     )
 
 
-def _of_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
+def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
     """The positions of the vehicle, where EKF2 is told that the sensor is not at its origin."""
     attitude = flight.attitude
-    if not any(track.place_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
+    if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
-    known = attitude.index.to_numpy(), attitude[Columns.QUATERNION].to_numpy()
-    turned = matrix(interpolate(track.samples.index.to_numpy(), *known)) @ np.asarray(track.place_m)
+    attitude_samples = attitude.index.to_numpy(), attitude[Columns.QUATERNION].to_numpy()
+    lever_arm_ned = matrix(
+        interpolate(track.samples.index.to_numpy(), *attitude_samples)
+    ) @ np.asarray(track.lever_arm_m)
     samples = track.samples.copy()
-    samples[Columns.POSITION] -= turned
-    forward, right, down = track.place_m
+    samples[Columns.POSITION] -= lever_arm_ned
+    forward, right, down = track.lever_arm_m
     note = say("of_vehicle", forward=forward, right=right, down=down)
     return replace(track, samples=samples, notes=(*track.notes, note))
 
 
-def _by_barometer(track: PositionTrack, flight: Flight, asked: HeightName | None) -> PositionTrack:
+def _use_barometer_height(
+    track: PositionTrack, flight: Flight, height_name: HeightName | None
+) -> PositionTrack:
     """The track with the barometer for its height, where that is asked for or what EKF2 fused.
 
     A barometer has no zero: it is put where EKF2's is.
     """
     ekf2, heights, name = flight.ekf2, flight.barometer, flight.log.name
-    if asked and not track.origin.by_gnss:
+    if height_name and not track.origin.fused_as_gnss:
         raise SettingsError(f"{name}: `height` is for GNSS, and the position is {track.name}.")
-    of_ekf2 = fuses(ekf2, BAROMETER.name) and not fuses(ekf2, GNSS.vertical)
-    wanted = asked == "barometer" or (asked is None and track.origin.by_gnss and of_ekf2)
-    if not wanted or heights is None:
-        if asked == "barometer":
+    is_fused_by_ekf2 = fused_aid(ekf2, BAROMETER.name) and not fused_aid(ekf2, GNSS.vertical)
+    uses_barometer = height_name == "barometer" or (
+        height_name is None and track.origin.fused_as_gnss and is_fused_by_ekf2
+    )
+    if not uses_barometer or heights is None:
+        if height_name == "barometer":
             raise MissingDataError(f"{name}: no height by a barometer.", GNSS.to_log)
         return track
-    zero, whence = heights["down_m"].iloc[0], "its first height"
+    zero_m, zero_text = heights["down_m"].iloc[0], "its first height"
     if isinstance(ekf2, Ekf2):
         down = np.interp(heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan)
-        apart = float(np.nanmedian(heights["down_m"] - down)) if np.isfinite(down).any() else zero
-        zero, whence = apart, "where it is EKF2's in the median"
-    note = f"down is by the barometer, from {whence}"
+        offset_m = (
+            float(np.nanmedian(heights["down_m"] - down)) if np.isfinite(down).any() else zero_m
+        )
+        zero_m, zero_text = offset_m, "where it is EKF2's in the median"
+    note = f"down is by the barometer, from {zero_text}"
     description = f"{track.description}, height by the barometer"
     notes = (*track.notes, note)
-    return replace(track, barometer=heights - zero, description=description, notes=notes)
+    return replace(track, barometer=heights - zero_m, description=description, notes=notes)
 
 
-def no_source(flight: Flight) -> Unavailable:
+def explain_missing_source(flight: Flight) -> Unavailable:
     """Why no track of a flight is a position source by itself, and what would be one."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
-    unused = next((track.name for track in flight.positions if not track.origin.automatic), "")
+    unused = next((track.name for track in flight.positions if not track.origin.is_automatic), "")
     looked_for = "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
     remedy = say("send_positions")
     if flight.log.format.startswith("MAVLink"):
@@ -228,36 +245,36 @@ def no_source(flight: Flight) -> Unavailable:
     if unused:
         remedy = say("gps_alone", unused=unused, remedy=remedy)
     reason = f"{damaged}no external position in this log ({looked_for})"
-    return Unavailable("position source", reason, capital(remedy))
+    return Unavailable("position source", reason, capitalise_first(remedy))
 
 
-def _why_best(flight: Flight, track: PositionTrack) -> str:
-    if track.origin == GIVEN_FILE:
+def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
+    if track.origin == POSITION_FILE:
         return "given with --position"
-    if track.origin.by_gnss:
+    if track.origin.fused_as_gnss:
         return "what EKF2 fused; no other position is in the log"
-    whence = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    lacking = [
+    origin_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
+    better_sources = [
         part.source
         for part in flight.missing
         if part.source in LOGGED_ORIGINS
         and LOGGED_ORIGINS[part.source].preference < track.origin.preference
     ]
-    if not lacking:
-        return f"the best source: logged as it arrived{whence}"
-    return f"the best that this log has{whence}; no usable {', '.join(lacking)}"
+    if not better_sources:
+        return f"the best source: logged as it arrived{origin_text}"
+    return f"the best that this log has{origin_text}; no usable {', '.join(better_sources)}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
     """The same track with ``clock_offset_s`` added to its time stamps."""
     if clock_offset_s == 0.0:
         return track
-    moved = {
+    shifted_frames = {
         name: frame.set_axis(frame.index + clock_offset_s)
         for name in ("samples", "orientation", "velocity")
         if (frame := getattr(track, name)) is not None
     }
-    return replace(track, **moved)
+    return replace(track, **shifted_frames)
 
 
 def choose_segment(
@@ -291,11 +308,11 @@ def choose_segment(
     if start_s is not None or end_s is not None:
         low, high = low if start_s is None else start_s, high if end_s is None else end_s
         ends = {"--start": start_s, "--end": end_s}
-        given = [text for text, value in ends.items() if value is not None]
-        reason = f"chosen with {' and '.join(given)}"
-        inside = max(low, 0.0), min(high, flight.log.duration_s)
-        if inside != (low, high) and inside[0] < inside[1]:
-            low, high = inside
+        option_names = [text for text, value in ends.items() if value is not None]
+        reason = f"chosen with {' and '.join(option_names)}"
+        clipped = max(low, 0.0), min(high, flight.log.duration_s)
+        if clipped != (low, high) and clipped[0] < clipped[1]:
+            low, high = clipped
             reason += ", cut at the ends of the data"
     if not low < high:
         raise SettingsError.of(
@@ -305,7 +322,11 @@ def choose_segment(
     count = len(within(track.samples, segment))
     if count < MIN_MEASUREMENTS:
         raise SettingsError.of(
-            "segment_short", log=flight.log.name, count=count, track=track, segment=segment,
+            "segment_short",
+            log=flight.log.name,
+            count=count,
+            track=track,
+            segment=segment,
             least=MIN_MEASUREMENTS,
-        )  # fmt: skip
+        )
     return segment

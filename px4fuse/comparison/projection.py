@@ -20,7 +20,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 
 # EKF2 never trusts external vision better than this (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
@@ -28,7 +28,7 @@ EKF2_MIN_NOISE_M = 0.01
 GNSS_HEIGHT_SCALE = 1.5
 MIN_COMMON_SAMPLES = 3
 # What is projected along an axis, from which columns, and by which power of its direction
-PROJECTED: Mapping[str, tuple[list[str], int]] = {
+PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_m": (Columns.POSITION, 1),
     "velocity_m_s": (Columns.VELOCITY, 1),
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
@@ -36,7 +36,7 @@ PROJECTED: Mapping[str, tuple[list[str], int]] = {
 }
 # Undoing resets must bring EKF2 this much closer to the measurements (median squared distance);
 # below that the published output, which the vehicle flew on, stands.
-CLEARLY_CLOSER = 0.95
+MAX_DISTANCE_RATIO = 0.95
 
 
 def continuous_state(
@@ -56,10 +56,10 @@ def continuous_state(
     statement : str
         What was done, empty where there was no reset in the segment.
     """
-    inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
-    state = ekf2.state.copy() if inside else ekf2.state
-    kept: list[str] = []
-    undone: list[str] = []
+    resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
+    state = ekf2.state.copy() if resets_inside else ekf2.state
+    kept_resets: list[str] = []
+    undone_resets: list[str] = []
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -67,26 +67,33 @@ def continuous_state(
     ):
         axes = [Columns.STATE.index(column) % 3 for column in columns]
         resets = [
-            r for r in inside if r.quantity == quantity and any(r.delta[axis] for axis in axes)
+            r
+            for r in resets_inside
+            if r.quantity == quantity and any(r.delta[axis] for axis in axes)
         ]
         if not resets:
             continue
-        said = kept
+        reset_texts = kept_resets
         if quantity == "position":  # a velocity has no frame origin to lose
             samples = within(track.samples, segment)[columns].dropna()
-            best = min(_undone(ekf2.state[columns], resets, axes), key=partial(_distance, samples))
-            if _distance(samples, best) < CLEARLY_CLOSER * _distance(samples, ekf2.state):
-                state[columns], said = best, undone
-        said.append(f"{len(resets)} of {label}")
+            best_state = min(
+                _continuous_candidates(ekf2.state[columns], resets, axes),
+                key=partial(_median_square_distance, samples),
+            )
+            if _median_square_distance(
+                samples, best_state
+            ) < MAX_DISTANCE_RATIO * _median_square_distance(samples, ekf2.state):
+                state[columns], reset_texts = best_state, undone_resets
+        reset_texts.append(f"{len(resets)} of {label}")
     statements = []
-    if undone:
-        statements.append(f"resets undone: {', '.join(undone)} (they change the frame)")
-    if kept:
-        statements.append(f"resets kept: {', '.join(kept)} (they correct an error)")
+    if undone_resets:
+        statements.append(f"resets undone: {', '.join(undone_resets)} (they change the frame)")
+    if kept_resets:
+        statements.append(f"resets kept: {', '.join(kept_resets)} (they correct an error)")
     return state, "; ".join(statements)
 
 
-def _undone(
+def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
     """Continuous position, in the frame of each stretch between resets."""
@@ -98,7 +105,7 @@ def _undone(
         yield published + shift
 
 
-def _distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
+def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
     """Median squared distance of the state from samples."""
     squared = np.zeros(len(samples))
     for column in samples:
@@ -107,11 +114,13 @@ def _distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
 
 
 def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
-    """What a frame holds of :data:`PROJECTED` along the axis, within the segment."""
-    cut = within(frame, segment)
-    known = {name: part for name, part in PROJECTED.items() if part[0][0] in frame}
-    made = {name: along(cut, of, axis.direction**power) for name, (of, power) in known.items()}
-    return pd.DataFrame(made, index=cut.index)
+    """What a frame holds of :data:`PROJECTED_COLUMNS` along the axis, within the segment."""
+    rows = within(frame, segment)
+    available = {name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame}
+    projected = {
+        name: along(rows, of, axis.direction**power) for name, (of, power) in available.items()
+    }
+    return pd.DataFrame(projected, index=rows.index)
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
@@ -120,7 +129,7 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
     if projected.empty:
-        return lacking("variances_outside_segment")
+        return missing_data("variances_outside_segment")
     return projected
 
 
@@ -137,10 +146,12 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
     if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
         samples = within(aid.samples, segment)
         position, variance = (
-            sum(weights[name] ** power * (samples[f"{a}_{name}"] - samples[f"{b}_{name}"])
-                for name in aid.axes)
+            sum(
+                weights[name] ** power * (samples[f"{a}_{name}"] - samples[f"{b}_{name}"])
+                for name in aid.axes
+            )
             for power, a, b in ((1, "observation", "innovation"), (2, "variance", "noise"))
-        )  # fmt: skip
+        )
         found = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
         return found[found["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
@@ -159,26 +170,26 @@ def project_innovations(
     ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
     """
     if track.aid(axis.name) is None:
-        return lacking("innovations_of_another", name=track.name)
+        return missing_data("innovations_of_another", name=track.name)
     frames = []
     for name in ("north", "east") if axis.name == AISLE else (axis.name,):
         frame = next(frame for key, frame in ekf2.innovations.items() if key == name)
         if isinstance(frame, Unavailable):
             return frame
         frames.append(frame)
-    cut = within(frames[0], segment).copy()
+    rows = within(frames[0], segment).copy()
     if axis.name == AISLE:
-        cut = _innovations_along(cut, frames[1], axis.direction)
-    if cut.empty:
-        return lacking("innovations_outside_segment")
-    r = cut["observation_variance_m2"].fillna(observation_variance(flight, track, axis, segment))
-    s_total = cut["innovation_variance_m2"]
+        rows = _innovations_along(rows, frames[1], axis.direction)
+    if rows.empty:
+        return missing_data("innovations_outside_segment")
+    r = rows["observation_variance_m2"].fillna(observation_variance(flight, track, axis, segment))
+    s_total = rows["innovation_variance_m2"]
     prior = (s_total - r).where(s_total > r)
-    cut["observation_variance_m2"] = r
-    cut["prior_variance_m2"] = prior
+    rows["observation_variance_m2"] = r
+    rows["prior_variance_m2"] = prior
     # a rejected sample updates nothing
-    cut["posterior_variance_m2"] = (prior * r / s_total).where(~(cut["rejected"] > 0), prior)
-    return cut
+    rows["posterior_variance_m2"] = (prior * r / s_total).where(~(rows["rejected"] > 0), prior)
+    return rows
 
 
 def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array) -> pd.DataFrame:
@@ -199,11 +210,11 @@ def observation_variance(
     track: PositionTrack,
     axis: Axis,
     segment: Segment,
-    usual_m: float = math.nan,
+    default_noise_m: float = math.nan,
 ) -> float:
     """R (m²) that EKF2 used for the source where it does not log it, NaN if unknown.
 
-    ``usual_m`` is taken for EKF2's own noise where the parameter is not in the log.
+    ``default_noise_m`` is taken for EKF2's own noise where the parameter is not in the log.
 
     R = EKF2_EVP_NOISE², or the sender's variance if larger, unless EKF2_EV_NOISE_MD is 1
     (EKF2.cpp, ev_pos_control.cpp); of GNSS EKF2_GPS_P_NOISE², half as much again in σ for height,
@@ -213,14 +224,14 @@ def observation_variance(
     aid, parameters, ekf2 = track.aid(axis.name), flight.log.parameters, flight.ekf2
     if aid is not None and isinstance(ekf2, Ekf2) and aid.name in ekf2.aids:
         parameters = {**parameters, **ekf2.aids[aid.name].parameters}
-    noise_m = usual_m if aid is None else parameters.get(aid.noise, usual_m)
+    noise_m = default_noise_m if aid is None else parameters.get(aid.noise, default_noise_m)
     if aid is None or math.isnan(noise_m):
         return math.nan
     scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
     r = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
     # what a file of its own reports is not what EKF2 was sent
-    theirs = track.alignment is not None or aid == BAROMETER
-    if theirs or parameters.get(aid.noise_mode) == 1.0:
+    ignores_reported = track.alignment is not None or aid == BAROMETER
+    if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
         return r
     reported = within(track.samples, segment)[Columns.POSITION_VARIANCE].median()
     reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))
@@ -235,5 +246,5 @@ def project_truth(
         return truth
     projected = project(truth.samples, axis, segment)
     if len(projected) < MIN_COMMON_SAMPLES:
-        return lacking("truth_outside_segment", name=truth.name)
+        return missing_data("truth_outside_segment", name=truth.name)
     return projected

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from px4fuse.comparison import say
-from px4fuse.comparison.comparison import kf_against_truth
-from px4fuse.comparison.estimates import Tuning, known_noises
+from px4fuse.comparison.comparison import kf_error_statistics
+from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.ekf2.inputs import Inputs
@@ -26,30 +26,30 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, make_axes
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capital
+from px4fuse.plain import capitalise_first
 from px4fuse.request import OPTIONS
 
 # EKF2 takes R from the sender where that is more than this many times EKF2_EVP_NOISE
-REPORTED_TIMES = 1.25
+MIN_REPORTED_RATIO = 1.25
 # One prediction of EKF2 (EKF2_PREDICT_US), and what a message takes to arrive
 UPDATE_MS, ARRIVAL_MS = 10.0, 30.0
 DELAY_STEP_MS = 50.0
 # How a remedy to type is written; who prints it knows the log (px4fuse.report.commands)
 COMMAND = "px4fuse compare LOG"
 # A noise must bring |log mean NIS| below this share of itself: what does less is not its cause
-NIS_NEARER = 0.8
+MAX_LOG_NIS_RATIO = 0.8
 # Half of the rejections are an effect, not a single sample
-REJECTED_FEWER = 0.5
+MAX_REJECTED_RATIO = 0.5
 # Times of the error to the truth that are no accident: errors last for seconds, so that a flight of
 # two minutes has some fifty that are independent, which tell their root mean square to a tenth
-WORSE_ERROR = 1.10
+MAX_ERROR_RATIO = 1.10
 # The same of our filter, which is replayed exactly: hardly a settings changes it by less
-WORSE_FILTER_ERROR = 1.005
+MAX_KF_ERROR_RATIO = 1.005
 # Shares of rejected samples below this are not worth a word
 REJECTED_SHOWN = 0.005
 
 
-def asked_of_ekf2(
+def ml_ekf2_parameters(
     comparison: Comparison,
     model: Model,
     tuning: Tuning,
@@ -73,24 +73,27 @@ def asked_of_ekf2(
         that may drift, or of GNSS, only where EKF2 trusts it even more than its short-term noise
         allows: small innovations against such a source say nothing about its error.
     """
-    if not fused(comparison, model.inputs):
+    if not is_fused_source(comparison, model.inputs):
         return {}
     changes: dict[str, float] = {}
-    tuned, used_m = known_noises(tuning, HORIZONTAL, AISLE, "north", "east"), noise_used_m(model)
-    noise_m = None if tuned is None else tuned.sigma_z.value
-    slow = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
-    if noise_m is not None and not (slow and noise_m <= used_m):
+    axis_tuning, used_m = (
+        first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east"),
+        noise_used_m(model),
+    )
+    noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
+    has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
+    if noise_m is not None and not (has_slow_errors and noise_m <= used_m):
         changes |= noise_change(model.inputs.aid, model.inputs.settings, used_m, noise_m)
-    return changes | delay_asked(comparison, model.inputs, clock)
+    return changes | ml_delay_change(comparison, model.inputs, clock)
 
 
-def fused(comparison: Comparison, inputs: Inputs) -> bool:
+def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
     """Whether EKF2 fused what was analysed."""
     source = comparison.source
     return source.name == inputs.received.source and source.alignment is None
 
 
-def delay_asked(
+def ml_delay_change(
     comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
     """EKF2's delay as the data ask for it; empty where they do not tell, or it is as flown."""
@@ -117,7 +120,7 @@ def delay_ms(comparison: Comparison) -> float | None:
     if source.origin.aid is None:
         return None
     found = comparison.flight.log.parameters.get(source.origin.aid.delay)
-    return None if source.origin.by_gnss and source.age_s == 0.0 != found else found
+    return None if source.origin.fused_as_gnss and source.age_s == 0.0 != found else found
 
 
 def noise_change(
@@ -128,9 +131,9 @@ def noise_change(
     Two digits, within PX4's range; ``settings`` and ``used_m`` are what it took.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
-    reported = used_m > REPORTED_TIMES * settings.get(aid.noise, math.inf)
+    is_reported = used_m > MIN_REPORTED_RATIO * settings.get(aid.noise, math.inf)
     may_differ = aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0
-    if may_differ and reported and noise_m < used_m:
+    if may_differ and is_reported and noise_m < used_m:
         changes[aid.noise_mode] = 1.0
     return changes
 
@@ -158,27 +161,29 @@ def noise_used_m(model: Model) -> float:
     return float(np.sqrt(np.median(updates[columns].to_numpy())))
 
 
-def effect_words(before: Summary, after: Summary) -> str:
+def format_whatif_effect(before: Summary, after: Summary) -> str:
     """What a change of EKF2's parameters does, in numbers, by replays without it and with it."""
-    parts = []
+    texts = []
     if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN:
-        parts.append(f"rejected {before.rejected_share:.0%} → {after.rejected_share:.0%}")
-    parts.append(f"mean NIS {_short(before.nis_mean)} → {_short(after.nis_mean)}")
-    flown, changed = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
-    if isinstance(flown, Unavailable):
-        parts.append(f"innovations {_std(before):.3f} → {_std(after):.3f} m rms, no truth")
+        texts.append(f"rejected {before.rejected_share:.0%} → {after.rejected_share:.0%}")
+    texts.append(f"mean NIS {_format_nis(before.nis_mean)} → {_format_nis(after.nis_mean)}")
+    flown_rmse, changed_rmse = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
+    if isinstance(flown_rmse, Unavailable):
+        texts.append(
+            f"innovations {_innovation_std_m(before):.3f} → {_innovation_std_m(after):.3f} m rms, no truth"
+        )
     else:
-        parts.append(f"position error {flown:.2f} → {changed:.2f} m")
-    return f"{', '.join(parts)} (replayed)"
+        texts.append(f"position error {flown_rmse:.2f} → {changed_rmse:.2f} m")
+    return f"{', '.join(texts)} (replayed)"
 
 
-def remedy_words(
+def format_ekf2_remedy(
     model: Model | Unavailable,
     changes: Mapping[str, float],
     helps: Callable[[Summary, Summary], bool],
     *,
     why: str = "",
-    otherwise: str,
+    fallback_remedy: str,
 ) -> str:
     """A change of EKF2's parameters in words, as a remedy where no replay denies it.
 
@@ -191,22 +196,24 @@ def remedy_words(
         From EKF2 as flown and as changed to whether that is a remedy.
     why : str
         Words before it: what the data ask for.
-    otherwise : str
+    fallback_remedy : str
         What to do where the replay says that it is none.
     """
-    setting = f"{why}set {settings_words(changes)}"
-    found = model if isinstance(model, Unavailable) else what_if(model, [changes])
-    if isinstance(found, Unavailable):
-        return f"{capital(setting)}. {not_replayed(found)}"
-    before, (after,) = found.replayed, found.whatif
+    setting = f"{why}set {format_settings(changes)}"
+    replays = model if isinstance(model, Unavailable) else what_if(model, [changes])
+    if isinstance(replays, Unavailable):
+        return f"{capitalise_first(setting)}. {format_not_replayed(replays)}"
+    before, (after,) = replays.replayed, replays.whatif
     if not after.steady:
-        said = settings_words(changes)
-        return f"{otherwise} What {said} would do is chaotic: single rejections decide."
-    effect = effect_words(before, after)
+        settings_text = format_settings(changes)
+        return (
+            f"{fallback_remedy} What {settings_text} would do is chaotic: single rejections decide."
+        )
+    effect = format_whatif_effect(before, after)
     if helps(before, after):
-        return f"{capital(setting)}: {effect}."
-    said = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
-    return f"{otherwise} {said} is no remedy: {effect}."
+        return f"{capitalise_first(setting)}: {effect}."
+    settings_text = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
+    return f"{fallback_remedy} {settings_text} is no remedy: {effect}."
 
 
 def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, float] | None:
@@ -221,13 +228,16 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     results = [comparison.axes[name] for name in names]
     later_s = changed.clock_offset_s - comparison.settings.clock_offset_s
     lines = make_axes(
-        comparison.flight, shift_clock(comparison.source, later_s), comparison.segment, names=names,
+        comparison.flight,
+        shift_clock(comparison.source, later_s),
+        comparison.segment,
+        names=names,
         heading_deg=results[0].heading_deg,
-    )  # fmt: skip
+    )
     errors_m: list[tuple[float, float]] = []
     for result, line in zip(results, lines, strict=True):
-        run, before = quick_replay(line, changed), result.filters["kf"].truth
-        after = kf_against_truth(run, result.truth, result.ekf2_state)
+        kf_run, before = quick_replay(line, changed), result.filters["kf"].truth
+        after = kf_error_statistics(kf_run, result.truth, result.ekf2_state)
         if isinstance(before, Unavailable) or isinstance(after, Unavailable):
             return None
         errors_m.append((before.position_rmse_m, after.position_rmse_m))
@@ -235,10 +245,10 @@ def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, f
     return math.hypot(*before_m), math.hypot(*after_m)
 
 
-def filter_words(
+def format_kf_remedy(
     comparison: Comparison,
     changes: Mapping[str, float],
-    more: str = "",
+    suffix: str = "",
     unseen_nats: float | None = None,
 ) -> str:
     """Other settings of our filter as a remedy, as far as truth or unseen data confirm it.
@@ -248,14 +258,19 @@ def filter_words(
     comparison : Comparison
     changes : mapping from field of Settings to value
         Rounded to three digits.
-    more : str
+    suffix : str
         Words behind the options that make them.
     unseen_nats : float or None
         What settings found on one half gain per measurement of the other; None where not known.
     """
-    rounded: dict[str, Any] = {name: float(f"{value:.3g}") for name, value in changes.items()}
-    typed = " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded.items()) + more
-    changed = replace(comparison.settings, **rounded)
+    rounded_settings: dict[str, Any] = {
+        name: float(f"{value:.3g}") for name, value in changes.items()
+    }
+    typed = (
+        " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded_settings.items())
+        + suffix
+    )
+    changed = replace(comparison.settings, **rounded_settings)
     errors = filter_errors_m(comparison, changed)
     if errors is None:
         if unseen_nats is not None and unseen_nats <= 0.0:
@@ -263,51 +278,58 @@ def filter_words(
         return f"{COMMAND} {typed}."
     before, after = errors
     effect = f"position error {before:.3f} → {after:.3f} m (replayed)"
-    if after > WORSE_FILTER_ERROR * before:
+    if after > MAX_KF_ERROR_RATIO * before:
         return f"Leave it: {typed} fits the innovations better, but not the truth: {effect}."
     return f"{COMMAND} {typed}: {effect}."
 
 
-def not_replayed(why: Unavailable) -> str:
+def format_not_replayed(why: Unavailable) -> str:
     """That a remedy was not tried, and why."""
     return f"Not replayed: {why.reason}."
 
 
-def settings_words(changes: Mapping[str, float]) -> str:
+def format_settings(changes: Mapping[str, float]) -> str:
     """Parameters and the values to set."""
-    said = (f"{name} to {value:.3g} {PARAMETERS[name].unit}" for name, value in changes.items())
-    return " and ".join(map(str.rstrip, said))
+    texts = (f"{name} to {value:.3g} {PARAMETERS[name].unit}" for name, value in changes.items())
+    return " and ".join(map(str.rstrip, texts))
 
 
 def noise_helps(before: Summary, after: Summary) -> bool:
     """Whether another noise brings the mean NIS nearer to 1, and neither rejects nor errs more."""
-    nearer = abs(math.log(after.nis_mean)) < NIS_NEARER * abs(math.log(before.nis_mean))
-    more = after.rejected_share > before.rejected_share or _errs_more(before, after, WORSE_ERROR)
-    return nearer and not more
+    is_nearer = abs(math.log(after.nis_mean)) < MAX_LOG_NIS_RATIO * abs(math.log(before.nis_mean))
+    is_worse = after.rejected_share > before.rejected_share or _increases_error(
+        before, after, MAX_ERROR_RATIO
+    )
+    return is_nearer and not is_worse
 
 
 def rejects_less(before: Summary, after: Summary) -> bool:
     """Whether far fewer samples are rejected, and the position is not worse."""
-    fewer = after.rejected_share < REJECTED_FEWER * before.rejected_share
-    return fewer and not _errs_more(before, after, WORSE_ERROR)
+    rejects_fewer = after.rejected_share < MAX_REJECTED_RATIO * before.rejected_share
+    return rejects_fewer and not _increases_error(before, after, MAX_ERROR_RATIO)
 
 
 def delay_helps(before: Summary, after: Summary) -> bool:
     """Whether the innovations become smaller, and the error to the truth where there is one."""
-    smaller = _std(after) < _std(before) and after.rejected_share <= before.rejected_share
-    return smaller and not _errs_more(before, after, 1.0)
+    is_smaller = (
+        _innovation_std_m(after) < _innovation_std_m(before)
+        and after.rejected_share <= before.rejected_share
+    )
+    return is_smaller and not _increases_error(before, after, 1.0)
 
 
-def _errs_more(before: Summary, after: Summary, times: float) -> bool:
+def _increases_error(before: Summary, after: Summary, factor: float) -> bool:
     """Whether the error to the truth becomes so many times what it was; not where none is known."""
-    error, flown = after.position_rmse_to_truth_m, before.position_rmse_to_truth_m
-    return isinstance(error, float) and isinstance(flown, float) and error > times * flown
+    error, flown_error = after.position_rmse_to_truth_m, before.position_rmse_to_truth_m
+    return (
+        isinstance(error, float) and isinstance(flown_error, float) and error > factor * flown_error
+    )
 
 
-def _std(summary: Summary) -> float:
+def _innovation_std_m(summary: Summary) -> float:
     """Standard deviation of the innovations per axis (m)."""
     return math.sqrt(np.mean([axis.innovation_std_m**2 for axis in summary.axes.values()]))
 
 
-def _short(nis: float) -> str:
+def _format_nis(nis: float) -> str:
     return f"{nis:.0f}" if nis >= 9.95 else f"{nis:.1f}" if nis >= 0.095 else f"{nis:.2g}"

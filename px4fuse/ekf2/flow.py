@@ -14,12 +14,12 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2.magnetometer import Samples, fuse_mean
-from px4fuse.ekf2.stretches import VELOCITY, Sensed, Stretch, low_passed
+from px4fuse.ekf2.magnetometer import EventSamples, fuse_mean
+from px4fuse.ekf2.stretches import VELOCITY, SensorSamples, Stretch, low_passed
 from px4fuse.flight import FLOW_SHARE
 
 
-def with_flow(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stretch:
+def add_flow_samples(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stretch:
     """The same stretch with what of the flow lies in it.
 
     Parameters
@@ -35,12 +35,18 @@ def with_flow(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stretch:
     count, interval_s = flow["samples"].to_numpy(), flow["interval_s"].to_numpy()
     step, weight = low_passed(stretch, flow.index.to_numpy(), count, interval_s, FLOW_SHARE)
     turn = stretch.rotation[step].swapaxes(2, 3)[:, :, :2]
-    gained = np.einsum("ki,kiab,kib->ka", weight, turn, stretch.gained_m_s[step])
-    speed, mean = flow[["forward_m_s", "right_m_s"]], np.einsum("ki,kiab->kab", weight, turn)
-    sensed = step[:, 0], speed.to_numpy() - gained, mean, count, flow["noise_m2_s2"].to_numpy()
-    return replace(stretch, flow=Sensed(*sensed, gate))
+    imu_gain = np.einsum("ki,kiab,kib->ka", weight, turn, stretch.gained_m_s[step])
+    velocity, mean = flow[["forward_m_s", "right_m_s"]], np.einsum("ki,kiab->kab", weight, turn)
+    sample_fields = (
+        step[:, 0],
+        velocity.to_numpy() - imu_gain,
+        mean,
+        count,
+        flow["noise_m2_s2"].to_numpy(),
+    )
+    return replace(stretch, flow=SensorSamples(*sample_fields, gate))
 
 
-def fuse_flow(x: Array, P: Array, told: Samples, gate: float) -> tuple[Array, Array]:
+def fuse_flow(x: Array, P: Array, flow_samples: EventSamples, gate: float) -> tuple[Array, Array]:
     """State and covariance of S variants after the flow of one event."""
-    return fuse_mean(x, P, told, told.noise, np.full(len(x), gate), VELOCITY)[:2]
+    return fuse_mean(x, P, flow_samples, flow_samples.noise, np.full(len(x), gate), VELOCITY)[:2]

@@ -15,10 +15,16 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.bias import Bias
-from px4fuse.ekf2.stretches import Heights, Stretch, by_event, padded, steps_of
+from px4fuse.ekf2.bias import BiasEstimator
+from px4fuse.ekf2.stretches import (
+    HeightSamples,
+    Stretch,
+    pad_samples,
+    sample_steps,
+    samples_by_event,
+)
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
-from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, at_times
+from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
 
 SPEED_DOWN, DOWN = 5, 8
 SENSORS = (BAROMETER, GNSS_HGT)
@@ -33,17 +39,19 @@ BAROMETER_HZ, OLD_BAROMETER_HZ, LEAST_HZ = 10.0, 15.0, 4.0
 MIN_GATE, MIN_SD = 1.0, 0.01  # the latter of position and height (m), and of a velocity (m/s)
 
 
-def with_heights(
+def add_heights(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
 ) -> tuple[Stretch, ...] | str:
     """The same stretches with what EKF2's height rests on, or why the log does not tell it."""
     parameters, times = record.parameters, np.concatenate([one.time_s for one in stretches])
     if fuses_by_mask(parameters):
         return "before PX4 v1.14 EKF2 keeps to one sensor of height"
-    meant = {name: log.meant for name, log in ekf2.aids.items() if log.meant is not None}
-    shares = {name: float(np.mean(at_times(on, times) > 0.0)) for name, on in meant.items()}
-    fused = [aid.name for aid in SENSORS if shares.get(aid.name) == 1.0]
-    if more := [aid for aid in HEIGHTS if shares.get(aid.name) and aid.name not in fused]:
+    enabled = {name: log.enabled for name, log in ekf2.aids.items() if log.enabled is not None}
+    enabled_shares = {
+        name: float(np.mean(step_values_at(on, times) > 0.0)) for name, on in enabled.items()
+    }
+    fused = [aid.name for aid in SENSORS if enabled_shares.get(aid.name) == 1.0]
+    if more := [aid for aid in HEIGHTS if enabled_shares.get(aid.name) and aid.name not in fused]:
         return f"EKF2 fused {more[0].label} in a part of the flight"
     reference = REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
     if len(fused) == 1:  # the one that there is takes its place
@@ -54,36 +62,41 @@ def with_heights(
     if BAROMETER.name in fused and flight.barometer is not None:
         taken_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
         down_m = flight.barometer["down_m"].to_numpy() + record.altitude_m
-    zone_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
-    dead_m = np.where(record.was(GROUND_EFFECT, taken_s), zone_m, 0.0)
-    had_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
-    made, delayed = [], record.delayed["down_m"]
+    dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
+    dead_m = np.where(record.was_in_state(GROUND_EFFECT, taken_s), dead_zone_m, 0.0)
+    ekf2_rate_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
+    new_stretches, delayed = [], record.delayed["down_m"]
     for stretch in stretches:
         start_s, bias = float(stretch.time_s[0]), (0.0, 0.0)
         for other in {*fused} - {reference}:
-            known = record.height_bias.get(other)
-            if known is None or not known.index[0] - BIAS_LATE_S < start_s < known.index[-1]:
+            logged_bias = record.height_bias.get(other)
+            if (
+                logged_bias is None
+                or not logged_bias.index[0] - BIAS_LATE_S < start_s < logged_bias.index[-1]
+            ):
                 return f"the log does not hold EKF2's bias of the {AIDS[other].label}"
-            value, variance = (np.interp(start_s, known.index, known[name]) for name in known)
+            value, variance = (
+                np.interp(start_s, logged_bias.index, logged_bias[name]) for name in logged_bias
+            )
             bias = float(value), float(variance)
-        samples = inside(stretch, taken_s, down_m, dead_m)
+        samples = samples_inside(stretch, taken_s, down_m, dead_m)
         rate_hz = len(samples[0]) / float(stretch.time_s[-1] - start_s)
         if BAROMETER.name in fused and rate_hz < LEAST_HZ:
             return f"the log holds {rate_hz:.1f} samples of the barometer a second"
-        weight = max(had_hz / rate_hz, 1.0) if rate_hz else 1.0
+        weight = max(ekf2_rate_hz / rate_hz, 1.0) if rate_hz else 1.0
         state = stretch.state.copy()
         state[DOWN] = np.interp(start_s, delayed.index, delayed)
-        heights = Heights(tuple(fused), reference, bias, *samples, weight)
-        made.append(replace(stretch, state=state, heights=heights))
-    return tuple(made)
+        heights = HeightSamples(tuple(fused), reference, bias, *samples, weight)
+        new_stretches.append(replace(stretch, state=state, heights=heights))
+    return tuple(new_stretches)
 
 
-def inside(
+def samples_inside(
     stretch: Stretch, taken_s: Array, down_m: Array, dead_m: Array
 ) -> tuple[IntArray, Array, Array, Array]:
     """Samples of the barometer in a stretch, behind the step at the end of which each is taken."""
-    step, kept = steps_of(stretch, taken_s)
-    return step, taken_s[kept], down_m[kept], dead_m[kept]
+    step, is_inside = sample_steps(stretch, taken_s)
+    return step, taken_s[is_inside], down_m[is_inside], dead_m[is_inside]
 
 
 def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]:
@@ -94,8 +107,13 @@ def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]
     """
     heights = stretch.heights
     assert heights is not None
-    told = heights.down_m[:, None], slice(2, 3), heights.taken_s, heights.dead_m
-    return padded([by_event(stretch, end, heights.step, *told) for end in ends])
+    sample_columns = heights.down_m[:, None], slice(2, 3), heights.taken_s, heights.dead_m
+    return pad_samples(
+        [
+            samples_by_event(stretch, event_steps, heights.step, *sample_columns)
+            for event_steps in ends
+        ]
+    )
 
 
 class HeightFilter:
@@ -115,24 +133,30 @@ class HeightFilter:
 
     Attributes
     ----------
-    told : ndarray, shape (E, k + 1, 3, S)
+    update_log : ndarray, shape (E, k + 1, 3, S)
         Of the barometer's samples and of GNSS at each event: innovation (m, measurement minus
         state), its variance, and whether it was fused.
     """
 
     def __init__(
-        self, stretch: Stretch, barometer: Array, fix_s: Array, fixed: BoolArray,
-        on: Mapping[str, BoolArray], knob: Mapping[str, Array], gated: BoolArray,
-    ) -> None:  # fmt: skip
+        self,
+        stretch: Stretch,
+        barometer: Array,
+        fix_s: Array,
+        fixed: BoolArray,
+        on: Mapping[str, BoolArray],
+        knob: Mapping[str, Array],
+        gated: BoolArray,
+    ) -> None:
         heights, size = stretch.heights, len(gated)
         assert heights is not None
         self.fused = heights.fused
         self.down_m, self.age_s, taken_s, self.dead_m, there = barometer
         self.time_s = [*taken_s, fix_s]
-        self.told = np.full((len(fix_s), len(self.time_s), 3, size), np.nan)
+        self.update_log = np.full((len(fix_s), len(self.time_s), 3, size), np.nan)
         fixed = fixed & on[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
-        self.seen = [*((there > 0.0) & on[BAROMETER.name]), fixed]
-        self.any = [np.any(each, axis=1).tolist() for each in self.seen]
+        self.has_sample = [*((there > 0.0) & on[BAROMETER.name]), fixed]
+        self.any = [np.any(each, axis=1).tolist() for each in self.has_sample]
         self.near = self.dead_m.any(axis=2)
         gates = [np.maximum(knob.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
         self.gate2 = [np.where(gated, gate**2, np.inf) for gate in gates]
@@ -141,7 +165,7 @@ class HeightFilter:
         self.weight, self.learning = (heights.weight, 1.0), on[heights.reference]
         value_m, variance_m2 = (np.full(size, part) for part in heights.bias)
         start_s, step_s = float(stretch.time_s[0]), float(np.median(stretch.step_s))
-        self.bias = Bias(value_m, variance_m2, start_s, step_s)
+        self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)
 
     def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
         """What one variant did with each sample of a sensor; ``end_s`` is the time of each event.
@@ -150,13 +174,21 @@ class HeightFilter:
         """
         rows, slots = [], len(self.down_m)
         for place in [slots] if sensor == GNSS_HGT.name else range(slots):
-            times, seen = self.time_s[place], self.seen[place][:, variant]
-            taken_s = times[seen, min(variant, times.shape[1] - 1)]
-            rows.append(np.vstack([taken_s, self.told[seen, place, :, variant].T, end_s[seen]]))
-        taken_s, nu, S, fused, end_s = np.hstack(rows)
+            times, has_sample = self.time_s[place], self.has_sample[place][:, variant]
+            measured_s = times[has_sample, min(variant, times.shape[1] - 1)]
+            rows.append(
+                np.vstack(
+                    [
+                        measured_s,
+                        self.update_log[has_sample, place, :, variant].T,
+                        end_s[has_sample],
+                    ]
+                )
+            )
+        measured_s, nu, S, fused, end_s = np.hstack(rows)
         columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
         columns |= {"rejected": 1.0 - fused, "fused": fused, "fused_at_s": end_s}
-        return pd.DataFrame(columns, pd.Index(taken_s, name="time_s")).sort_index()
+        return pd.DataFrame(columns, pd.Index(measured_s, name="time_s")).sort_index()
 
     def fuse(
         self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array
@@ -168,26 +200,34 @@ class HeightFilter:
                 column = P[:, :, DOWN] - age_s[:, None] * P[:, :, SPEED_DOWN]
                 spread = column[:, DOWN] - age_s * column[:, SPEED_DOWN]
                 nu = self.down_m[place, e] - x[:, DOWN] + age_s * x[:, SPEED_DOWN]
-                x, P = self._take(e, place, 0, x, P, column, spread, nu, self.noise_m2)
+                x, P = self._fuse_innovation(e, place, 0, x, P, column, spread, nu, self.noise_m2)
         if self.any[-1][e]:
             column, nu = P[:, :, DOWN], gnss_m - x[:, DOWN]
-            x, P = self._take(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
+            x, P = self._fuse_innovation(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
         return x, P
 
-    def _take(
-        self, e: int, place: int, at: int, x: Array, P: Array, column: Array, spread: Array,
-        nu: Array, R: Array,
-    ) -> tuple[Array, Array]:  # fmt: skip
+    def _fuse_innovation(
+        self,
+        e: int,
+        place: int,
+        at: int,
+        x: Array,
+        P: Array,
+        column: Array,
+        spread: Array,
+        nu: Array,
+        R: Array,
+    ) -> tuple[Array, Array]:
         """Fuse an innovation; ``column`` is PH', ``spread`` HPH'."""
         if self.biased[at]:
-            seen, time_s = self.seen[place][e], self.time_s[place][e]
-            nu, R = self.bias.corrected(
-                nu, spread, R, time_s, seen, self.learning[e], self.weight[at]
+            has_sample, time_s = self.has_sample[place][e], self.time_s[place][e]
+            nu, R = self.bias.remove_bias(
+                nu, spread, R, time_s, has_sample, self.learning[e], self.weight[at]
             )
         if at == 0 and self.near[place, e]:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_m[place, e], 0.0), nu)
         S = spread + R
-        taken = self.seen[place][e] & (nu * nu <= self.gate2[at] * S)
-        self.told[e, place] = nu, S, taken
-        K = column * (taken / (spread + R / self.weight[at]))[:, None]
+        is_fused = self.has_sample[place][e] & (nu * nu <= self.gate2[at] * S)
+        self.update_log[e, place] = nu, S, is_fused
+        K = column * (is_fused / (spread + R / self.weight[at]))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]

@@ -12,10 +12,10 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.ekf2.earth import metres_of
-from px4fuse.ekf2.flow import with_flow
-from px4fuse.ekf2.heights import with_heights
+from px4fuse.ekf2.flow import add_flow_samples
+from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.output_predictor import corrections
 from px4fuse.ekf2.stretches import IMU_GAP_S, MIN_STRETCH_S, Stretch, find_stretches, predict_s
 from px4fuse.ekf2_parameters import (
@@ -32,15 +32,23 @@ from px4fuse.ekf2_parameters import (
     fuses_by_mask,
     settings_in_force,
 )
-from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Unavailable, at_times
-from px4fuse.origin import GIVEN_FILE
-from px4fuse.readers.px4_innovations import fuses, with_gnss
-from px4fuse.readers.px4_positions import THINNED_HZ
+from px4fuse.flight import (
+    Columns,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    PositionTrack,
+    Unavailable,
+    step_values_at,
+)
+from px4fuse.origin import POSITION_FILE
+from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
+from px4fuse.readers.px4_positions import MAX_THINNED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
-WHAT = "EKF2 replay"
+ANALYSIS_NAME = "EKF2 replay"
 # Where a log's EKF2 is this model (simulated flights), the log says so in these words
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
@@ -51,7 +59,7 @@ ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
 # The aid-source topics carry the time of measurement, as EKF2 takes it, to about a millisecond
 SAME_SAMPLE_S = 0.006
 GNSS_VELOCITY_BIT = 4  # of EKF2_GPS_CTRL; before v1.14 both are always fused
-OF_GNSS = (GNSS_POS.label, GNSS_VEL.label)
+GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
 # vehicle_local_position is logged every 0.1 s
 RESET_SHOWS_S = 0.2
 # Predictions of more than this lose turns and vibration inside a step; EKF2's own are 8 to 13 ms
@@ -60,12 +68,12 @@ MAX_IMU_INTERVAL_S = 0.012
 MAX_LOST_SHARE = 0.1
 # The first release that stamps estimator_states with the time of the horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"
-NO_LIMIT = 1_000_000
+UNLIMITED_RESETS = 1_000_000
 MAX_INTERVAL_S = 0.25
 
 
 @dataclass(frozen=True)
-class Received:
+class ReceivedPositions:
     """Position samples as EKF2 received them, shape (m,) or (m, ...), in time order.
 
     Attributes
@@ -102,11 +110,11 @@ class Received:
     own_times: bool = False
     moved_m: Array | None = None
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)
-class Rules:
+class FusionRules:
     """What decides when EKF2 starts, stops and resets horizontal position, by release.
 
     Attributes
@@ -173,8 +181,8 @@ class Inputs:
 
     settings: dict[str, float]
     stretches: tuple[Stretch, ...]
-    received: Received
-    rules: Rules
+    received: ReceivedPositions
+    rules: FusionRules
     step_s: float
     horizon_s: float
     predict_s: float
@@ -183,12 +191,12 @@ class Inputs:
     aid: Aid = EV_POS
     max_interval_s: float = MAX_INTERVAL_S
     imposed: str = ""
-    vision: Received | None = None
+    vision: ReceivedPositions | None = None
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
+def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
     flight: Flight, doubtful: Mapping[str, str] = MappingProxyType({})
 ) -> Inputs | Unavailable:
     """What the model runs on, or why the log cannot carry it.
@@ -208,9 +216,9 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
     if isinstance(ekf2, Unavailable):
         return ekf2
     aid = replayed_aid(ekf2)
-    gnss, given = aid == GNSS_POS, ekf2
+    gnss, logged_ekf2 = aid == GNSS_POS, ekf2
     if gnss:
-        ekf2 = with_gnss(ekf2)
+        ekf2 = with_gnss_innovations(ekf2)
     record, horizon_s = ekf2.record, ekf2.horizon_s
     if isinstance(record, Unavailable):
         return record
@@ -218,55 +226,61 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
         record = replace(record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
-    modelled = (*OF_GNSS, *([FLOW.label] if len(record.flow) else [])) if gnss else ()
-    if more := [one for one in record.other_aiding if one not in modelled]:
+    modelled_aids = (*GNSS_LABELS, *([FLOW.label] if len(record.flow) else [])) if gnss else ()
+    if more := [aid_name for aid_name in record.other_aiding if aid_name not in modelled_aids]:
         fused, off = ("GNSS", "") if gnss else ("vision position", f", {GNSS_POS.switch} 0")
-        return lacking(
+        return missing_data(
             "aids_not_modelled", fused=fused, more=", ".join(more), off=off, vision=EV_POS.switch
         )
-    if lacks := _imu_lacks(imu.index.to_numpy()):
-        return lacks
-    read = read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
-    if isinstance(read, Unavailable):
-        return read
-    besides = gnss and EV_POS.name not in doubtful
-    vision = _besides(flight, given, record, attitude) if besides else None
+    if missing := _missing_imu(imu.index.to_numpy()):
+        return missing
+    position_samples = (
+        read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
+    )
+    if isinstance(position_samples, Unavailable):
+        return position_samples
+    uses_vision = gnss and EV_POS.name not in doubtful
+    vision = (
+        _read_vision_besides_gnss(flight, logged_ekf2, record, attitude) if uses_vision else None
+    )
     if isinstance(vision, Unavailable):
         return vision
     # since v1.17 each receiver has its own, which its messages carry
-    track = _gnss(flight) if gnss else None
-    place = {} if track is None else dict(zip(aid.place, track.place_m, strict=True))
+    track = _gnss_track(flight) if gnss else None
+    place = {} if track is None else dict(zip(aid.place, track.lever_arm_m, strict=True))
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
-            return Unavailable(WHAT, horizon_s.reason, horizon_s.remedy)
+            return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
         horizon_s = 0.0  # a buffer of one step: EKF2_EV_DELAY is at most EKF2_PREDICT_US
-    carrying_s, flow = read.stamp_s, record.flow if gnss else record.flow.iloc[:0]
+    carrying_s, flow = position_samples.stamp_s, record.flow if gnss else record.flow.iloc[:0]
     if len(flow) and FLOW.name not in doubtful:
         carrying_s = np.union1d(carrying_s, flow.index)
     stretches = find_stretches(flight, imu, attitude, ekf2, record, carrying_s, gnss=gnss)
     if not stretches:
         fused = aid.label.removesuffix(", position")
-        return lacking("stretch_short", least_s=MIN_STRETCH_S, fused=fused)
+        return missing_data("stretch_short", least_s=MIN_STRETCH_S, fused=fused)
     fusing = ekf2.fusing
     if len(flow):
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
-        stretches = tuple(with_flow(stretch, flow, gate) for stretch in stretches)
+        stretches = tuple(add_flow_samples(stretch, flow, gate) for stretch in stretches)
     imposed = "; ".join(
         f"{AIDS[name].label}: {why}"
         for name, why in doubtful.items()
         if name not in (FLOW.name, EV_POS.name)
     )
     if gnss and not imposed:
-        found = with_heights(flight, ekf2, record, stretches)
-        stretches, imposed = (stretches, found) if isinstance(found, str) else (found, "")
-    others = [EV_POS] if vision else []
-    others += [MAG] if any(stretch.field for stretch in stretches) else []
+        new_stretches = add_heights(flight, ekf2, record, stretches)
+        stretches, imposed = (
+            (stretches, new_stretches) if isinstance(new_stretches, str) else (new_stretches, "")
+        )
+    other_aids = [EV_POS] if vision else []
+    other_aids += [MAG] if any(stretch.field for stretch in stretches) else []
     heights = stretches[0].heights
-    others += [BAROMETER] if heights and BAROMETER.name in heights.fused else []
+    other_aids += [BAROMETER] if heights and BAROMETER.name in heights.fused else []
     return Inputs(
-        settings=settings_in_force(record.parameters, aid, *others) | place,
+        settings=settings_in_force(record.parameters, aid, *other_aids) | place,
         stretches=stretches,
-        received=read,
+        received=position_samples,
         rules=_rules(record, ekf2.step_s, gnss=gnss),
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
@@ -281,18 +295,20 @@ def prepare(  # noqa: PLR0911, PLR0912 (a reason each)
     )
 
 
-def _imu_lacks(time_s: Array) -> Unavailable | None:
+def _missing_imu(time_s: Array) -> Unavailable | None:
     """Why IMU samples at these times are too few for predictions; None where they are not."""
     intervals = np.diff(time_s)
     interval = float(np.median(intervals))
     if interval > MAX_IMU_INTERVAL_S:
-        return lacking("imu_slow", rate_hz=1.0 / interval)
-    within = intervals[intervals <= IMU_GAP_S]
-    lost = float((np.rint(within / interval) - 1.0).clip(0.0).sum() / len(time_s))
-    return None if lost <= MAX_LOST_SHARE else lacking("imu_incomplete", share=lost)
+        return missing_data("imu_slow", rate_hz=1.0 / interval)
+    regular_intervals = intervals[intervals <= IMU_GAP_S]
+    lost_share = float((np.rint(regular_intervals / interval) - 1.0).clip(0.0).sum() / len(time_s))
+    return (
+        None if lost_share <= MAX_LOST_SHARE else missing_data("imu_incomplete", share=lost_share)
+    )
 
 
-def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> Rules:
+def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> FusionRules:
     """What decides on starts, stops and resets, by the release's own parameters."""
     floor = 5e-8 / step_s**2 if record.per_step_biases else None
     by_delay = "EKF2_DELAY_MAX" not in record.parameters
@@ -301,71 +317,79 @@ def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> Rules:
         # longitude, with twice the variance; since main of 2026 each aid by itself
         scale = 2.0 if record.keeps_latitude else 1.0
         both = GNSS_MODE not in record.parameters
-        return Rules(np.inf, np.inf, 7.0, NO_LIMIT, floor, by_delay, scale, both)
+        return FusionRules(np.inf, np.inf, 7.0, UNLIMITED_RESETS, floor, by_delay, scale, both)
     # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    old = fuses_by_mask(record.parameters)
-    limits = (np.inf, 7.0, 7.0, NO_LIMIT) if old else (0.2, 0.4, 1.0, 5)
-    return Rules(*limits, floor, by_delay)
+    is_old_release = fuses_by_mask(record.parameters)
+    intervals = (np.inf, 7.0, 7.0, UNLIMITED_RESETS) if is_old_release else (0.2, 0.4, 1.0, 5)
+    return FusionRules(*intervals, floor, by_delay)
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:
     """What EKF2's horizontal position rests on: external vision, or GNSS where it fused that."""
     vision = ekf2.aids.get(EV_POS.name)
-    used = vision is not None and (vision.meant is None or bool(vision.meant.any()))
-    both = _meant(ekf2, GNSS_POS) is not None
-    return GNSS_POS if fuses(ekf2) and (both or not used) else EV_POS
+    is_vision_used = vision is not None and (vision.enabled is None or bool(vision.enabled.any()))
+    has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
+    return GNSS_POS if fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
 
 
-def _meant(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
+def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
     """When EKF2 meant to fuse an aid; None where it never did, by what the log tells."""
     log = ekf2.aids.get(aid.name)
-    return log.meant if log is not None and log.meant is not None and log.meant.any() else None
+    return (
+        log.enabled if log is not None and log.enabled is not None and log.enabled.any() else None
+    )
 
 
-def _gnss(flight: Flight) -> PositionTrack | None:
+def _gnss_track(flight: Flight) -> PositionTrack | None:
     return next((track for track in flight.positions if track.origin.is_gnss), None)
 
 
-def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> Received | Unavailable:
+def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPositions | Unavailable:
     """The fixes that EKF2 received, as :func:`read_vision` gives positions of vision."""
-    track = _gnss(flight)
+    track = _gnss_track(flight)
     if track is None or track.velocity is None:
-        return Unavailable(WHAT, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
-    if track.rate_hz < THINNED_HZ:
-        return lacking("gnss_thinned", rate_hz=track.rate_hz)
+        return Unavailable(ANALYSIS_NAME, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
+    if track.rate_hz < MAX_THINNED_HZ:
+        return missing_data("gnss_thinned", rate_hz=track.rate_hz)
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
     samples, velocities = track.samples, track.velocity
-    if (meant := ekf2.aids[GNSS_POS.name].meant) is not None:  # others came while EKF2 did without
-        kept = at_times(meant, samples.index) > 0.0
-        samples, velocities = samples[kept], velocities[kept]
+    if (
+        enabled := ekf2.aids[GNSS_POS.name].enabled
+    ) is not None:  # others came while EKF2 did without
+        is_enabled = step_values_at(enabled, samples.index) > 0.0
+        samples, velocities = samples[is_enabled], velocities[is_enabled]
     # the stamp of a fix that has a time of its own is made up, so that its age is the delay
     flown = settings_in_force(parameters, GNSS_POS)
     flown_s = flown[GNSS_POS.delay] * 1e-3
     stamp = samples.index.to_numpy() + flown_s
     # EKF2 believes no fix to be worse than without aiding (gps_control.cpp)
     worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
-    stated = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=worst_m**2)
+    reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=worst_m**2)
     velocity = velocities[Columns.VELOCITY].to_numpy()
     fused = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
-    spread = velocities[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
-    known = bool(fused and np.isfinite(velocity).all())
-    decisions = _decisions(ekf2, record, stamp, GNSS_POS)
-    return Received(
+    velocity_variance = velocities[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
+    has_velocity = bool(fused and np.isfinite(velocity).all())
+    decisions = _logged_decisions(ekf2, record, stamp, GNSS_POS)
+    return ReceivedPositions(
         stamp,
         stamp,
         samples[Columns.POSITION].to_numpy() * metres_of(record),
-        stated.to_numpy(),
+        reported_variance.to_numpy(),
         *decisions,
         track.name,
-        velocity if known else None,
-        spread if known else None,
+        velocity if has_velocity else None,
+        velocity_variance if has_velocity else None,
         own_times=track.age_s == 0.0 != flown_s,
-        moved_m=_moved(ekf2, samples.index.to_numpy(), decisions[0], flown["EKF2_TAU_POS"]),
+        moved_m=_position_corrections(
+            ekf2, samples.index.to_numpy(), decisions[0], flown["EKF2_TAU_POS"]
+        ),
     )
 
 
-def _moved(ekf2: Ekf2, measured_s: Array, rejected: Array, tau_s: float) -> Array | None:
+def _position_corrections(
+    ekf2: Ekf2, measured_s: Array, rejected: Array, tau_s: float
+) -> Array | None:
     """By how much EKF2 moved its position to each sample; None where that tells nothing more."""
     if not (rejected > 0.0).any() or np.isfinite(rejected).all():
         return None
@@ -379,13 +403,13 @@ def _moved(ekf2: Ekf2, measured_s: Array, rejected: Array, tau_s: float) -> Arra
         if reset.quantity == "position":
             position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
     # EKF2 takes it half a step before, and the first part of what it does shows at once
-    known_s = measured_s + ekf2.horizon_s - 1.5 * ekf2.step_s
-    return corrections(times, velocity, position, known_s, tau_s)
+    before_sample_s = measured_s + ekf2.horizon_s - 1.5 * ekf2.step_s
+    return corrections(times, velocity, position, before_sample_s, tau_s)
 
 
 def read_vision(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
-) -> Received | Unavailable:
+) -> ReceivedPositions | Unavailable:
     """The samples that EKF2 received, in NED, or why the log does not hold them all.
 
     Parameters
@@ -396,7 +420,7 @@ def read_vision(
     attitude : DataFrame
         As published, to turn samples of a frame of their own.
     """
-    track = _source(flight)
+    track = _vision_track(flight)
     if isinstance(track, Unavailable):
         return track
     samples = track.samples.dropna(subset=Columns.POSITION[:2])
@@ -408,7 +432,7 @@ def read_vision(
         rotated = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
     if track.frame == "FRD" and rotated:
         if track.orientation is None:
-            return lacking("frame_not_turned", name=track.name)
+            return missing_data("frame_not_turned", name=track.name)
         published, sent = (
             interpolate(stamp, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
             for frame in (attitude, track.orientation)
@@ -420,45 +444,49 @@ def read_vision(
     arrival = np.full(len(stamp), -np.inf)  # unknown: never taken to be late
     if len(age) and "vehicle_visual_odometry" in track.topics:
         arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
-    decisions = _decisions(ekf2, record, stamp)
-    return Received(stamp, arrival, position, variance, *decisions, track.name)
+    decisions = _logged_decisions(ekf2, record, stamp)
+    return ReceivedPositions(stamp, arrival, position, variance, *decisions, track.name)
 
 
-def _besides(
+def _read_vision_besides_gnss(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
-) -> Received | Unavailable | None:
+) -> ReceivedPositions | Unavailable | None:
     """The samples of vision that EKF2 received besides fixes; None where it fused none."""
-    if (meant := _meant(ekf2, EV_POS)) is None:
+    if (enabled := _enabled_log(ekf2, EV_POS)) is None:
         return None
     if fuses_by_mask(record.parameters):
-        return lacking("vision_moves", firmware=flight.log.firmware)
-    seen = read_vision(flight, ekf2, record, attitude)
-    if isinstance(seen, Unavailable):
-        return seen
-    off = at_times(meant, seen.stamp_s) == 0.0
-    position_m = seen.position_m * metres_of(record)
-    return replace(seen, position_m=np.where(off[:, None], np.nan, position_m))
+        return missing_data("vision_moves", firmware=flight.log.firmware)
+    received = read_vision(flight, ekf2, record, attitude)
+    if isinstance(received, Unavailable):
+        return received
+    is_disabled = step_values_at(enabled, received.stamp_s) == 0.0
+    position_m = received.position_m * metres_of(record)
+    return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
 
 
-def _decisions(
+def _logged_decisions(
     ekf2: Ekf2, record: FusionRecord, stamp: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
     """What EKF2 rejected and reset to, where its aid-source topic tells, by time of measurement."""
     rejected, reset = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
     innovations, horizon_s = ekf2.innovations["north"], ekf2.horizon_s
-    known = aid_source(aid) in ekf2.innovation_topics
-    if isinstance(innovations, Unavailable) or isinstance(horizon_s, Unavailable) or not known:
+    has_own_topic = aid_source(aid) in ekf2.innovation_topics
+    if (
+        isinstance(innovations, Unavailable)
+        or isinstance(horizon_s, Unavailable)
+        or not has_own_topic
+    ):
         return rejected, reset
     delay_s = settings_in_force(record.parameters, aid)[aid.delay] * 1e-3
-    taken = stamp - delay_s - 0.5 * ekf2.step_s
-    row = same_sample(innovations.index.to_numpy(), taken)
-    rejected[row >= 0] = innovations["rejected"].to_numpy()[row[row >= 0]]
+    measured_s = stamp - delay_s - 0.5 * ekf2.step_s
+    sample_row = same_sample(innovations.index.to_numpy(), measured_s)
+    rejected[sample_row >= 0] = innovations["rejected"].to_numpy()[sample_row[sample_row >= 0]]
     # a reset shows in the first published sample after it, the horizon after the measurement
-    published = taken + horizon_s
-    for shown_s in horizontal_resets_s(ekf2):
-        before = np.flatnonzero((published <= shown_s) & (rejected != 0.0))
-        if len(before) and shown_s - published[before[-1]] < RESET_SHOWS_S:
-            reset[before[-1]] = True
+    published = measured_s + horizon_s
+    for reset_s in horizontal_resets_s(ekf2):
+        earlier_rows = np.flatnonzero((published <= reset_s) & (rejected != 0.0))
+        if len(earlier_rows) and reset_s - published[earlier_rows[-1]] < RESET_SHOWS_S:
+            reset[earlier_rows[-1]] = True
     return rejected, reset
 
 
@@ -480,11 +508,11 @@ def horizontal_resets_s(ekf2: Ekf2) -> Array:
     )
 
 
-def _source(flight: Flight) -> PositionTrack | Unavailable:
+def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
     """The track that EKF2 received, complete."""
     why = ["no vehicle_visual_odometry"]
-    for track in sorted(flight.positions, key=lambda t: t.origin == GIVEN_FILE):
-        if track.origin.is_vision and track.origin.as_sent:
+    for track in sorted(flight.positions, key=lambda t: t.origin == POSITION_FILE):
+        if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in COPY_INTERVAL_S:
             interval = float(np.median(np.diff(track.samples.index.to_numpy())))
@@ -493,4 +521,4 @@ def _source(flight: Flight) -> PositionTrack | Unavailable:
             why.append(
                 f"{track.name} holds one sample in {interval:.2g} s, fewer than EKF2 may have fused"
             )
-    return lacking("vision_incomplete", why="; ".join(why))
+    return missing_data("vision_incomplete", why="; ".join(why))

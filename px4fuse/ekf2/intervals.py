@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.stretches import (
     BIASES,
     GRAVITY_M_S2,
-    MOVED,
+    IMU_STATE_COUNT,
     POSITION,
     STATES,
     THETA,
@@ -42,7 +42,7 @@ LATE_S = 0.03
 IDLE, FUSE, START = 0, 1, 2
 # Columns of what acts within an interval: attitude error, gyro bias and accelerometer bias at its
 # beginning, the correction of the nominal attitude, and gravity with the specific force
-CAUSES = 11
+EFFECT_COLUMNS = 11
 TURN, INPUT = 9, 10
 
 # What happens at the end of each interval, in order of time
@@ -83,7 +83,7 @@ class Intervals:
     gyro_noise: Array
     accelerometer_noise: Array
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,12 @@ def make_intervals(inputs: Inputs, stretch: Stretch, timing: Timing) -> Interval
     count, duration_s = len(end), stretch.time_s[end] - stretch.time_s[start]
     transition = np.tile(np.eye(STATES), (count, 1, 1))
     turn, drive = np.zeros((2, count, STATES))
-    moved = _effects(stretch, start, end)
-    transition[:, :MOVED, THETA], transition[:, :MOVED, BIASES] = moved[..., :3], moved[..., 3:9]
-    turn[:, :MOVED], drive[:, :MOVED] = moved[..., TURN], moved[..., INPUT]
+    effects = _effects(stretch, start, end)
+    transition[:, :IMU_STATE_COUNT, THETA], transition[:, :IMU_STATE_COUNT, BIASES] = (
+        effects[..., :3],
+        effects[..., 3:9],
+    )
+    turn[:, :IMU_STATE_COUNT], drive[:, :IMU_STATE_COUNT] = effects[..., TURN], effects[..., INPUT]
     transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
     noises = _noises((end - start).astype(float), duration_s, transition[:, VELOCITY, THETA])
     return Intervals(events, transition, turn, drive, *noises)
@@ -111,30 +114,36 @@ def make_intervals(inputs: Inputs, stretch: Stretch, timing: Timing) -> Interval
 
 def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
     received, time_s = inputs.received, stretch.time_s
-    first, beyond = np.searchsorted(received.stamp_s, time_s[[0, -1]])
-    stamp, last = received.stamp_s[first:beyond], len(time_s) - 1
-    taken = stamp - timing.delay_s - 0.5 * inputs.step_s
+    first, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
+    stamp, last = received.stamp_s[first:last_row], len(time_s) - 1
+    measured_s = stamp - timing.delay_s - 0.5 * inputs.step_s
     # what arrives after the horizon has passed it is fused late, or not at all
-    due = np.maximum(taken, received.arrival_s[first:beyond] - timing.horizon_s)
-    end = np.searchsorted(time_s, due - 1e-9)
-    inside = (end > 0) & (end <= last)
+    due_s = np.maximum(measured_s, received.arrival_s[first:last_row] - timing.horizon_s)
+    end = np.searchsorted(time_s, due_s - 1e-9)
+    is_inside = (end > 0) & (end <= last)
     end = np.maximum.accumulate(np.minimum(end, last))
-    in_time = time_s[end] < taken + MAX_LATE_S
-    usable = inside & in_time
+    is_in_time = time_s[end] < measured_s + MAX_LATE_S
+    usable = is_inside & is_in_time
     usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step the newer one is fused
-    action, startable = _actions(inputs, stretch, taken, end, usable)
+    action, startable = _actions(inputs, stretch, measured_s, end, usable)
     # further events where the source is silent, as many for every delay
     silence = np.diff(np.concatenate([time_s[:1], stamp, time_s[-1:]]))
-    more = np.maximum(np.ceil(silence / inputs.max_interval_s).astype(int) - 1, 0)
-    place, total = np.cumsum(more[:-1] + 1) - 1, len(stamp) + int(more.sum())
-    known, ends = np.concatenate([[-1], place, [total]]), np.concatenate([[0], end, [last]])
+    extra_events = np.maximum(np.ceil(silence / inputs.max_interval_s).astype(int) - 1, 0)
+    sample_places, total = (
+        np.cumsum(extra_events[:-1] + 1) - 1,
+        len(stamp) + int(extra_events.sum()),
+    )
+    known_places, ends = (
+        np.concatenate([[-1], sample_places, [total]]),
+        np.concatenate([[0], end, [last]]),
+    )
     events = np.zeros(total, EVENT)
-    events["end"] = np.rint(np.interp(np.arange(total), known, ends))
+    events["end"] = np.rint(np.interp(np.arange(total), known_places, ends))
     events["sample"], events["time_s"] = -1, time_s[events["end"]]
-    late, lost = inside & in_time & (due - taken > LATE_S), inside & ~in_time
-    samples = np.arange(first, beyond)
-    events[place] = np.rec.fromarrays(
-        [end, samples, action, usable, startable, late, lost, taken], dtype=EVENT
+    late, lost = is_inside & is_in_time & (due_s - measured_s > LATE_S), is_inside & ~is_in_time
+    samples = np.arange(first, last_row)
+    events[sample_places] = np.rec.fromarrays(
+        [end, samples, action, usable, startable, late, lost, measured_s], dtype=EVENT
     )
     return events.view(np.recarray)
 
@@ -146,19 +155,23 @@ def _actions(
     rules = inputs.rules
     action = np.full(len(taken_s), IDLE)
     startable = np.zeros(len(taken_s), dtype=bool)
-    popped = np.flatnonzero(usable)
-    interval = np.diff(taken_s[popped], prepend=-np.inf)
-    startable[popped] = interval < rules.start_interval_s
+    usable_rows = np.flatnonzero(usable)
+    interval = np.diff(taken_s[usable_rows], prepend=-np.inf)
+    startable[usable_rows] = interval < rules.start_interval_s
     # the last step before this sample was fused, and how old the sample before was then
-    silence = stretch.time_s[end[popped] - 1] - np.concatenate([[np.inf], taken_s[popped[:-1]]])
-    running = stretch.fusing
-    for at, (gap, silent) in enumerate(zip(interval.tolist(), silence.tolist(), strict=True)):
-        running = running and not silent > rules.stop_s
-        if running:
-            action[popped[at]] = FUSE
-        elif gap < rules.start_interval_s:
-            action[popped[at]] = START
-            running = True
+    silence = stretch.time_s[end[usable_rows] - 1] - np.concatenate(
+        [[np.inf], taken_s[usable_rows[:-1]]]
+    )
+    is_fusing = stretch.fusing
+    for row, (interval_s, silence_s) in enumerate(
+        zip(interval.tolist(), silence.tolist(), strict=True)
+    ):
+        is_fusing = is_fusing and not silence_s > rules.stop_s
+        if is_fusing:
+            action[usable_rows[row]] = FUSE
+        elif interval_s < rules.start_interval_s:
+            action[usable_rows[row]] = START
+            is_fusing = True
     return action, startable
 
 
@@ -171,21 +184,21 @@ def _effects(stretch: Stretch, start: IntArray, end: IntArray) -> Array:
     # the first steps of all intervals, then their second ones and so on, longer before shorter
     longest_first = np.argsort(-length, kind="stable")
     first = start[longest_first]
-    attitude, velocity, position = effects = np.zeros((3, len(end), 3, CAUSES))
+    attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMNS))
     attitude[:, :, 0:3] = np.eye(3)
     force_m_s2 = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2)
     steps = np.arange(int(length.max(initial=0)))
     for at, count in zip(steps, np.searchsorted(-length[longest_first], -steps), strict=True):
-        step, some = first[:count] + at, slice(count)
+        step, rows = first[:count] + at, slice(count)
         dt, force = stretch.step_s[step][:, None, None], force_m_s2[step]
-        turned = -stretch.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of a step
-        position[some] += 0.5 * dt * velocity[some]
-        velocity[some] += (-skew(force) * dt) @ attitude[some]  # by ∂v/∂δθ of the step
-        velocity[some, :, 6:9] += turned
-        velocity[some, :, INPUT] += (force + GRAVITY_M_S2) * dt[:, :, 0]
-        position[some] += 0.5 * dt * velocity[some]
-        attitude[some, :, 3:6] += turned
-        attitude[some, :, TURN] -= stretch.correction_rad[step]
+        rotation_step = -stretch.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of a step
+        position[rows] += 0.5 * dt * velocity[rows]
+        velocity[rows] += (-skew(force) * dt) @ attitude[rows]  # by ∂v/∂δθ of the step
+        velocity[rows, :, 6:9] += rotation_step
+        velocity[rows, :, INPUT] += (force + GRAVITY_M_S2) * dt[:, :, 0]
+        position[rows] += 0.5 * dt * velocity[rows]
+        attitude[rows, :, 3:6] += rotation_step
+        attitude[rows, :, TURN] -= stretch.correction_rad[step]
     effects[:, longest_first] = effects.copy()
     return np.concatenate(effects, axis=1)
 
@@ -202,8 +215,8 @@ def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]
     m = tilt / n  # mean ∂v/∂δθ of a step
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
-    gyro, accelerometer = np.zeros((2, len(steps), MOVED, MOVED))
-    for matrix, rows, columns, part in (
+    gyro, accelerometer = np.zeros((2, len(steps), IMU_STATE_COUNT, IMU_STATE_COUNT))
+    for matrix, rows, columns, block in (
         (gyro, THETA, THETA, n * d**2 * eye),
         (gyro, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),
         (gyro, POSITION, THETA, m * d**3 * n * (n - 1) * (n - 2) / 6),
@@ -214,7 +227,7 @@ def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]
         (accelerometer, POSITION, VELOCITY, d**3 * n * (n - 1) / 2 * eye),
         (accelerometer, POSITION, POSITION, d**4 * n * (n - 1) * (2 * n - 1) / 6 * eye),
     ):
-        matrix[:, rows, columns] = part
+        matrix[:, rows, columns] = block
         if rows != columns:
-            matrix[:, columns, rows] = part.transpose(0, 2, 1)
+            matrix[:, columns, rows] = block.transpose(0, 2, 1)
     return gyro, accelerometer

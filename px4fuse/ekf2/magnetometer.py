@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, THETA, Sensed
+from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
 from px4fuse.trajectory.rotation import skew
 
 MIN_SD_GAUSS = 0.01
@@ -20,10 +20,10 @@ EYE = np.eye(3)
 CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is [v]×
 
 
-class Samples(NamedTuple):
+class EventSamples(NamedTuple):
     """Means of the samples that are fused at each event; shape (E, ...), or (E, S, ...).
 
-    ``value`` and ``turn`` are as :class:`~px4fuse.ekf2.stretches.Sensed` has them, a velocity as of
+    ``value`` and ``turn`` are as :class:`~px4fuse.ekf2.stretches.SensorSamples` has them, a velocity as of
     the event; ``number`` is how many EKF2 had, and ``noise`` R of one.
     """
 
@@ -33,30 +33,32 @@ class Samples(NamedTuple):
     noise: Array
 
 
-def gather(sensed: Sensed, end: IntArray, gained_m_s: Array | None = None) -> Samples:
+def mean_by_event(
+    sensed: SensorSamples, end: IntArray, gained_m_s: Array | None = None
+) -> EventSamples:
     """Samples by the event at which they are fused; ``end`` is the step of each event.
 
     ``gained_m_s`` is of :class:`~px4fuse.ekf2.stretches.Stretch`, for a velocity.
     """
     event = np.searchsorted(end, sensed.step)
-    inside, size = event < len(end), len(end)
-    event = event[inside]
+    is_inside, size = event < len(end), len(end)
+    event = event[is_inside]
     count = np.maximum(np.bincount(event, minlength=size), 1)
 
     def mean(rows: Array) -> Array:
         total = np.zeros((size, *rows.shape[1:]))
-        np.add.at(total, event, rows[inside])
+        np.add.at(total, event, rows[is_inside])
         return np.asarray((total.T / count).T)
 
     value, turn, noise = map(mean, (sensed.value, sensed.turn, sensed.noise))
     if gained_m_s is not None:
         value = value + np.einsum("eab,eb->ea", turn, gained_m_s[end])
-    number = np.bincount(event, sensed.samples[inside], size)
-    return Samples(value, turn, np.asarray(number, float), noise)
+    number = np.bincount(event, sensed.samples[is_inside], size)
+    return EventSamples(value, turn, np.asarray(number, float), noise)
 
 
 def fuse_field(
-    x: Array, P: Array, told: Samples, noise_gauss: Array, gate: Array
+    x: Array, P: Array, field_samples: EventSamples, noise_gauss: Array, gate: Array
 ) -> tuple[Array, Array, Array]:
     """State and covariance of S variants after the field samples of one event.
 
@@ -64,45 +66,53 @@ def fuse_field(
     (3, S, 3); NaN where there was no sample.
     """
     R = np.maximum(noise_gauss, MIN_SD_GAUSS) ** 2
-    return fuse_mean(x, P, told, R, gate, EARTH_FIELD, BODY_FIELD)
+    return fuse_mean(x, P, field_samples, R, gate, EARTH_FIELD, BODY_FIELD)
 
 
 def fuse_mean(
-    x: Array, P: Array, told: Samples, R: Array, gate: Array, rows: slice, own: slice | None = None
+    x: Array,
+    P: Array,
+    sample_mean: EventSamples,
+    R: Array,
+    gate: Array,
+    rows: slice,
+    bias_rows: slice | None = None,
 ) -> tuple[Array, Array, Array]:
     """State and covariance of S variants after the mean of some samples, as :func:`fuse_field`.
 
     Parameters
     ----------
-    told : Samples
+    sample_mean : Samples
         Of one event.
     R, gate : ndarray, shape (S,)
         Variance of one sample, and its gate in standard deviations.
     rows : slice
         States that are measured in the body (NED).
-    own : slice, optional
+    bias_rows : slice, optional
         States that are the body's own, and are measured with them.
     """
-    state, number = x[:, rows], told.number
-    of_state, of_turn = ((each @ CROSS).reshape(-1, 3, 3) for each in (state, x[:, THETA]))
-    H = np.zeros((len(x), told.value.shape[-1], x.shape[1]))
-    H[:, :, THETA] = told.turn @ of_state
-    H[:, :, rows] = told.turn @ (EYE - of_turn)
-    seen = (H[:, :, rows] @ state[:, :, None])[:, :, 0]
-    if own is not None:
-        H[:, :, own] = EYE
-        seen += x[:, own]
-    nu, HP = told.value - seen, H @ P
+    state, number = x[:, rows], sample_mean.number
+    cross_state, cross_turn = (
+        (vectors @ CROSS).reshape(-1, 3, 3) for vectors in (state, x[:, THETA])
+    )
+    H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
+    H[:, :, THETA] = sample_mean.turn @ cross_state
+    H[:, :, rows] = sample_mean.turn @ (EYE - cross_turn)
+    predicted = (H[:, :, rows] @ state[:, :, None])[:, :, 0]
+    if bias_rows is not None:
+        H[:, :, bias_rows] = EYE
+        predicted += x[:, bias_rows]
+    nu, HP = sample_mean.value - predicted, H @ P
     S = HP @ H.transpose(0, 2, 1)
     diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # a view
-    found = np.empty((3, *nu.shape))
-    found[0], found[1] = nu, diagonal + R[:, None]
-    there = number > 0.0
-    taken = there & (nu * nu <= gate[:, None] ** 2 * found[1]).all(axis=1)
-    found[2] = taken[:, None]
-    found[:, ~there] = np.nan
-    diagonal += np.where(there, R / np.maximum(number, 1.0), 1.0)[:, None]
-    K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * taken[:, None, None]
+    innovation_record = np.empty((3, *nu.shape))
+    innovation_record[0], innovation_record[1] = nu, diagonal + R[:, None]
+    has_sample = number > 0.0
+    is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * innovation_record[1]).all(axis=1)
+    innovation_record[2] = is_fused[:, None]
+    innovation_record[:, ~has_sample] = np.nan
+    diagonal += np.where(has_sample, R / np.maximum(number, 1.0), 1.0)[:, None]
+    K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP
-    return x, 0.5 * (P + P.transpose(0, 2, 1)), found
+    return x, 0.5 * (P + P.transpose(0, 2, 1)), innovation_record

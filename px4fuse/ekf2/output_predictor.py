@@ -28,19 +28,23 @@ from px4fuse.ekf2.stretches import (
 
 INTEGRAL_SHARE = 0.1
 # What a correction does is followed for so many time constants
-FOLLOWED = 5.0
+FOLLOWED_TIME_CONSTANTS = 5.0
 # Against what nothing tells apart: two corrections between the same rows
 NO_CORRECTION = 1e-3
 # A row after so many usual intervals has others missing before it; so much of a correction must
 # show in rows that are there
-MISSING_ROWS, SEEN_SHARE = 3.0, 0.5
+MISSING_ROWS, MIN_SHOWN_SHARE = 3.0, 0.5
 ATTITUDE_SHARE = 0.5
 
 
 def publish(
-    stretch: Stretch, state: Array, reset_m: Array, turned_rad: Array, lag: int,
+    stretch: Stretch,
+    state: Array,
+    reset_m: Array,
+    turned_rad: Array,
+    lag: int,
     settings: Mapping[str, float],
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     """Published velocity and position at each step's end.
 
     Parameters
@@ -64,30 +68,36 @@ def publish(
     """
     step_s, mean_step = stretch.step_s[:, None], float(np.mean(stretch.step_s))
     # the bias that the newest IMU samples are corrected with is the horizon's
-    force = stretch.force_m_s2 - later(state[:, ACCELEROMETER_BIAS], lag)[1:]
+    force = stretch.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
     force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
     gain = (force + np.cross(turned_rad[1:], force) + GRAVITY_M_S2) * step_s
-    free = np.cumsum(np.concatenate([state[:1, VELOCITY], gain]), axis=0)
-    followed = _followed(state[:, VELOCITY] - free, lag, mean_step, settings["EKF2_TAU_VEL"])
-    velocity = free + followed
+    dead_reckoned = np.cumsum(np.concatenate([state[:1, VELOCITY], gain]), axis=0)
+    velocity_correction = _follow_offset(
+        state[:, VELOCITY] - dead_reckoned, lag, mean_step, settings["EKF2_TAU_VEL"]
+    )
+    velocity = dead_reckoned + velocity_correction
     # within a step the velocity grows by what the IMU gives; corrections come at its end
-    moved = (velocity[:-1] + 0.5 * gain) * step_s
+    position_increments = (velocity[:-1] + 0.5 * gain) * step_s
     steady = state[:, POSITION] - reset_m  # the buffer is moved along with a reset
-    free = np.cumsum(np.concatenate([steady[:1], moved]), axis=0)
-    position = free + _followed(steady - free, lag, mean_step, settings["EKF2_TAU_POS"])
-    return velocity, position + later(reset_m, lag)
+    dead_reckoned = np.cumsum(np.concatenate([steady[:1], position_increments]), axis=0)
+    position = dead_reckoned + _follow_offset(
+        steady - dead_reckoned, lag, mean_step, settings["EKF2_TAU_POS"]
+    )
+    return velocity, position + delay_by(reset_m, lag)
 
 
-def _followed(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
+def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
     """Sum of the corrections up to each step that make the output follow the state.
 
     With e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
     g = step_s / np.clip(tau_s, step_s, 10.0)
     h = INTEGRAL_SHARE * g**2
-    late = later(offset - offset[0], lag)
-    corrected = _recursive(np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), late)
-    return np.asarray(corrected + offset[0])
+    delayed_offset = delay_by(offset - offset[0], lag)
+    correction_sum = _recursive_filter(
+        np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), delayed_offset
+    )
+    return np.asarray(correction_sum + offset[0])
 
 
 def corrections(
@@ -114,25 +124,35 @@ def corrections(
         NaN where rows of the log are missing after it.
     """
     interval_s = np.diff(time_s)
-    carried = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
-    beyond = np.diff(position_m, axis=0) - carried
+    dead_reckoned = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
+    correction_increments = np.diff(position_m, axis=0) - dead_reckoned
     usual_s = float(np.median(interval_s))
-    usable = np.isfinite(beyond).all(axis=1) & (interval_s < MISSING_ROWS * usual_s)
-    beyond[~usable] = 0.0
-    span = math.ceil(FOLLOWED * tau_s / usual_s) + 1
+    is_usable = np.isfinite(correction_increments).all(axis=1) & (
+        interval_s < MISSING_ROWS * usual_s
+    )
+    correction_increments[~is_usable] = 0.0
+    span = math.ceil(FOLLOWED_TIME_CONSTANTS * tau_s / usual_s) + 1
     row = np.searchsorted(time_s, known_s, side="right") - 1 + np.arange(span)[:, None]
-    inside = (row >= 0) & (row < len(beyond)) & usable[np.clip(row, 0, len(beyond) - 1)]
-    row, sample = row[inside], np.nonzero(inside)[1]
-    begun, ended = (
+    is_inside = (
+        (row >= 0)
+        & (row < len(correction_increments))
+        & is_usable[np.clip(row, 0, len(correction_increments) - 1)]
+    )
+    row, sample = row[is_inside], np.nonzero(is_inside)[1]
+    decay_start, decay_end = (
         np.exp(-np.maximum(time_s[each] - known_s[sample], 0.0) / tau_s) for each in (row, row + 1)
     )
-    shares = csr_array((begun - ended, (row, sample)), shape=(len(beyond), len(known_s)))
+    shares = csr_array(
+        (decay_start - decay_end, (row, sample)), shape=(len(correction_increments), len(known_s))
+    )
     normal = shares.T @ shares + NO_CORRECTION * eye_array(len(known_s))
-    found = np.reshape(spsolve(normal.tocsc(), shares.T @ beyond), (len(known_s), -1))
-    return np.where(shares.sum(axis=0)[:, None] > SEEN_SHARE, found, np.nan)
+    result = np.reshape(
+        spsolve(normal.tocsc(), shares.T @ correction_increments), (len(known_s), -1)
+    )
+    return np.where(shares.sum(axis=0)[:, None] > MIN_SHOWN_SHARE, result, np.nan)
 
 
-def later(values: Array, lag: int) -> Array:
+def delay_by(values: Array, lag: int) -> Array:
     """The same values ``lag`` steps later, the first one before them."""
     return np.concatenate([np.repeat(values[:1], lag, axis=0), values])[: len(values)]
 
@@ -153,15 +173,15 @@ def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float)
     numerator, denominator = np.zeros((2, lag + 2))
     numerator[-1], denominator[:2] = share, (1.0, -1.0)
     denominator[-1] += share
-    return _recursive(numerator, denominator, error_rad)
+    return _recursive_filter(numerator, denominator, error_rad)
 
 
-def _recursive(numerator: Array, denominator: Array, values: Array) -> Array:
+def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
     """Values through a recursive filter: a triangular system whose bands are the denominator."""
     count = len(values)
-    driven = np.zeros((values.shape[1], count))
-    for late in np.flatnonzero(numerator[:count]).tolist():
-        driven[:, late:] += numerator[late] * values[: count - late].T
+    driven_values = np.zeros((values.shape[1], count))
+    for delay in np.flatnonzero(numerator[:count]).tolist():
+        driven_values[:, delay:] += numerator[delay] * values[: count - delay].T
     bands = np.broadcast_to(denominator, (count, len(denominator))).T
-    filtered, _ = lapack.dtbtrs(bands, driven.T, uplo="L", overwrite_b=1)
+    filtered, _ = lapack.dtbtrs(bands, driven_values.T, uplo="L", overwrite_b=1)
     return np.asarray(filtered)

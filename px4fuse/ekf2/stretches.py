@@ -13,10 +13,10 @@ import pandas as pd
 from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.ekf2.earth import earth_rate_rad_s, metres_of
 from px4fuse.flight import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
-from px4fuse.readers.px4_ekf2 import same_stamps, samples_per_step
+from px4fuse.readers.px4_ekf2 import rows_of_stamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
     from_vector,
@@ -44,28 +44,28 @@ FIELD_AFTER_S = 1.0
 HISTORY_S = 20.0
 # EKF2 fuses 14 samples of the field a second (SENS_MAG_RATE is 15): one of fewer that are in the
 # log stands for several, down to this rate
-FIELD_HZ, LEAST_FIELD_HZ = 14.0, 1.5
+FIELD_HZ, MIN_FIELD_HZ = 14.0, 1.5
 # Time constant of EKF2's low pass of innovations (updateAidSourceStatus, ekf_helper.cpp)
 FILTER_S = 0.5
 MIN_STRETCH_S = 10.0
 # Resets are published up to the longest delay and a row of the log later
-RESET_LATE_S = 0.5
+MAX_RESET_DELAY_S = 0.5
 # Of the samples in a second: more clipped ones are lost motion
-CLIPPED_SHARE = 0.05
+MAX_CLIPPED_SHARE = 0.05
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 
 
 # States, of Stretch.state
 STATES = 15
-MOVED = 9  # of them, those that the IMU moves: all but the biases
+IMU_STATE_COUNT = 9  # of them, those that the IMU moves: all but the biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
 EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, where they are fused
 
 
 @dataclass(frozen=True)
-class Sensed:
+class SensorSamples:
     """What the magnetometer or optical flow measured in one stretch, in m means of some samples.
 
     Attributes
@@ -92,11 +92,11 @@ class Sensed:
     noise: Array
     gate: float = np.inf
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)
-class Heights:
+class HeightSamples:
     """What EKF2's height rests on in one stretch.
 
     Attributes
@@ -126,7 +126,7 @@ class Heights:
     dead_m: Array
     weight: float
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Stretch:
         None: the heading is EKF2's own as flown, whatever is changed.
     heights : Heights or None
         None: the height is EKF2's own as flown, or vision's.
-    shaken : ndarray, shape (n + 1,), or None
+    distrusted_share : ndarray, shape (n + 1,), or None
         Share of the accelerometer's axes that EKF2 relied on less in the step before: all while it
         took the vertical acceleration to be wrong, else those at the end of their range (of the
         axes together, as R turns them); None: never any.
@@ -196,14 +196,14 @@ class Stretch:
     attitude_error_rad: Array
     correlation: Array
     fusing: bool = True
-    field: Sensed | None = None
-    heights: Heights | None = None
-    shaken: Array | None = None
-    flow: Sensed | None = None
+    field: SensorSamples | None = None
+    heights: HeightSamples | None = None
+    distrusted_share: Array | None = None
+    flow: SensorSamples | None = None
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     history: "Stretch | None" = None
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @cached_property
     def gained_m_s(self) -> Array:
@@ -220,7 +220,7 @@ class Stretch:
         return np.concatenate([np.zeros((1, 3)), path])
 
 
-def by_event(
+def samples_by_event(
     stretch: Stretch, end: IntArray, step: IntArray, position_m: Array, axes: slice, *more: Array
 ) -> Array:
     """Positions by the event at which they are fused, for the k that come in one interval at most.
@@ -246,21 +246,25 @@ def by_event(
     event = np.searchsorted(end, step)
     event = event[event < len(end)]
     count = len(event)
-    step, at = step[:count], end[event]
-    age_s = stretch.time_s[at] - stretch.time_s[step]
+    step, event_step = step[:count], end[event]
+    age_s = stretch.time_s[event_step] - stretch.time_s[step]
     path, speed = stretch.path_m[:, axes], stretch.gained_m_s[:, axes]
-    position_m = position_m[:count] + path[at] - path[step] - speed[at] * age_s[:, None]
-    place = np.arange(count) - np.searchsorted(event, event)
-    told = *position_m.T, age_s, *(each[:count] for each in more), np.ones(count)
-    samples = np.zeros((len(told), place.max(initial=-1) + 1, len(end)))
-    samples[:, place, event] = told
+    position_m = (
+        position_m[:count] + path[event_step] - path[step] - speed[event_step] * age_s[:, None]
+    )
+    slot = np.arange(count) - np.searchsorted(event, event)
+    sample_columns = *position_m.T, age_s, *(each[:count] for each in more), np.ones(count)
+    samples = np.zeros((len(sample_columns), slot.max(initial=-1) + 1, len(end)))
+    samples[:, slot, event] = sample_columns
     return samples
 
 
-def padded(found: Sequence[Array]) -> list[Array]:
-    """The same of :func:`by_event` for several sets of events, with room for as many in each."""
-    most = max(samples.shape[1] for samples in found)
-    return [np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in found]
+def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
+    """The same of :func:`samples_by_event` for several sets of events, with room for as many in each."""
+    max_slots = max(samples.shape[1] for samples in sample_arrays)
+    return [
+        np.pad(each, ((0, 0), (0, max_slots - each.shape[1]), (0, 0))) for each in sample_arrays
+    ]
 
 
 def find_stretches(
@@ -296,51 +300,59 @@ def find_stretches(
     for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
         gap = np.flatnonzero(np.diff(stamps) > limit)
         cuts += [*stamps[gap], *stamps[gap + 1]]
-    cuts += _breaks_s(imu, ekf2) if gnss else ()
+    cuts += _break_times_s(imu, ekf2) if gnss else ()
     first = max(attitude.index[0], source_s[0])
     last = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    of_field = _field_s(record) if gnss else None
-    cuts += of_field[1:] if of_field else ()
+    field_span = _field_span(record) if gnss else None
+    cuts += field_span[1:] if field_span else ()
     # another instance has states of its own
     cuts += [time_s for time_s, _ in ekf2.instances[1:]]
-    found = []
+    stretches = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
-        inside = fused[(fused >= low) & (fused <= high)]
-        if not len(inside):
+        fused_inside = fused[(fused >= low) & (fused <= high)]
+        if not len(fused_inside):
             continue
         starts = [off + AIRBORNE_S for off, _ in airborne if off < high][:1]
-        if of_field and low <= of_field[0] < high:
-            starts.append(of_field[0])
-        at = int(np.searchsorted(states, max([inside[0] + START_AFTER_S, *starts])))
-        if at == len(states) or high - states[at] < MIN_STRETCH_S:
+        if field_span and low <= field_span[0] < high:
+            starts.append(field_span[0])
+        start_row = int(np.searchsorted(states, max([fused_inside[0] + START_AFTER_S, *starts])))
+        if start_row == len(states) or high - states[start_row] < MIN_STRETCH_S:
             continue
-        covered = (time[1:] > states[at]) & (time[:-1] < high)
-        if not np.all(np.diff(time)[covered] <= IMU_GAP_S):
+        is_covered = (time[1:] > states[start_row]) & (time[:-1] < high)
+        if not np.all(np.diff(time)[is_covered] <= IMU_GAP_S):
             continue
-        parts = imu, attitude, ekf2, record
+        stretch_inputs = imu, attitude, ekf2, record
         if not gnss:
-            found.append(_stretch(*parts, at, high))
+            stretches.append(_stretch(*stretch_inputs, start_row, high))
             continue
-        made = _on_gnss(*parts, at, high)
-        before = int(np.searchsorted(states, max(first, states[at] - HISTORY_S)))
-        if before < at:
-            made = replace(made, history=_on_gnss(*parts, before, states[at]))
-        within = of_field and of_field[0] <= states[at] and high <= of_field[1]
-        found.append(_with_field(made, record, at, ekf2.step_s) if within else made)
-    return tuple(found)
+        stretch = _gnss_stretch(*stretch_inputs, start_row, high)
+        history_row = int(np.searchsorted(states, max(first, states[start_row] - HISTORY_S)))
+        if history_row < start_row:
+            stretch = replace(
+                stretch, history=_gnss_stretch(*stretch_inputs, history_row, states[start_row])
+            )
+        has_field = field_span and field_span[0] <= states[start_row] and high <= field_span[1]
+        stretches.append(
+            _add_field(stretch, record, start_row, ekf2.step_s) if has_field else stretch
+        )
+    return tuple(stretches)
 
 
-def _on_gnss(
-    imu: pd.DataFrame, attitude: pd.DataFrame, ekf2: Ekf2, record: FusionRecord, at: int,
+def _gnss_stretch(
+    imu: pd.DataFrame,
+    attitude: pd.DataFrame,
+    ekf2: Ekf2,
+    record: FusionRecord,
+    start_row: int,
     end_s: float,
-) -> Stretch:  # fmt: skip
+) -> Stretch:
     """A stretch on an earth that turns, where bad accelerations are relied on less."""
-    made = _on_earth(_stretch(imu, attitude, ekf2, record, at, end_s), record)
-    return replace(made, shaken=_shaken(imu, record, made.time_s))
+    stretch = _on_rotating_earth(_stretch(imu, attitude, ekf2, record, start_row, end_s), record)
+    return replace(stretch, distrusted_share=_distrusted_share(imu, record, stretch.time_s))
 
 
-def _on_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
+def _on_rotating_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
     """The same stretch on an earth that turns, its position in EKF2's own metres."""
     metres, state = metres_of(record), stretch.state.copy()
     state[POSITION] *= metres
@@ -350,31 +362,37 @@ def _on_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
     )
 
 
-def _breaks_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
+def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     """Beginnings and ends of what the model cannot follow.
 
     Many clipped samples, which lose motion as a gap does, and resets of EKF2's height and vertical
     velocity, which are published a while after.
     """
-    breaks = [time for reset in ekf2.resets if reset.delta[2]
-              for time in (reset.time_s - RESET_LATE_S, reset.time_s)]  # fmt: skip
+    breaks = [
+        time
+        for reset in ekf2.resets
+        if reset.delta[2]
+        for time in (reset.time_s - MAX_RESET_DELAY_S, reset.time_s)
+    ]
     if "clipped" in imu:
         times = imu.index.to_numpy()
         clipped_s = times[imu["clipped"].to_numpy() > 0.0]
         begin, end = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
-        many = clipped_s[end - begin > CLIPPED_SHARE / float(np.median(np.diff(times)))]
-        breaks += [*(many - 0.5), *(many + 0.5)]
+        clipped_moments = clipped_s[
+            end - begin > MAX_CLIPPED_SHARE / float(np.median(np.diff(times)))
+        ]
+        breaks += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
     return breaks
 
 
-def _shaken(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
+def _distrusted_share(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
     """Share of the accelerometer's axes that are relied on less, at the end of each step."""
-    shaken = record.was(BAD_ACCELERATION, time_s).astype(float)
+    share_by_step = record.was_in_state(BAD_ACCELERATION, time_s).astype(float)
     if "clipped" in imu:  # a bit for each axis
         clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
-        share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
-        np.maximum.at(shaken, np.searchsorted(time_s, clipped.index), share)
-    return shaken
+        clipped_share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
+        np.maximum.at(share_by_step, np.searchsorted(time_s, clipped.index), clipped_share)
+    return share_by_step
 
 
 def _stretch(
@@ -382,17 +400,17 @@ def _stretch(
     attitude: pd.DataFrame,
     ekf2: Ekf2,
     record: FusionRecord,
-    at: int,
+    start_row: int,
     end_s: float,
 ) -> Stretch:
-    start = record.delayed.iloc[at].astype(np.float64)
+    start = record.delayed.iloc[start_row].astype(np.float64)
     time = imu.index.to_numpy()
-    first_row = int(np.argmin(np.abs(time - record.delayed.index[at])))
+    first_row = int(np.argmin(np.abs(time - record.delayed.index[start_row])))
     rows = slice(first_row, int(np.searchsorted(time, end_s, side="right")))
     time, imu = time[rows], imu.iloc[rows]
     interval = np.diff(time)
-    known = same_stamps(time, record.delayed.index)
-    ends = step_ends(interval, known, predict_s(record))
+    end_stamps = rows_of_stamps(time, record.delayed.index)
+    ends = step_ends(interval, end_stamps, predict_s(record))
     bias = np.asarray(start[Columns.ACCELEROMETER_BIAS])
     rate = imu[Columns.ANGULAR_RATE].to_numpy()[1:] - np.asarray(start[Columns.GYRO_BIAS])
     force = imu[Columns.SPECIFIC_FORCE].to_numpy()[1:] - bias
@@ -401,17 +419,19 @@ def _stretch(
     step = np.diff(times)
     gyro = running_product(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(turn)]))
 
-    def beyond(frame: pd.DataFrame, early_s: float, known: Array) -> tuple[Array, Array]:
+    def attitude_beyond(
+        frame: pd.DataFrame, early_s: float, end_stamps: Array
+    ) -> tuple[Array, Array]:
         """Times of a frame's attitudes, and what they have beyond the known ones at the steps."""
         inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
         at_s, own = frame.index[inside].to_numpy(), frame.loc[inside, Columns.QUATERNION].to_numpy()
-        return at_s, multiply(own, conjugate(interpolate(at_s, times, known)))
+        return at_s, multiply(own, conjugate(interpolate(at_s, times, end_stamps)))
 
     # what the published attitude has beyond the gyro's, in the earth frame
-    extra = interpolate(times, *beyond(attitude, 0.0, gyro))
-    nominal = multiply(extra, gyro)
-    states, turned = beyond(record.delayed, 1e-4, nominal)
-    error = to_vector(turned)
+    extra_rotation = interpolate(times, *attitude_beyond(attitude, 0.0, gyro))
+    nominal = multiply(extra_rotation, gyro)
+    states, turned_states = attitude_beyond(record.delayed, 1e-4, nominal)
+    error = to_vector(turned_states)
     published = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION]
     position = start[Columns.POSITION].to_numpy()
     position = np.where(np.isfinite(position), position, published)
@@ -420,74 +440,80 @@ def _stretch(
         time_s=times,
         step_s=step,
         rotation=matrix(nominal),
-        correction_rad=to_vector(multiply(extra[1:], conjugate(extra[:-1]))),
+        correction_rad=to_vector(multiply(extra_rotation[1:], conjugate(extra_rotation[:-1]))),
         force_m_s2=gain / step[:, None],
         accelerometer_bias_m_s2=bias,
         state=np.concatenate([error[0], start[Columns.VELOCITY], position, np.zeros(6)]),
         variance=np.asarray(start[Columns.DELAYED_VARIANCE[:15]]),
-        down_m=_at(ekf2.state["down_m"], times),
+        down_m=_interpolate(ekf2.state["down_m"], times),
         attitude_variance_rad2=np.column_stack(
-            [_at(record.delayed[name], times) for name in Columns.DELAYED_VARIANCE[:3]]
+            [_interpolate(record.delayed[name], times) for name in Columns.DELAYED_VARIANCE[:3]]
         ),
-        down_variance_m2=_at(record.delayed["down_m2"], times),
-        attitude_error_rad=np.column_stack([np.interp(times, states, part) for part in error.T]),
+        down_variance_m2=_interpolate(record.delayed["down_m2"], times),
+        attitude_error_rad=np.column_stack(
+            [np.interp(times, states, component) for component in error.T]
+        ),
         correlation=np.eye(15),
     )
 
 
-def _field_s(record: FusionRecord) -> tuple[float, float] | None:
+def _field_span(record: FusionRecord) -> tuple[float, float] | None:
     """From when to when EKF2 fused all of the field, without a break, once it was settled."""
     fused = record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
-    times, on = fused.index.to_numpy(), fused.to_numpy() > 0.0
-    if not on.any() or 1.0 / np.median(np.diff(times)) < LEAST_FIELD_HZ:
+    times, is_fused = fused.index.to_numpy(), fused.to_numpy() > 0.0
+    if not is_fused.any() or 1.0 / np.median(np.diff(times)) < MIN_FIELD_HZ:
         return None
-    first, last = np.flatnonzero(on)[[0, -1]]
-    if not on[first:last].all():
+    first, last = np.flatnonzero(is_fused)[[0, -1]]
+    if not is_fused[first:last].all():
         return None
     return float(times[first]) + FIELD_AFTER_S, float(times[last])
 
 
-def _with_field(stretch: Stretch, record: FusionRecord, at: int, step_s: float) -> Stretch:
+def _add_field(stretch: Stretch, record: FusionRecord, start_row: int, step_s: float) -> Stretch:
     """The same stretch with the magnetic fields among its states."""
-    start, frame = record.delayed.iloc[at], record.field_gauss
+    start, frame = record.delayed.iloc[start_row], record.field_gauss
     stamps = frame.index.to_numpy()
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     weight = max(FIELD_HZ * float(np.median(np.diff(stamps))), 1.0)
     gauss = frame.iloc[:, :3].to_numpy()
     fields = np.asarray(start[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
     variance = np.asarray(start[Columns.DELAYED_VARIANCE[-6:]])
-    made = with_field(stretch, stamps - age_s, gauss, weight, fields, variance)
+    extended = add_field_states(stretch, stamps - age_s, gauss, weight, fields, variance)
     if Columns.FIELD_INNOVATION[0] not in frame:
-        return made
-    filtered = frame[Columns.FIELD_INNOVATION].to_numpy()
-    return replace(made, field=_mean_field(stretch, record.delayed, stamps - age_s, filtered))
+        return extended
+    filtered_gauss = frame[Columns.FIELD_INNOVATION].to_numpy()
+    return replace(
+        extended, field=_mean_field(stretch, record.delayed, stamps - age_s, filtered_gauss)
+    )
 
 
 def _mean_field(
     stretch: Stretch, delayed: pd.DataFrame, taken_s: Array, filtered_gauss: Array
-) -> Sensed:
+) -> SensorSamples:
     """Of the field, means of all samples between two rows, by EKF2's low pass of its innovations.
 
     An innovation is what EKF2 expected minus what was measured, and what it expected is known.
     """
     between_s = np.diff(taken_s)
-    inside = (taken_s[:-1] > stretch.time_s[0]) & (taken_s[1:] <= stretch.time_s[-1])
-    row = np.flatnonzero(inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
-    taken_s, between_s = taken_s[row], between_s[row - 1]
+    is_inside = (taken_s[:-1] > stretch.time_s[0]) & (taken_s[1:] <= stretch.time_s[-1])
+    rows = np.flatnonzero(is_inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
+    taken_s, between_s = taken_s[rows], between_s[rows - 1]
     count = np.maximum(np.rint(FIELD_HZ * between_s), 1.0)
     share = between_s / (between_s + count * FILTER_S)
-    kept = ((1.0 - share) ** count)[:, None]
-    innovation = (filtered_gauss[row] - kept * filtered_gauss[row - 1]) / (1.0 - kept)
+    decay = ((1.0 - share) ** count)[:, None]
+    innovation = (filtered_gauss[rows] - decay * filtered_gauss[rows - 1]) / (1.0 - decay)
     step, weight = low_passed(stretch, taken_s, count, between_s / count, share)
     turn = stretch.rotation[step].swapaxes(2, 3)
     earth, body = (
         np.column_stack([np.interp(taken_s, delayed.index, delayed[name]) for name in names])
         for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
     )
-    seen = earth[:, None] - np.cross(stretch.attitude_error_rad[step], earth[:, None])
-    expected = np.einsum("ki,kiab,kib->ka", weight, turn, seen) + body
+    rotated_earth_field = earth[:, None] - np.cross(
+        stretch.attitude_error_rad[step], earth[:, None]
+    )
+    expected = np.einsum("ki,kiab,kib->ka", weight, turn, rotated_earth_field) + body
     mean = np.einsum("ki,kiab->kab", weight, turn)
-    return Sensed(step[:, 0], expected - innovation, mean, count, np.zeros(len(row)))
+    return SensorSamples(step[:, 0], expected - innovation, mean, count, np.zeros(len(rows)))
 
 
 def low_passed(
@@ -514,7 +540,7 @@ def low_passed(
     return np.searchsorted(stretch.time_s, taken_s - 1e-9), weight
 
 
-def with_field(
+def add_field_states(
     stretch: Stretch, taken_s: Array, gauss: Array, weight: float, fields: Array, variance: Array
 ) -> Stretch:
     """The same stretch with the fields of earth and body among its states, uncorrelated with them.
@@ -528,22 +554,22 @@ def with_field(
     fields, variance : ndarray, shape (6,)
         At the start, of earth (NED) and body.
     """
-    step, inside = steps_of(stretch, taken_s)
+    step, inside = sample_steps(stretch, taken_s)
     turn, count = stretch.rotation[step].transpose(0, 2, 1), len(step)
     return replace(
         stretch,
         state=np.concatenate([stretch.state, fields]),
         variance=np.concatenate([stretch.variance, variance]),
         correlation=block_diag(stretch.correlation, np.eye(len(fields))),
-        field=Sensed(step, gauss[inside], turn, np.full(count, weight), np.zeros(count)),
+        field=SensorSamples(step, gauss[inside], turn, np.full(count, weight), np.zeros(count)),
     )
 
 
-def steps_of(stretch: Stretch, taken_s: Array) -> tuple[IntArray, BoolArray]:
+def sample_steps(stretch: Stretch, taken_s: Array) -> tuple[IntArray, BoolArray]:
     """Step at the end of which each sample in a stretch is taken, and which samples those are."""
     step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
-    inside = (step > 0) & (step < len(stretch.time_s))
-    return step[inside], inside
+    is_inside = (step > 0) & (step < len(stretch.time_s))
+    return step[is_inside], is_inside
 
 
 def predict_s(record: FusionRecord) -> float:
@@ -551,7 +577,7 @@ def predict_s(record: FusionRecord) -> float:
     return record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
-def _at(series: pd.Series, times: Array) -> Array:
+def _interpolate(series: pd.Series, times: Array) -> Array:
     return np.asarray(np.interp(times, series.index, series))
 
 
@@ -575,14 +601,14 @@ def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
     ndarray of int
         The last is at most n.
     """
-    needed = samples_per_step(target_s, float(np.median(interval_s)), known)
-    shown = set(known.tolist())
+    samples_needed = samples_per_step(target_s, float(np.median(interval_s)), known)
+    known_ends = set(known.tolist())
     ends, count, total = [], 0, 0.0
-    for at, interval in enumerate(interval_s.tolist(), start=1):
+    for sample, interval in enumerate(interval_s.tolist(), start=1):
         count, total = count + 1, total + interval
-        complete = count >= needed and total > 0.5 * target_s
-        if complete or total > target_s or at in shown:
-            ends.append(at)
+        is_complete = count >= samples_needed and total > 0.5 * target_s
+        if is_complete or total > target_s or sample in known_ends:
+            ends.append(sample)
             count, total = 0, 0.0
     return np.array(ends, dtype=np.intp)
 
@@ -594,7 +620,7 @@ def down_sampled(turn: Array, gain: Array, ends: IntArray) -> tuple[Array, Array
     total = turned[ends] - turned[starts]
     count = ends - starts
     of_step = np.repeat(np.arange(len(ends)), count)
-    used = slice(0, int(ends[-1]))
-    left = turned[ends][of_step] - 0.5 * (turned[:-1][used] + turned[1:][used])
-    seen_from_end = gain[used] - np.cross(left, gain[used])
+    used_rows = slice(0, int(ends[-1]))
+    remaining_turn = turned[ends][of_step] - 0.5 * (turned[:-1][used_rows] + turned[1:][used_rows])
+    seen_from_end = gain[used_rows] - np.cross(remaining_turn, gain[used_rows])
     return total, np.add.reduceat(seen_from_end, starts, axis=0)

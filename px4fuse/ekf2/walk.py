@@ -20,19 +20,19 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, aids_of, delayed_variants, obedient
+from px4fuse.ekf2.model import Model, delayed_variants, modelled_aids, replay_with_logged_rejections
 from px4fuse.ekf2.recursion import Variant
-from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, rms_to_truth, settled
+from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, inside_spans, rms_to_truth
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
-from px4fuse.record import Count, NotNegative, Record, lacking
+from px4fuse.record import Count, NotNegative, Record, missing_data
 
-WHAT = "why EKF2 differs"
+ANALYSIS_NAME = "why EKF2 differs"
 OTHER_TIME = Unavailable("RMSE to truth", "the truth is of another time", "Record both together.")
 # The filter of the lesson spreads its process noise over steps of DT (DESIGN: Q per second is
 # SIGMA_A² · DT); EKF2 adds EKF2_ACC_NOISE² · Δt² each step, EKF2_ACC_NOISE² · Δt per second
@@ -79,7 +79,7 @@ class Step(Record, frozen=True, kw_only=True):
     position_rmse_to_truth_m: NotNegative | None = None
 
 
-class Coast(Record, frozen=True, kw_only=True):
+class RejectionRun(Record, frozen=True, kw_only=True):
     """The longest run of rejected samples in flight.
 
     Attributes
@@ -99,7 +99,7 @@ class Coast(Record, frozen=True, kw_only=True):
     distance_m: NotNegative
 
 
-class Outside(Record, frozen=True):
+class UnreplayedPart(Record, frozen=True):
     """Where the walk does not lead: parts of the segment in which EKF2 started or did not fuse.
 
     Attributes
@@ -145,8 +145,8 @@ class WhySteps(Record, frozen=True, kw_only=True):
     velocity_left_mean_square_m2_s2: NotNegative
     position_rmse_to_truth_m: Mapping[str, NotNegative | Unavailable]
     spans_s: Spans
-    coast: Coast | None = None
-    outside: Outside | None = None
+    coast: RejectionRun | None = None
+    outside: UnreplayedPart | None = None
     sentences: tuple[str, ...] = ()
 
     @property
@@ -160,22 +160,22 @@ class Why(WhySteps, frozen=True, kw_only=True, eq=False):
 
     Attributes
     ----------
-    times_s, apart_m, left_m : ndarray
+    times_s, kf_minus_ekf2_m, unexplained_m : ndarray
         EKF2's own sample times, and how far our filter and the model are from EKF2's position.
     cause : str
         The weightiest of the steps in a sentence, without its moment.
     """
 
-    written_as = WhySteps
+    schema_type = WhySteps
     times_s: Array
-    apart_m: Array
-    left_m: Array
+    kf_minus_ekf2_m: Array
+    unexplained_m: Array
     cause: str = ""
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-def walk(
+def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
 ) -> dict[str, Why] | Unavailable:
     """Walk from our filter to the logged EKF2, without words.
@@ -195,19 +195,22 @@ def walk(
         Unavailable where the model does not reproduce what was logged.
     """
     if not model.agreement.good:
-        return model.agreement.doubted(WHAT)
+        return model.agreement.as_unavailable(ANALYSIS_NAME)
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    variants = on_the_way(model.inputs, settings or Settings())
-    delayed, flown = delayed_variants(model, list(variants.values())), obedient(model)
-    judged, times = model.flown.judged_s, ekf2.state.index.to_numpy()
-    inside = settled(times, judged)
+    variants = step_variants(model.inputs, settings or Settings())
+    delayed, flown = (
+        delayed_variants(model, list(variants.values())),
+        replay_with_logged_rejections(model),
+    )
+    evaluated_spans, times = model.flown.judged_s, ekf2.state.index.to_numpy()
+    is_inside = inside_spans(times, evaluated_spans)
     # all stages have the replay's times
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
-        inside &= (times >= index[0]) & (times <= index[-1])
-    times = times[inside]
+        is_inside &= (times >= index[0]) & (times <= index[-1])
+    times = times[is_inside]
     if not len(times):
-        return lacking("walk_elsewhere", what=WHAT)
+        return missing_data("walk_elsewhere", what=ANALYSIS_NAME)
     span = float(times[0]), float(times[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
@@ -223,31 +226,31 @@ def walk(
         )
         if stage in (ATTITUDE, FIELD, SPEED, FLOWING, VISION):  # the last without a gate
             ungated = track
-    spans = Segment(*span, "").cut(judged)
-    coast = _coast(flown, ungated, span, judged)
-    truth, found = model.flight.truth, {}
-    untrue = OTHER_TIME if isinstance(truth, Truth) else truth
-    for at, (axis, direction) in enumerate(directions.items()):
-        ours = state_at(runs[axis], times) if runs else stages[0][at]
+    spans = Segment(*span, "").cut(evaluated_spans)
+    coast = _longest_rejection(flown, ungated, span, evaluated_spans)
+    truth, steps_by_axis = model.flight.truth, {}
+    no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
+    for axis_index, (axis, direction) in enumerate(directions.items()):
+        kf_state = state_at(runs[axis], times) if runs else stages[0][axis_index]
         # ours, after each step, and the logged EKF2, shape (k + 2, 2, n)
-        path = np.array([ours, *(stage[at] for stage in stages)])
-        apart = path - path[-1]
+        path = np.array([kf_state, *(stage[axis_index] for stage in stages)])
+        difference = path - path[-1]
         errors = [rms_to_truth(model.flight, track, direction, times) for track in path[:, 0]]
-        position, velocity = np.mean(apart[:-1] ** 2, axis=2).T.tolist()
-        moved = np.abs(np.diff(path[:-1, 0], axis=0))
+        position, velocity = np.mean(difference[:-1] ** 2, axis=2).T.tolist()
+        position_change = np.abs(np.diff(path[:-1, 0], axis=0))
         steps = tuple(
             Step(
                 name=name,
-                position_mean_square_m2=position[after - 1] - position[after],
-                velocity_mean_square_m2_s2=velocity[after - 1] - velocity[after],
-                position_moved_m=float(moved[after - 1].max()),
-                moved_at_s=float(times[moved[after - 1].argmax()]),
-                position_rmse_to_truth_m=errors[after],
+                position_mean_square_m2=position[step_index - 1] - position[step_index],
+                velocity_mean_square_m2_s2=velocity[step_index - 1] - velocity[step_index],
+                position_moved_m=float(position_change[step_index - 1].max()),
+                moved_at_s=float(times[position_change[step_index - 1].argmax()]),
+                position_rmse_to_truth_m=errors[step_index],
             )
-            for after, name in enumerate((*variants, OUTPUT), start=1)
+            for step_index, name in enumerate((*variants, OUTPUT), start=1)
         )
-        ends = {"kf": errors[0], "ekf2": errors[-1]}
-        found[axis] = Why(
+        filter_errors = {"kf": errors[0], "ekf2": errors[-1]}
+        steps_by_axis[axis] = Why(
             count=len(times),
             position_mean_square_m2=position[0],
             velocity_mean_square_m2_s2=velocity[0],
@@ -255,55 +258,66 @@ def walk(
             position_left_mean_square_m2=position[-1],
             velocity_left_mean_square_m2_s2=velocity[-1],
             position_rmse_to_truth_m={
-                name: untrue if error is None else error for name, error in ends.items()
+                name: no_truth if error is None else error for name, error in filter_errors.items()
             },
             spans_s=spans,
             coast=coast,
             times_s=times,
             # copies: a view would keep all steps
-            apart_m=apart[0, 0].copy(),
-            left_m=apart[-2, 0].copy(),
+            kf_minus_ekf2_m=difference[0, 0].copy(),
+            unexplained_m=difference[-2, 0].copy(),
         )
-    return found
+    return steps_by_axis
 
 
-def on_the_way(inputs: Inputs, ours: Settings) -> dict[str, Variant]:
+def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
     """The filter after each step but the last; from one to the next, one thing changes."""
     flown, aid, received = inputs.settings, inputs.aid, inputs.received
-    spread = {"EKF2_ACC_NOISE": float(ours.sigma_a_m_s2 * np.sqrt(ours.dt_s / inputs.step_s))}
-    own = {**flown, **spread, aid.noise: ours.sigma_z_m}
+    kf_process_noise = {
+        "EKF2_ACC_NOISE": float(
+            kf_settings.sigma_a_m_s2 * np.sqrt(kf_settings.dt_s / inputs.step_s)
+        )
+    }
+    kf_parameters = {**flown, **kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # from positions of GNSS, which ours is given, the delay was taken already
-    taken_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
-    offset_s = ours.clock_offset_s - taken_s
-    unmoved = {**own, **dict.fromkeys(aid.place, 0.0)}
-    aids = aids_of(inputs)
+    applied_delay_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
+    offset_s = kf_settings.clock_offset_s - applied_delay_s
+    without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.place, 0.0)}
+    aids = modelled_aids(inputs)
     others = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
-    bare = Variant(
-        own, biases=False, attitude=False, velocity=False, reported=False, gated=False,
+    kf_variant = Variant(
+        kf_parameters,
+        biases=False,
+        attitude=False,
+        velocity=False,
+        reported=False,
+        gated=False,
         without=dict.fromkeys((MAG.name, *others), 0.0),
-    )  # fmt: skip
+    )
     variants = {
-        SAMPLES: replace(bare, settings=unmoved, stamp_offset_s=offset_s),
-        STAMPS: bare,
-        NOISE: (noise := replace(bare, settings={**flown, **spread}, reported=True)),
+        SAMPLES: replace(kf_variant, settings=without_lever_arm, stamp_offset_s=offset_s),
+        STAMPS: kf_variant,
+        NOISE: (
+            noise := replace(kf_variant, settings={**flown, **kf_process_noise}, reported=True)
+        ),
         BIASES: replace(noise, biases=True),
         PROCESS: replace(noise, settings=flown, biases=True),
-        ATTITUDE: (last := replace(noise, settings=flown, biases=True, attitude=True)),
+        ATTITUDE: (variant := replace(noise, settings=flown, biases=True, attitude=True)),
     }
     if MAG.name in aids:
-        variants[FIELD] = last = replace(last, without=dict.fromkeys(others, 0.0))
+        variants[FIELD] = variant = replace(variant, without=dict.fromkeys(others, 0.0))
     if received.velocity_m_s is not None:
-        variants[SPEED] = last = replace(last, velocity=True)
-    for at, name in enumerate(others, start=1):
+        variants[SPEED] = variant = replace(variant, velocity=True)
+    for position, name in enumerate(others, start=1):
         step = FLOWING if name == FLOW.name else VISION
-        variants[step] = last = replace(last, without=dict.fromkeys(others[at:], 0.0))
+        variants[step] = variant = replace(variant, without=dict.fromkeys(others[position:], 0.0))
     return variants | {GATE: Variant(flown, as_logged=True)}
 
 
-def _coast(
-    flown: Ekf2Replay, ungated: pd.DataFrame, span: tuple[float, float], judged: Spans
-) -> Coast | None:
-    updates = flown.updates[settled(flown.updates.index, judged)]
+def _longest_rejection(
+    flown: Ekf2Replay, ungated: pd.DataFrame, span: tuple[float, float], spans: Spans
+) -> RejectionRun | None:
+    updates = flown.updates[inside_spans(flown.updates.index, spans)]
     updates = updates[updates["fused_at_s"].between(*span)]
     rejected, time = updates["rejected"].to_numpy() > 0, updates["fused_at_s"].to_numpy()
     if not rejected.any():
@@ -313,14 +327,14 @@ def _coast(
     starts, ends = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
     longest = int(np.argmax(ends - starts))
     begin, end = time[starts[longest]], time[min(ends[longest], len(time) - 1)]
-    part = flown.delayed.loc[begin:end]
-    apart = [
-        part[column] - np.interp(part.index, ungated.index, ungated[column])
+    rejected_part = flown.delayed.loc[begin:end]
+    ungated_difference = [
+        rejected_part[column] - np.interp(rejected_part.index, ungated.index, ungated[column])
         for column in Columns.POSITION[:2]
     ]
-    return Coast(
+    return RejectionRun(
         start_s=float(begin),
         samples=int(ends[longest] - starts[longest]),
         duration_s=float(end - begin),
-        distance_m=float(np.max(np.hypot(*apart))),
+        distance_m=float(np.max(np.hypot(*ungated_difference))),
     )

@@ -12,9 +12,9 @@ import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.arrays import Array
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.ekf2.inputs import horizontal_resets_s
-from px4fuse.ekf2.model import Model, aids_of, disturbed, replay_settings
+from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
     HORIZONTAL,
     Agreement,
@@ -22,22 +22,22 @@ from px4fuse.ekf2.replay import (
     Spans,
     along,
     axes_of,
-    logged_besides,
+    inside_spans,
+    logged_aid_innovations,
     logged_innovations,
     rms_to_truth,
-    settled,
 )
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, check
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, check_parameters
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.heading import heading_rad
 from px4fuse.flight import AxisName, Columns, Ekf2, Flight, Unavailable
-from px4fuse.record import Count, NotNegative, Record, Share, lacking
+from px4fuse.record import Count, NotNegative, Record, Share, missing_data
 
-WHAT = "EKF2 what-if"
+ANALYSIS_NAME = "EKF2 what-if"
 # Below this share of EKF2's samples in the log, gaps between fusions cannot be told from it
-COMPLETE_SHARE = 0.9
-NO_TRUTH = lacking("rmse_without_truth")
+MIN_COMPLETE_SHARE = 0.9
+NO_TRUTH = missing_data("rmse_without_truth")
 # Of a flight on GNSS
 HEADING_FOLLOWS = (
     "The heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
@@ -48,18 +48,18 @@ HEADING_STAYS = (
     "fused of a magnetometer, all axes throughout"
 )
 HEIGHT_FOLLOWS, HEIGHT_STAYS = "The height follows too", "The height is EKF2's own as flown"
-OWN_HEADING, OWN_HEIGHT = lacking("heading_own"), lacking("height_own")
+OWN_HEADING, OWN_HEIGHT = missing_data("heading_own"), missing_data("height_own")
 # What must be left to judge once an aid is taken away
-JUDGED_S = 5.0
+MIN_EVALUATED_S = 5.0
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
 # Each rejection decides the next: a prediction is steady where millimetres of noise on positions
 # leave it where it was, and never where most samples are rejected
 DISTURBED_M, DISTURBED_RUNS = 0.002, 4
-FEW_REJECTED, MOST_REJECTED = 0.02, 0.35
+MIN_REJECTED_SHARE, MAX_REJECTED_SHARE = 0.02, 0.35
 # After so long without a height EKF2 resets it (hgt_fusion_timeout_max, common.h)
 HEIGHT_TIMEOUT_S = 5.0
-STEADY_NIS, STEADY_REJECTED, STEADY_RMSE = 1.10, 0.03, 1.15
+MAX_NIS_RATIO, MAX_REJECTED_SPREAD, MAX_RMSE_RATIO = 1.10, 0.03, 1.15
 
 
 class AxisSummary(Record, frozen=True):
@@ -106,8 +106,8 @@ class HeightSummary(Record, frozen=True):
     @property
     def steady(self) -> bool:
         """Whether it goes on without the resets of EKF2's height, which the model does not have."""
-        kept = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
-        return kept and self.rejected_share <= MOST_REJECTED
+        is_without_reset = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
+        return is_without_reset and self.rejected_share <= MAX_REJECTED_SHARE
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
@@ -200,7 +200,7 @@ class WhatIf:
     judged: Spans
     notes: tuple[str, ...]
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 def what_if(
@@ -230,35 +230,42 @@ def what_if(
         after which nothing is left to judge.
     """
     if not model.agreement.good:
-        return model.agreement.doubted(WHAT)
+        return model.agreement.as_unavailable(ANALYSIS_NAME)
     without = without or {}
     replays = replay_settings(model, settings, without=without)
     flight, judged = model.flight, model.flown.judged_s
     if without:
         since = min(without.values())
         # each further stretch starts anew from the log, which had the aid
-        left = [(max(start, since), end) for start, end in judged if end - since > JUDGED_S]
-        judged = tuple(left[:1])
+        remaining_spans = [
+            (max(start, since), end) for start, end in judged if end - since > MIN_EVALUATED_S
+        ]
+        judged = tuple(remaining_spans[:1])
         if not judged:
             raise SettingsError.of(
-                "since_late", since=since, least_s=JUDGED_S, end_s=model.flown.judged_s[-1][1]
+                "since_late",
+                since=since,
+                least_s=MIN_EVALUATED_S,
+                end_s=model.flown.judged_s[-1][1],
             )
     gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
-        logged=_of_log(flight, model.flown, judged),
-        replayed=_of_replay(flight, model.flown, judged),
-        whatif=_steadied(model, [_of_replay(flight, r, judged) for r in replays], judged, without),
+        logged=_summarise_log(flight, model.flown, judged),
+        replayed=_summarise_replay(flight, model.flown, judged),
+        whatif=_mark_unpredictable(
+            model, [_summarise_replay(flight, r, judged) for r in replays], judged, without
+        ),
         judged=judged,
         notes=(
-            *(_of_heading_and_height(model) if replays and gnss else ()),
+            *(_heading_and_height_notes(model) if replays and gnss else ()),
             *(note for replay in replays for note in _notes(model, replay)),
-            *(_carried(model, replay, without, judged) for replay in replays if without),
+            *(_deviation_note(model, replay, without, judged) for replay in replays if without),
         ),
     )
 
 
-def _of_heading_and_height(model: Model) -> tuple[str, str]:
+def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     off_deg = model.agreement.heading_rms_difference_deg
     heading = HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
     return heading, HEIGHT_STAYS if model.inputs.imposed else HEIGHT_FOLLOWS
@@ -279,8 +286,8 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     >>> sweep_values("EKF2_EV_DELAY", 0, 200, 3)
     [0.0, 100.0, 200.0]
     """
-    check({name: low})
-    check({name: high})
+    check_parameters({name: low})
+    check_parameters({name: high})
     if not low < high:
         raise SettingsError(f"{name}={low:g}:{high:g}: the first value must be the smaller one.")
     if not 2 <= count <= MAX_SWEEP_VALUES:
@@ -290,95 +297,134 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     return [float(value) for value in values]
 
 
-def _steadied(
-    model: Model, found: Sequence[Summary], judged: Spans, without: Mapping[str, float]
+def _mark_unpredictable(
+    model: Model, summaries: Sequence[Summary], judged: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
     """Predictions, with whether each stays where it is when the positions are disturbed."""
-    runs = [[one] for one in found]
-    tried = [
-        same for same in runs
-        if same[0].changed and FEW_REJECTED < same[0].rejected_share <= MOST_REJECTED
-    ]  # fmt: skip
-    for seed in range(DISTURBED_RUNS if tried else 0):
-        other = disturbed(model, DISTURBED_M, seed)
-        again = replay_settings(other, [same[0].changed for same in tried], without=without)
-        for same, replay in zip(tried, again, strict=True):
-            same.append(_of_replay(model.flight, replay, judged))
-    return tuple(
-        replace(
-            one,
-            steady=all(height.steady for height in one.heights.values())
-            and all(other.rejected_share <= MOST_REJECTED for other in one.others.values())
-            and (not one.changed or (one.rejected_share <= MOST_REJECTED and _alike(same))),
+    runs = [[summary] for summary in summaries]
+    uncertain_runs = [
+        repeated_runs
+        for repeated_runs in runs
+        if repeated_runs[0].changed
+        and MIN_REJECTED_SHARE < repeated_runs[0].rejected_share <= MAX_REJECTED_SHARE
+    ]
+    for seed in range(DISTURBED_RUNS if uncertain_runs else 0):
+        disturbed_model = with_position_noise(model, DISTURBED_M, seed)
+        repeated_replays = replay_settings(
+            disturbed_model,
+            [repeated_runs[0].changed for repeated_runs in uncertain_runs],
             without=without,
         )
-        for one, same in zip(found, runs, strict=True)
+        for repeated_runs, replay in zip(uncertain_runs, repeated_replays, strict=True):
+            repeated_runs.append(_summarise_replay(model.flight, replay, judged))
+    return tuple(
+        replace(
+            summary,
+            steady=all(height.steady for height in summary.heights.values())
+            and all(
+                disturbed_model.rejected_share <= MAX_REJECTED_SHARE
+                for disturbed_model in summary.others.values()
+            )
+            and (
+                not summary.changed
+                or (summary.rejected_share <= MAX_REJECTED_SHARE and _agree(repeated_runs))
+            ),
+            without=without,
+        )
+        for summary, repeated_runs in zip(summaries, runs, strict=True)
     )
 
 
-def _alike(runs: Sequence[Summary]) -> bool:
+def _agree(runs: Sequence[Summary]) -> bool:
     """Whether all say the same of consistency, rejections and error."""
-    rmse = [e for one in runs if isinstance(e := one.position_rmse_to_truth_m, float)]
-    shares = [one.rejected_share for one in runs]
-    nis = [[one.axes[axis].nis_mean for one in runs] for axis in HORIZONTAL]
+    rmse = [e for summary in runs if isinstance(e := summary.position_rmse_to_truth_m, float)]
+    shares = [summary.rejected_share for summary in runs]
+    nis = [[summary.axes[axis].nis_mean for summary in runs] for axis in HORIZONTAL]
     return (
-        all(max(along) <= STEADY_NIS * min(along) for along in nis)
-        and max(shares) - min(shares) <= STEADY_REJECTED
-        and (not rmse or max(rmse) <= STEADY_RMSE * min(rmse))
+        all(max(values) <= MAX_NIS_RATIO * min(values) for values in nis)
+        and max(shares) - min(shares) <= MAX_REJECTED_SPREAD
+        and (not rmse or max(rmse) <= MAX_RMSE_RATIO * min(rmse))
     )
 
 
-def _of_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
+def _summarise_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
     updates = replay.updates
-    used, at = updates[settled(updates.index, judged)], updates["fused_at_s"].to_numpy()
+    evaluated_updates, fused_at_s = (
+        updates[inside_spans(updates.index, judged)],
+        updates["fused_at_s"].to_numpy(),
+    )
     # between the samples the variance grows from after one to before the next
-    variance = pd.DataFrame(index=np.column_stack([at - 1e-6, at]).ravel())
+    variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
         s, r = (updates[f"{of}_variance_{axis}_m2"] for of in ("innovation", "observation"))
         after = updates[f"position_variance_{axis}_m2"]
         variance[f"{axis}_m2"] = np.column_stack([s - r, after]).ravel()
-    fused = used["fused_at_s"][(used["fused"] > 0) | (used["reset"] > 0)]
-    resets = used["reset"].sum()
-    if (vision := replay.besides.get(EV_POS.name)) is not None:
-        resets += vision["reset"][settled(vision["fused_at_s"], judged)].sum()
-    return _summary(
-        flight, replay, judged, used, replay.published, variance, replay.besides,
+    fused = evaluated_updates["fused_at_s"][
+        (evaluated_updates["fused"] > 0) | (evaluated_updates["reset"] > 0)
+    ]
+    resets = evaluated_updates["reset"].sum()
+    if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
+        resets += vision["reset"][inside_spans(vision["fused_at_s"], judged)].sum()
+    return _make_summary(
+        flight,
+        replay,
+        judged,
+        evaluated_updates,
+        replay.published,
+        variance,
+        replay.other_aid_updates,
         replay.delayed["heading_rad"],
-        changed=replay.changed, longest_without_fusion_s=_longest(fused.to_numpy(), judged),
-        resets=int(resets), late=replay.late, lost=replay.lost,
-    )  # fmt: skip
+        changed=replay.changed,
+        longest_without_fusion_s=_longest_between_fusions(fused.to_numpy(), judged),
+        resets=int(resets),
+        late=replay.late,
+        lost=replay.lost,
+    )
 
 
-def _of_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
+def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = logged_innovations(ekf2)
-    used = logged[settled(logged.index, judged)]
-    behind_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
-    resets = horizontal_resets_s(ekf2) - behind_s
-    resets = resets[settled(resets, judged)]
-    replayed = int(settled(replay.updates.index, judged).sum())
-    longest: float | Unavailable = lacking("fusions_few", count=len(used), of=replayed)
-    if len(used) > COMPLETE_SHARE * replayed:
-        fused = used.index[used["rejected"] == 0].to_numpy()
-        longest = _longest(np.concatenate([fused, resets]), judged)
+    evaluated_updates = logged[inside_spans(logged.index, judged)]
+    horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
+    resets = horizontal_resets_s(ekf2) - horizon_s
+    resets = resets[inside_spans(resets, judged)]
+    replayed = int(inside_spans(replay.updates.index, judged).sum())
+    longest: float | Unavailable = missing_data(
+        "fusions_few", count=len(evaluated_updates), of=replayed
+    )
+    if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
+        fused = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
+        longest = _longest_between_fusions(np.concatenate([fused, resets]), judged)
     assert isinstance(flight.attitude, pd.DataFrame)  # it was replayed
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
-    besides = {name: logged_besides(name, ekf2.aids[name]) for name in replay.besides}
-    return _summary(
-        flight, replay, judged, used, ekf2.state, None, besides, heading,
-        changed={}, longest_without_fusion_s=longest, resets=len(resets),
-    )  # fmt: skip
+    other_aid_updates = {
+        name: logged_aid_innovations(name, ekf2.aids[name]) for name in replay.other_aid_updates
+    }
+    return _make_summary(
+        flight,
+        replay,
+        judged,
+        evaluated_updates,
+        ekf2.state,
+        None,
+        other_aid_updates,
+        heading,
+        changed={},
+        longest_without_fusion_s=longest,
+        resets=len(resets),
+    )
 
 
-def _summary(
+def _make_summary(
     flight: Flight,
     replay: Ekf2Replay,
     judged: Spans,
-    used: pd.DataFrame,
+    evaluated_updates: pd.DataFrame,
     published: pd.DataFrame,
     variance: pd.DataFrame | None,
-    besides: Mapping[str, pd.DataFrame],
+    other_aid_updates: Mapping[str, pd.DataFrame],
     heading: pd.Series,
     **more: Any,
 ) -> Summary:
@@ -389,7 +435,7 @@ def _summary(
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = ekf2.variance
-    times = ekf2.state.index[settled(ekf2.state.index, judged)].to_numpy()
+    times = ekf2.state.index[inside_spans(ekf2.state.index, judged)].to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
         position = along(published, Columns.POSITION, direction, times)
@@ -401,39 +447,49 @@ def _summary(
         if isinstance(logged, Unavailable):
             sigma = logged
         else:
-            at = logged.index[settled(logged.index, judged)].to_numpy()
-            known = logged if variance is None else variance
-            stated = np.interp(at, known.index, known[f"{axis}_m2"])
+            variance_s = logged.index[inside_spans(logged.index, judged)].to_numpy()
+            known_variance = logged if variance is None else variance
+            stated = np.interp(variance_s, known_variance.index, known_variance[f"{axis}_m2"])
             sigma = float(np.sqrt(np.median(stated)))
-        more[axis] = AxisSummary(*_innovations(used, axis), sigma, error_m(direction))
+        more[axis] = AxisSummary(
+            *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
+        )
     heights = {
-        name: _of_besides(kept, judged)
-        for name, each in besides.items()
-        if len(kept := each[settled(each.index, judged)])
+        name: _summarise_aid(evaluated, judged)
+        for name, each in other_aid_updates.items()
+        if len(evaluated := each[inside_spans(each.index, judged)])
     }
     if vision := heights.pop(EV_POS.name, None):
         more["others"] = {EV_POS.name: vision}
-    if besides.keys() - {EV_POS.name}:
+    if other_aid_updates.keys() - {EV_POS.name}:
         more["heights"], more["height_rmse_to_truth_m"] = heights, error_m(np.eye(3)[2])
     return Summary(
-        samples=len(used), rejected_share=float(used["rejected"].mean()),
-        heading_error_mean_deg=_heading_error(flight, replay, heading, judged), **more,
-    )  # fmt: skip
+        samples=len(evaluated_updates),
+        rejected_share=float(evaluated_updates["rejected"].mean()),
+        heading_error_mean_deg=_heading_error(flight, replay, heading, judged),
+        **more,
+    )
 
 
-def _innovations(used: pd.DataFrame, *axes: AxisName) -> tuple[float, tuple[float, float], float]:
+def _innovation_statistics(
+    updates: pd.DataFrame, *axes: AxisName
+) -> tuple[float, tuple[float, float], float]:
     """Mean NIS, its band, and the innovations' standard deviation, of some axes together."""
-    nu = used[[f"innovation_{axis}_m" for axis in axes]].to_numpy().ravel()
-    s = used[[f"innovation_variance_{axis}_m2" for axis in axes]].to_numpy().ravel()
+    nu = updates[[f"innovation_{axis}_m" for axis in axes]].to_numpy().ravel()
+    s = updates[[f"innovation_variance_{axis}_m2" for axis in axes]].to_numpy().ravel()
     return float(np.mean(nu**2 / s)), nis_band(len(nu)), float(np.std(nu))
 
 
-def _of_besides(used: pd.DataFrame, judged: Spans) -> HeightSummary:
-    rejected = used["rejected"].to_numpy()
-    fused_s = used.index.to_numpy()[rejected == 0.0]
-    parts = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged)
-    longest_s = max(_longest(*part) for part in parts)
-    return HeightSummary(*_innovations(used, *axes_of(used)), float(rejected.mean()), longest_s)
+def _summarise_aid(evaluated_updates: pd.DataFrame, judged: Spans) -> HeightSummary:
+    rejected = evaluated_updates["rejected"].to_numpy()
+    fused_s = evaluated_updates.index.to_numpy()[rejected == 0.0]
+    fusions_by_span = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged)
+    longest_s = max(_longest_between_fusions(*part) for part in fusions_by_span)
+    return HeightSummary(
+        *_innovation_statistics(evaluated_updates, *axes_of(evaluated_updates)),
+        float(rejected.mean()),
+        longest_s,
+    )
 
 
 def _heading_error(
@@ -442,50 +498,54 @@ def _heading_error(
     """Mean of a heading (rad) minus the truth's, in degrees."""
     if GNSS_POS.noise not in replay.settings:
         return OWN_HEADING
-    true = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
-    if true is None:
+    true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
+    if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log holds no true attitude")
-    kept = heading[settled(heading.index, judged)]
-    at = np.interp(kept.index, true.index, heading_rad(true), np.nan, np.nan)
-    error = np.angle(np.exp(1j * (kept.to_numpy() - at)))
+    evaluated_heading = heading[inside_spans(heading.index, judged)]
+    true_at_samples = np.interp(
+        evaluated_heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
+    )
+    error = np.angle(np.exp(1j * (evaluated_heading.to_numpy() - true_at_samples)))
     return float(np.degrees(np.nanmean(error)))
 
 
-def _longest(fused_s: Array, judged: Spans) -> float:
+def _longest_between_fusions(fused_s: Array, judged: Spans) -> float:
     """Longest time between two fusions, the ends of what is judged included."""
     ends = [judged[0][0], judged[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
 
-def _carried(model: Model, replay: Ekf2Replay, without: Mapping[str, float], judged: Spans) -> str:
+def _deviation_note(
+    model: Model, replay: Ekf2Replay, without: Mapping[str, float], judged: Spans
+) -> str:
     """How far from the replay as flown EKF2 comes without some aids."""
-    flown, found = (
-        one.published.loc[settled(one.published.index, judged), Columns.POSITION]
-        for one in (model.flown, replay)
+    flown, changed_position = (
+        replay_run.published.loc[inside_spans(replay_run.published.index, judged), Columns.POSITION]
+        for replay_run in (model.flown, replay)
     )
-    *level, down = np.abs((found - flown).to_numpy()).T
-    apart = np.hypot(*level)
-    lost = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
-    heights = {*model.flown.besides} - {EV_POS.name}
-    position = {*aids_of(model.inputs)} - {MAG.name} - heights
+    *horizontal, down = np.abs((changed_position - flown).to_numpy()).T
+    distance = np.hypot(*horizontal)
+    lost_text = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
+    heights = {*model.flown.other_aid_updates} - {EV_POS.name}
+    position = {*modelled_aids(model.inputs)} - {MAG.name} - heights
     height = f"; its height is {down.max():.3g} m from it at most" if heights & {*without} else ""
-    given_up = (
+    give_up_note = (
         "; with no horizontal aid EKF2 itself gives its position up after EKF2_NOAID_TOUT (5 s), "
         "while the model dead-reckons on"
     )
     return (
-        f"Without {lost}, what is published is {apart.max():.3g} m from the replay as flown at "
-        f"most (at {found.index[apart.argmax()]:.1f} s), {apart[-1]:.3g} m at the end{height}"
-        + (given_up if position <= without.keys() else "")
+        f"Without {lost_text}, what is published is {distance.max():.3g} m from the replay as flown at "
+        f"most (at {changed_position.index[distance.argmax()]:.1f} s), {distance[-1]:.3g} m at the end{height}"
+        + (give_up_note if position <= without.keys() else "")
     )
 
 
 def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
-    least = replay.settings.get(GNSS_POS.noise, 0.0)
-    if least >= replay.changed.get(EV_POS.noise, np.inf):
+    min_noise = replay.settings.get(GNSS_POS.noise, 0.0)
+    if min_noise >= replay.changed.get(EV_POS.noise, np.inf):
         yield (
             "While EKF2 fuses GNSS it takes no position of vision to be more exact than "
-            f"{GNSS_POS.noise}, {least:g} m"
+            f"{GNSS_POS.noise}, {min_noise:g} m"
         )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"

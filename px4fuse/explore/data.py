@@ -11,14 +11,17 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import CONTENT_NIS, NEES_LARGE, beyond_claim
+from px4fuse.comparison.interventions import (
+    MAX_UNSUSPICIOUS_NIS,
+    MIN_NEES_FINDING,
+    error_beyond_reported_sigma,
+)
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
-from px4fuse.explore.ekf2_grid import grid_data, judged_numbers
-from px4fuse.explore.packing import COARSE, Packer
+from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter import settings as allowed
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.consistency import CONFIDENCE, nis_band
+from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
@@ -32,15 +35,15 @@ from px4fuse.request import ComparisonRequest, command_line
 # How far the stamps can be moved on the page; --clock-offset takes more
 OFFSET_REACH_S = 0.6
 # Innovations that the running mean of NIS is taken over
-RUNNING = 30
+RUNNING_MEAN_COUNT = 30
 # The track on the plan is drawn with at most so many points
 MAX_PLAN_POINTS = 2000
 # Findings that other settings would take away or bring
-OF_KNOBS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
+KNOB_FINDINGS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
 
 def flight_data(
-    analysis: Analysis, packer: Packer, *, beside: bool = False, replays: bool = True
+    analysis: Analysis, packer: Packer, *, side_by_side: bool = False
 ) -> dict[str, Any]:
     """Everything about one flight, as JSON can hold it; arrays are places in the packer.
 
@@ -49,12 +52,10 @@ def flight_data(
     analysis : Analysis
         Made from a request.
     packer : Packer
-    beside : bool
+    side_by_side : bool
         Whether it stands beside another flight: then times are from the start of its segment.
-    replays : bool
-        Whether EKF2 with other parameters is among it, most of a page's size.
     """
-    signals = signals_of(analysis, packer)
+    signals = replay_signals(analysis, packer)
     settings, segment = analysis.settings, analysis.segment
     events, findings, request = analysis.events, find(analysis), analysis.request
     assert request is not None
@@ -63,18 +64,17 @@ def flight_data(
         "source": analysis.source.name,
         # what innovations ask for then is no noise
         "drifts": analysis.source.origin.may_drift,
-        "shift": segment.start_s if beside else 0.0,
+        "shift": segment.start_s if side_by_side else 0.0,
         "story": list(story(analysis, findings)),
-        "settings": _settings(settings),
+        "settings": _settings_data(settings),
         "main": analysis.main.axis.name,
         **signals,
         "axes": [
-            own | _others(analysis, result, packer)
+            own | _axis_data(analysis, result, packer)
             for own, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
-        "maps": _maps(analysis),
-        "grid": _grid(analysis, packer, beside=beside, replays=replays),
-        "plan": _plan(analysis, packer),
+        "maps": _map_data(analysis),
+        "plan": _plan_data(analysis, packer),
         "events": {
             "silent": list(events.gaps),
             "dropout": list(events.dropouts),
@@ -83,31 +83,23 @@ def flight_data(
             "reset": list(events.resets_s),
         },
         "findings": [
-            {**_finding(first), "more": [_finding(one) for one in followers]}
+            {**_finding_data(first), "more": [_finding_data(one) for one in followers]}
             for first, *followers in by_root(findings)
         ],
-        "command": _command(request, analysis),
-        "offset": _offset(request, analysis),
+        "command": _command_data(request, analysis),
+        "offset": _offset_data(request, analysis),
     }
 
 
-def signals_of(comparison: Comparison, packer: Packer) -> dict[str, Any]:
+def replay_signals(comparison: Comparison, packer: Packer) -> dict[str, Any]:
     """What the page's engine replays: measurements, IMU integrals, segment and start."""
     raw = raw_source(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
-        "imu": _imu(comparison, packer),
-        "axes": [_signals(comparison, line, raw, packer) for line in comparison.lines],
+        "imu": _imu_data(comparison, packer),
+        "axes": [_axis_signals(comparison, line, raw, packer) for line in comparison.lines],
     }
-
-
-def _grid(
-    analysis: Analysis, packer: Packer, *, beside: bool, replays: bool
-) -> dict[str, Any] | str:
-    if beside:
-        return "only for one log"
-    return grid_data(analysis, packer) if replays else "left out of a page of many flights"
 
 
 def ranges() -> dict[str, Any]:
@@ -117,9 +109,9 @@ def ranges() -> dict[str, Any]:
         "sigma-z": list(allowed.SIGMA_Z_RANGE_M),
         "dt": list(allowed.DT_RANGE_S),
         "clock-offset": list(allowed.CLOCK_OFFSET_RANGE_S),
-        "lesson": _settings(Settings()),
-        "running": [RUNNING, *nis_band(RUNNING)],
-        "hidden": [NEES_LARGE, CONTENT_NIS],
+        "lesson": _settings_data(Settings()),
+        "running": [RUNNING_MEAN_COUNT, *nis_band(RUNNING_MEAN_COUNT)],
+        "hidden": [MIN_NEES_FINDING, MAX_UNSUSPICIOUS_NIS],
     }
 
 
@@ -128,7 +120,7 @@ def raw_source(comparison: Comparison) -> PositionTrack:
     return choose_source(comparison.flight, comparison.source.name)[0]
 
 
-def _settings(settings: Settings) -> dict[str, Any]:
+def _settings_data(settings: Settings) -> dict[str, Any]:
     return {
         "sigmaA": settings.sigma_a_m_s2,
         "sigmaZ": settings.sigma_z_m,
@@ -138,7 +130,7 @@ def _settings(settings: Settings) -> dict[str, Any]:
     }
 
 
-def _offset(request: ComparisonRequest, analysis: Analysis) -> dict[str, Any]:
+def _offset_data(request: ComparisonRequest, analysis: Analysis) -> dict[str, Any]:
     """How far the stamps can be moved, and why not where they cannot; what fits best."""
     if request.position is not None:
         return {"why": "the clock offset of a position file is spent on placing it"}
@@ -149,7 +141,7 @@ def _offset(request: ComparisonRequest, analysis: Analysis) -> dict[str, Any]:
     return {"from": centre - OFFSET_REACH_S, "to": centre + OFFSET_REACH_S, "likely": likely}
 
 
-def _imu(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
+def _imu_data(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
     """Times, gaps and span of the acceleration; why not where there is none."""
     acceleration = comparison.lines[0].acceleration
     if isinstance(acceleration, Unavailable):
@@ -159,14 +151,14 @@ def _imu(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
     edges = np.stack([time[gap], time[gap + 1]], 1)
     total = np.cumsum(edges[:, 1] - edges[:, 0])
     return {
-        "time": packer.add_times(time[_used(comparison, acceleration)]),
+        "time": packer.add_times(time[_used_samples(comparison, acceleration)]),
         "span": [time[0], time[-1]],
         "gapEdges": edges.ravel().tolist(),
         "gapSum": np.stack([np.concatenate([[0.0], total])[:-1], total], 1).ravel().tolist(),
     }
 
 
-def _used(comparison: Comparison, acceleration: Acceleration) -> slice:
+def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
     """The samples that steps inside the segment can need, one beyond either end."""
     segment, time = comparison.segment, acceleration.time_s
     low = int(np.searchsorted(time, segment.start_s, side="right")) - 1
@@ -174,7 +166,7 @@ def _used(comparison: Comparison, acceleration: Acceleration) -> slice:
     return slice(max(low, 0), high)
 
 
-def _signals(
+def _axis_signals(
     comparison: Comparison, axis: Axis, raw: PositionTrack, packer: Packer
 ) -> dict[str, Any]:
     """One axis: measurements as they were stamped, also beyond the segment, and acceleration."""
@@ -182,20 +174,25 @@ def _signals(
     time = raw.samples.index.to_numpy()
     value = along(raw.samples, Columns.POSITION, axis.direction)
     reach = OFFSET_REACH_S + abs(comparison.settings.clock_offset_s)
-    near = (time >= segment.start_s - reach) & (time <= segment.end_s + reach)
-    near &= np.isfinite(value)
-    made: dict[str, Any] = {
+    is_in_reach = (time >= segment.start_s - reach) & (time <= segment.end_s + reach)
+    is_in_reach &= np.isfinite(value)
+    signals: dict[str, Any] = {
         "name": axis.name,
-        "time": packer.add_times(time[near]),
-        "z": packer.add(value[near]),
+        "time": packer.add_times(time[is_in_reach]),
+        "z": packer.add(value[is_in_reach]),
     }
     if isinstance(axis.acceleration, Acceleration):
-        used = axis.acceleration.integral_m_s[_used(comparison, axis.acceleration)]
-        made |= {"integral": packer.add(used - used[0]), "rms": axis.acceleration.rms_m_s2}
-    return made
+        velocity_integral = axis.acceleration.integral_m_s[
+            _used_samples(comparison, axis.acceleration)
+        ]
+        signals |= {
+            "integral": packer.add(velocity_integral - velocity_integral[0]),
+            "rms": axis.acceleration.rms_m_s2,
+        }
+    return signals
 
 
-def _others(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
+def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
     """What stands beside our filter along one axis."""
     name = result.axis.name
     return {
@@ -203,82 +200,102 @@ def _others(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
-        "bands": _bands(len(result.axis.measurement_time_s), packer),
+        "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # the joint likelihood map of the horizontal axes where there is one, or its own
         "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _ekf2(analysis, result, packer),
-        "truth": _truth(result, packer),
+        "ekf2": _ekf2_data(analysis, result, packer),
+        "truth": _truth_data(result, packer),
     }
 
 
-def _bands(count: int, packer: Packer) -> list[int]:
+def _nis_bands(count: int, packer: Packer) -> list[int]:
     """Bands of the mean NIS for every number of innovations: places of both ends.
 
     Another clock offset moves measurements into the segment and out of it.
     """
     freedom = np.arange(1, 2 * count + 1)
     ends = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
-    return [packer.add(np.asarray(stats.chi2.ppf(end, freedom)) / freedom, COARSE) for end in ends]
+    return [
+        packer.add(np.asarray(stats.chi2.ppf(end, freedom)) / freedom, COARSE_SCALE) for end in ends
+    ]
 
 
-def _ekf2(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
+def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
     """What EKF2 did, which no setting of ours changes; why not where there is none."""
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
-    judged = result.filters["ekf2"]
-    made: dict[str, Any] = {
-        "state": _frame(state, ["position_m", "velocity_m_s"], packer),
+    consistency = result.filters["ekf2"]
+    ekf2: dict[str, Any] = {
+        "state": _pack_frame(state, ["position_m", "velocity_m_s"], packer),
         "variance": "",
         "innovations": "",
-        "summary": judged_numbers(judged),
+        "summary": _summary(consistency),
         "r": None,
     }
-    if isinstance(judged.truth, AgainstTruth):
-        made["summary"] |= {
-            "truthP": judged.truth.position_rmse_m,
-            "truthV": judged.truth.velocity_rmse_m_s,
+    if isinstance(consistency.truth, AgainstTruth):
+        ekf2["summary"] |= {
+            "truthP": consistency.truth.position_rmse_m,
+            "truthV": consistency.truth.velocity_rmse_m_s,
         }
-    if hidden := beyond_claim(judged):
-        made["summary"]["claimed"] = hidden.claimed_m
+    if hidden := error_beyond_reported_sigma(consistency):
+        ekf2["summary"]["claimed"] = hidden.reported_sigma_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
-        made["variance"] = _frame(
+        ekf2["variance"] = _pack_frame(
             sigma, ["position_variance_m2", "velocity_variance_m2_s2"], packer
         )
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         frame = result.ekf2_innovations
-        shown = frame[np.isfinite(frame["innovation_m"]) & (frame["innovation_variance_m2"] > 0)]
-        used = shown.assign(
-            rejected=(shown["rejected"] > 0).astype(float),
-            sigma=np.sqrt(shown["innovation_variance_m2"]),
+        valid_rows = frame[
+            np.isfinite(frame["innovation_m"]) & (frame["innovation_variance_m2"] > 0)
+        ]
+        packed_rows = valid_rows.assign(
+            rejected=(valid_rows["rejected"] > 0).astype(float),
+            sigma=np.sqrt(valid_rows["innovation_variance_m2"]),
         )
-        made["innovations"] = _frame(used, ["innovation_m", "sigma", "rejected"], packer)
+        ekf2["innovations"] = _pack_frame(
+            packed_rows, ["innovation_m", "sigma", "rejected"], packer
+        )
         r = frame["observation_variance_m2"].dropna()
-        made["r"] = float(np.sqrt(r.median())) if len(r) else None
+        ekf2["r"] = float(np.sqrt(r.median())) if len(r) else None
     else:
-        made["why"] = result.ekf2_innovations.reason
-    return made
+        ekf2["why"] = result.ekf2_innovations.reason
+    return ekf2
 
 
-def _truth(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
+def _summary(statement: Consistency | Unavailable) -> dict[str, Any]:
+    """Return EKF2's column of the page's table; the reason where there are too few innovations."""
+    if isinstance(statement, Unavailable):
+        return {"why": statement.reason}
+    return {
+        "why": "",
+        "count": statement.count,
+        "nis": statement.nis_mean,
+        "band": list(statement.nis_band),
+        "outside": statement.outside_two_sigma,
+        "lag1": statement.lag1_autocorrelation,
+    }
+
+
+def _truth_data(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
     if isinstance(result.truth, Unavailable):
         return result.truth.reason
     position = result.truth[["position_m"]].dropna()
     velocity = result.truth[["velocity_m_s"]].dropna()
     return {
-        "p": _frame(position, ["position_m"], packer),
-        "v": _frame(velocity, ["velocity_m_s"], packer) if len(velocity) else None,
+        "p": _pack_frame(position, ["position_m"], packer),
+        "v": _pack_frame(velocity, ["velocity_m_s"], packer) if len(velocity) else None,
     }
 
 
-def _frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]:
+def _pack_frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]:
     """Places of the times and of some columns."""
-    values = [packer.add(frame[column].to_numpy(), COARSE) for column in columns]
+    values = [packer.add(frame[column].to_numpy(), COARSE_SCALE) for column in columns]
     return [packer.add_times(frame.index.to_numpy()), *values]
 
 
-def _maps(analysis: Analysis) -> dict[str, Any]:
+def _map_data(analysis: Analysis) -> dict[str, Any]:
     """What the map of each axis shows; why not where there is none."""
     return {
         name: {
@@ -293,47 +310,47 @@ def _maps(analysis: Analysis) -> dict[str, Any]:
     }
 
 
-def _plan(comparison: Comparison, packer: Packer) -> list[int] | str:
+def _plan_data(comparison: Comparison, packer: Packer) -> list[int] | str:
     """The source's track seen from above: places of time, north and east."""
     samples = within(comparison.source.samples, comparison.segment)
     track = samples[Columns.POSITION[:2]].dropna()
     if not len(track):
         return "the source has no horizontal position"
-    some = track.iloc[:: max(1, -(-len(track) // MAX_PLAN_POINTS))]
-    return _frame(some, Columns.POSITION[:2], packer)
+    sampled = track.iloc[:: max(1, -(-len(track) // MAX_PLAN_POINTS))]
+    return _pack_frame(sampled, Columns.POSITION[:2], packer)
 
 
-def _finding(finding: Finding) -> dict[str, Any]:
+def _finding_data(finding: Finding) -> dict[str, Any]:
     return {
         "severity": finding.severity,
         "message": finding.message,
         "remedy": finding.remedy,
-        "knobs": finding.id in OF_KNOBS,
+        "knobs": finding.id in KNOB_FINDINGS,
         "spans": [list(span) for span in finding.spans_s[:20]],
         "more": [],
     }
 
 
-def _command(request: ComparisonRequest, comparison: Comparison) -> dict[str, Any]:
+def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[str, Any]:
     """The command without what the page sets, and what holds the analysed part where it is.
 
     The segment and the aisle are found from the stamps, so that another clock offset would move
     them: then they are said.
     """
     offset_s = None if request.position is None else request.clock_offset_s
-    bare = msgspec.structs.replace(
+    base_request = msgspec.structs.replace(
         request, sigma_a_m_s2=0.5, sigma_z_m=None, dt_s=0.1, input=None, clock_offset_s=offset_s
     )
     heading = next((line.heading_deg for line in comparison.lines if line.name == AISLE), None)
-    held = msgspec.structs.replace(
-        bare,
+    fixed_request = msgspec.structs.replace(
+        base_request,
         start_s=comparison.segment.start_s,
         end_s=comparison.segment.end_s,
-        heading_deg=heading if bare.heading_deg is None else bare.heading_deg,
+        heading_deg=heading if base_request.heading_deg is None else base_request.heading_deg,
     )
     return {
-        "bare": command_line(bare),
-        "held": command_line(held),
+        "bare": command_line(base_request),
+        "held": command_line(fixed_request),
         "input": request.input,
         "found": "zero" if isinstance(comparison.lines[0].acceleration, Unavailable) else "imu",
     }

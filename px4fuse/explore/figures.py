@@ -16,29 +16,40 @@ from bokeh.plotting import figure
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.estimates import Tuning
-from px4fuse.explore.data import RUNNING
+from px4fuse.explore.data import RUNNING_MEAN_COUNT
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.record import Record, table
-from px4fuse.report.style import EKF2, MEASUREMENT, OURS, TRUTH
+from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MEASUREMENT_COLOUR, TRUTH_COLOUR
 
-HEIGHT, TALL = 150, 210
+PLOT_HEIGHT, TALL_HEIGHT = 150, 210
 # Ours is dark, solid and round; EKF2 is lighter, dashed and square, as in the report
-OURS_LINE: dict[str, Any] = {"line_color": OURS, "line_width": 1.6, "name": "ours"}
+KF_LINE: dict[str, Any] = {"line_color": KF_COLOUR, "line_width": 1.6, "name": "ours"}
 EKF2_LINE: dict[str, Any] = {
-    "line_color": EKF2, "line_width": 1.6, "line_dash": [6, 3], "name": "ekf2",
-}  # fmt: skip
+    "line_color": EKF2_COLOUR,
+    "line_width": 1.6,
+    "line_dash": [6, 3],
+    "name": "ekf2",
+}
 TRUTH_LINE: dict[str, Any] = {
-    "line_color": TRUTH, "line_width": 1.2, "line_dash": [1, 3], "name": "truth",
-}  # fmt: skip
+    "line_color": TRUTH_COLOUR,
+    "line_width": 1.2,
+    "line_dash": [1, 3],
+    "name": "truth",
+}
 NIS_BAND: dict[str, Any] = {
-    "level": "underlay", "fill_alpha": 0.15, "fill_color": "#4a8f5a", "line_color": "#4a8f5a",
-}  # fmt: skip
-LEFT = 96
+    "level": "underlay",
+    "fill_alpha": 0.15,
+    "fill_color": "#4a8f5a",
+    "line_color": "#4a8f5a",
+}
+LEFT_BORDER = 96
 STYLES = {
-    "ours": OURS_LINE, "dotted": OURS_LINE | {"line_dash": [2, 2]}, "ekf2": EKF2_LINE,
+    "ours": KF_LINE,
+    "dotted": KF_LINE | {"line_dash": [2, 2]},
+    "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
-}  # fmt: skip
+}
 # √(2 · drop of log-likelihood): as far as so many standard deviations
 MAP_SIGMAS = 6.0
 
@@ -85,15 +96,15 @@ def document_json(
         Of each flight, for its likelihood maps.
     """
     document = Document()
-    time_range = _range("time")
+    time_range = _page_range("time")
     places: dict[str, str] = {}
     for number, (data, tuning) in enumerate(zip(flights, tunings, strict=True)):
         plots = _plots(number, data, time_range)
         plots |= {
-            "strip": _strip(number, data, time_range),
-            "map": _map(number, tuning),
-            "plan": _plan(number),
-            "step": _step(number),
+            "strip": _event_strip(number, data, time_range),
+            "map": _likelihood_map(number, tuning),
+            "plan": _plan_plot(number),
+            "step": _phase_plot(number),
         }
         places |= {plot.id: f"{name}-{number}" for name, plot in plots.items()}
         with document.models.freeze():  # what belongs to the roots is looked for once
@@ -104,41 +115,48 @@ def document_json(
 
 def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
     """Every plot against time of one flight, by its name."""
-    lacking = {
+    missing_kinds = {
         kind
         for kind in ("ekf2", "truth")
         if not any(isinstance(axis[kind], dict) for axis in data["axes"])
     }
     plots: dict[str, Any] = {}
     for name, plot in FIGURES.plots.items():
-        if name == "error" and "truth" in lacking:
+        if name == "error" and "truth" in missing_kinds:
             continue
         sources = _Sources(name, number)
-        made = plots[name] = figure(
-            name=f"{name}-{number}", height=TALL if plot.tall else HEIGHT,
-            sizing_mode="stretch_width", x_range=time_range, y_range=_range(),
-            toolbar_location=None, y_axis_type=plot.scale, tools="xbox_zoom,xpan,tap",
-            active_drag="xbox_zoom", y_axis_label=plot.label, lod_threshold=None,
-            min_border_left=LEFT,
-        )  # fmt: skip
+        fig = plots[name] = figure(
+            name=f"{name}-{number}",
+            height=TALL_HEIGHT if plot.tall else PLOT_HEIGHT,
+            sizing_mode="stretch_width",
+            x_range=time_range,
+            y_range=_page_range(),
+            toolbar_location=None,
+            y_axis_type=plot.scale,
+            tools="xbox_zoom,xpan,tap",
+            active_drag="xbox_zoom",
+            y_axis_label=plot.label,
+            lod_threshold=None,
+            min_border_left=LEFT_BORDER,
+        )
         if name == "position":
-            _dots(made, sources["measured"], MEASUREMENT, 3, name="measured")
-            _beyond(made, sources["beyond"], MEASUREMENT, "measured")
+            _draw_dots(fig, sources["measured"], MEASUREMENT_COLOUR, 3, name="measured")
+            _draw_arrows(fig, sources["beyond"], MEASUREMENT_COLOUR, "measured")
         if name == "innovation":
-            _innovations(made, sources, with_ekf2="ekf2" not in lacking)
+            _draw_innovations(fig, sources, with_ekf2="ekf2" not in missing_kinds)
         if name == "nis":
-            low, high = nis_band(RUNNING)
-            made.add_layout(BoxAnnotation(bottom=low, top=high, **NIS_BAND))
-        for source, column, whose, who in plot.lines:
-            if whose in lacking:
+            low, high = nis_band(RUNNING_MEAN_COUNT)
+            fig.add_layout(BoxAnnotation(bottom=low, top=high, **NIS_BAND))
+        for source, column, style_name, hover_name in plot.lines:
+            if style_name in missing_kinds:
                 continue
-            drawn = made.line("t", column, source=sources[source], **STYLES[whose])
-            if who:
-                _hover(made, drawn, (who, f"@{column}{{0.000}} {plot.unit}"))
-        made.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
+            line_renderer = fig.line("t", column, source=sources[source], **STYLES[style_name])
+            if hover_name:
+                _add_hover(fig, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}"))
+        fig.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
         shift = data["shift"]
-        for low, high, style in _bands(data):
-            made.add_layout(
+        for low, high, style in _event_bands(data):
+            fig.add_layout(
                 BoxAnnotation(left=low - shift, right=high - shift, level="underlay", **style)
             )
     return plots
@@ -151,61 +169,77 @@ class _Sources(dict[str, ColumnDataSource]):
         self.plot, self.number = plot, number
 
     def __missing__(self, name: str) -> ColumnDataSource:
-        self[name] = _source(f"{self.plot}:{name}", self.number, FIGURES.sources[name])
+        self[name] = _empty_source(f"{self.plot}:{name}", self.number, FIGURES.sources[name])
         return self[name]
 
 
-def _beyond(made: Any, source: ColumnDataSource, colour: str, name: str) -> None:
+def _draw_arrows(fig: Any, source: ColumnDataSource, colour: str, name: str) -> None:
     """Arrow heads at the edge that hides something, turned upside down at the lower one."""
-    made.scatter(
-        "t", "y", angle="turn", source=source, marker="triangle", size=9, fill_color=colour,
-        line_color=None, name=name,
-    )  # fmt: skip
+    fig.scatter(
+        "t",
+        "y",
+        angle="turn",
+        source=source,
+        marker="triangle",
+        size=9,
+        fill_color=colour,
+        line_color=None,
+        name=name,
+    )
 
 
-def _innovations(made: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
+def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
     """Innovations of both filters as dots, and our ±2√S as a band."""
     updates = sources["updates"]
-    made.varea(
-        "t", "minus", "plus", source=updates, fill_color=OURS, fill_alpha=0.15, name="ours_band"
+    fig.varea(
+        "t",
+        "minus",
+        "plus",
+        source=updates,
+        fill_color=KF_COLOUR,
+        fill_alpha=0.15,
+        name="ours_band",
     )
     if with_ekf2:
         square: dict[str, Any] = {"marker": "square", "name": "ekf2"}
-        fused = _dots(made, sources["fused"], EKF2, 4, **square)
-        rejected = _dots(made, sources["rejected"], None, 7, line_color=EKF2, **square)
-        _hover(made, fused, ("EKF2", "@nu{0.000} m"))
-        _hover(made, rejected, ("EKF2 rejected", "@nu{0.000} m"))
-        _beyond(made, sources["beyond_ekf2"], EKF2, "ekf2")
-    ours = made.scatter(
-        "t", "nu", source=updates, size=4, fill_color=OURS, line_color=None, name="ours"
+        fused = _draw_dots(fig, sources["fused"], EKF2_COLOUR, 4, **square)
+        rejected = _draw_dots(fig, sources["rejected"], None, 7, line_color=EKF2_COLOUR, **square)
+        _add_hover(fig, fused, ("EKF2", "@nu{0.000} m"))
+        _add_hover(fig, rejected, ("EKF2 rejected", "@nu{0.000} m"))
+        _draw_arrows(fig, sources["beyond_ekf2"], EKF2_COLOUR, "ekf2")
+    kf_dots = fig.scatter(
+        "t", "nu", source=updates, size=4, fill_color=KF_COLOUR, line_color=None, name="ours"
     )
-    _hover(made, ours, ("ours", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
-    _beyond(made, sources["beyond"], OURS, "ours")
+    _add_hover(fig, kf_dots, ("ours", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
+    _draw_arrows(fig, sources["beyond"], KF_COLOUR, "ours")
 
 
-def _hover(made: Any, renderer: Any, *rows: tuple[str, str]) -> None:
+def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     tips = [("time", "@t{0.00} s"), *rows]
     side: Any = {"EKF2": "right", "truth": "above"}.get(rows[0][0], "left")  # none hides another
-    made.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
+    fig.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
 
 
-def _range(name: str | None = None) -> Range1d:
+def _page_range(name: str | None = None) -> Range1d:
     """For the page to set."""
     return Range1d(start=0.1, end=1.0, name=name)
 
 
-def _source(name: str, number: int, columns: str) -> ColumnDataSource:
+def _empty_source(name: str, number: int, columns: str) -> ColumnDataSource:
     """Empty, for the page to fill."""
     empty: dict[str, Any] = {column: [] for column in columns.split()}
     return ColumnDataSource(empty, name=f"{name}-source-{number}")
 
 
-def _bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
+def _event_bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
     """Shading behind every plot against time: modes in turn, ground, silence, dropouts."""
     grey: dict[str, Any] = {"fill_color": "#888888", "line_color": None}
     hatched: dict[str, Any] = {
-        "hatch_pattern": "/", "hatch_color": "#888888", "hatch_alpha": 0.6, "fill_alpha": 0.05,
-    }  # fmt: skip
+        "hatch_pattern": "/",
+        "hatch_color": "#888888",
+        "hatch_alpha": 0.6,
+        "fill_alpha": 0.05,
+    }
     events = data["events"]
     sand: dict[str, Any] = {"fill_color": "#b08a3a", "fill_alpha": 0.1, "line_color": None}
     return [
@@ -216,105 +250,156 @@ def _bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
     ]
 
 
-def _strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
+def _event_strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
     """What happened when, a row for each kind, so that no colour is needed to tell them apart."""
-    source = _source("strip", number, "row left right text")
+    source = _empty_source("strip", number, "row left right text")
     has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
     rows = FIGURES.strip if has_ekf2 else FIGURES.strip[2:]
-    made = figure(
-        name=f"strip-{number}", height=28 * len(rows) + 24, sizing_mode="stretch_width",
-        x_range=time_range, y_range=FactorRange(factors=rows), toolbar_location=None,
-        tools="xbox_zoom,xpan", active_drag="xbox_zoom", min_border_left=LEFT,
+    fig = figure(
+        name=f"strip-{number}",
+        height=28 * len(rows) + 24,
+        sizing_mode="stretch_width",
+        x_range=time_range,
+        y_range=FactorRange(factors=rows),
+        toolbar_location=None,
+        tools="xbox_zoom,xpan",
+        active_drag="xbox_zoom",
+        min_border_left=LEFT_BORDER,
         x_axis_label="time (s)",
-    )  # fmt: skip
-    made.hbar(
-        y="row", left="left", right="right", height=0.55, source=source, fill_color="#7d8894",
-        line_color="#7d8894", name="event",
-    )  # fmt: skip
-    made.text(
-        "left", "row", "text", source=source, text_font_size="11px", text_baseline="middle",
-        x_offset=3, name="ink",
-    )  # fmt: skip
-    made.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
-    return made
+    )
+    fig.hbar(
+        y="row",
+        left="left",
+        right="right",
+        height=0.55,
+        source=source,
+        fill_color="#7d8894",
+        line_color="#7d8894",
+        name="event",
+    )
+    fig.text(
+        "left",
+        "row",
+        "text",
+        source=source,
+        text_font_size="11px",
+        text_baseline="middle",
+        x_offset=3,
+        name="ink",
+    )
+    fig.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
+    return fig
 
 
-def _map(number: int, tuning: Tuning) -> Any:
+def _likelihood_map(number: int, tuning: Tuning) -> Any:
     """How likely the innovations are over both noises, and where the sliders stand."""
-    made = figure(
-        name=f"map-{number}", height=250, sizing_mode="stretch_width", x_axis_type="log",
-        y_axis_type="log", x_range=_range(), y_range=_range(), tools="tap",
-        toolbar_location=None, x_axis_label="SIGMA_A (m/s²)", y_axis_label="SIGMA_Z (m)",
-    )  # fmt: skip
+    fig = figure(
+        name=f"map-{number}",
+        height=250,
+        sizing_mode="stretch_width",
+        x_axis_type="log",
+        y_axis_type="log",
+        x_range=_page_range(),
+        y_range=_page_range(),
+        tools="tap",
+        toolbar_location=None,
+        x_axis_label="SIGMA_A (m/s²)",
+        y_axis_label="SIGMA_Z (m)",
+    )
     mapper = LinearColorMapper(palette=FIGURES.map_colours, low=0.0, high=MAP_SIGMAS)
     for name, tuned in tuning.items():
         if isinstance(tuned, AxisTuning):
-            x, dw = _outer(tuned.map.sigma_a_m_s2)
-            y, dh = _outer(tuned.map.sigma_z_m)
+            x, dw = _pixel_extent(tuned.map.sigma_a_m_s2)
+            y, dh = _pixel_extent(tuned.map.sigma_z_m)
             # rows are SIGMA_Z
             image = np.sqrt(2.0 * np.maximum(tuned.map.drop.T, 0.0)).astype(np.float32)
-            draw: Any = made.image  # its colours stand in no signature
+            draw: Any = fig.image  # its colours stand in no signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
-    trail = _source("trail", number, "x y")
-    best = _source("best", number, "x y")
-    point = _source("point", number, "x y")
+    trail = _empty_source("trail", number, "x y")
+    best = _empty_source("best", number, "x y")
+    point = _empty_source("point", number, "x y")
     white: dict[str, Any] = {"line_color": "white"}
-    made.line("x", "y", source=trail, line_color=EKF2, line_width=1.2, name="ekf2")
-    _dots(made, trail, EKF2, 3, name="ekf2")
-    made.scatter("x", "y", source=best, size=13, marker="cross", line_width=2.5, **white)
-    _dots(made, point, EKF2, 12, marker="circle", line_width=2.0, **white)
-    return made
+    fig.line("x", "y", source=trail, line_color=EKF2_COLOUR, line_width=1.2, name="ekf2")
+    _draw_dots(fig, trail, EKF2_COLOUR, 3, name="ekf2")
+    fig.scatter("x", "y", source=best, size=13, marker="cross", line_width=2.5, **white)
+    _draw_dots(fig, point, EKF2_COLOUR, 12, marker="circle", line_width=2.0, **white)
+    return fig
 
 
-def _dots(made: Any, source: ColumnDataSource, colour: str | None, size: int, **style: Any) -> Any:
+def _draw_dots(
+    fig: Any, source: ColumnDataSource, colour: str | None, size: int, **style: Any
+) -> Any:
     """Dots without an edge, unless the style has one, at a source's last two columns."""
     x, y = source.column_names[-2:]
-    look = {"size": size, "fill_color": colour, "line_color": None} | style
-    return made.scatter(x, y, source=source, **look)
+    marker_style = {"size": size, "fill_color": colour, "line_color": None} | style
+    return fig.scatter(x, y, source=source, **marker_style)
 
 
-def _outer(values: Array) -> tuple[float, float]:
+def _pixel_extent(values: Array) -> tuple[float, float]:
     """Where the pixels of a logarithmic axis begin, and how far they reach."""
     half = float(np.sqrt(values[1] / values[0]))
     return float(values[0]) / half, float(values[-1]) * half - float(values[0]) / half
 
 
-def _plan(number: int) -> Any:
+def _plan_plot(number: int) -> Any:
     """The track seen from above; what is chosen on it is the time that all plots show."""
-    made = figure(
-        name=f"plan-{number}", height=250, sizing_mode="stretch_width", match_aspect=True,
-        tools="box_select,tap", active_drag="box_select", toolbar_location=None,
-        x_axis_label="east (m)", y_axis_label="north (m)",
-    )  # fmt: skip
-    track = _source("plan", number, "t east north")
-    shown = _source("shown", number, "east north")
-    here = _source("here", number, "east north")
-    made.line("east", "north", source=track, line_color=MEASUREMENT, line_width=1.0)
-    _dots(made, track, MEASUREMENT, 3, nonselection_fill_alpha=0.6)
-    _dots(made, shown, OURS, 4, name="ours")
-    _dots(made, here, None, 12, marker="circle_x", line_color=EKF2, line_width=2.0, name="ekf2")
-    return made
-
-
-def _step(number: int) -> Any:
-    """The phase plane: position and velocity with their ellipse of 2σ, and what was measured."""
-    made = figure(
-        name=f"step-{number}", height=330, sizing_mode="stretch_width", x_range=_range(),
-        y_range=_range(), tools="", toolbar_location=None,
-        x_axis_label="position (m)", y_axis_label="velocity (m/s)",
-    )  # fmt: skip
-    band: dict[str, Any] = {"left": 0.0, "right": 0.0, "visible": False}
-    made.add_layout(
-        BoxAnnotation(name="band", fill_color=MEASUREMENT, fill_alpha=0.25, line_color=None, **band)
+    fig = figure(
+        name=f"plan-{number}",
+        height=250,
+        sizing_mode="stretch_width",
+        match_aspect=True,
+        tools="box_select,tap",
+        active_drag="box_select",
+        toolbar_location=None,
+        x_axis_label="east (m)",
+        y_axis_label="north (m)",
     )
-    made.add_layout(
+    track = _empty_source("plan", number, "t east north")
+    shown_source = _empty_source("shown", number, "east north")
+    cursor = _empty_source("here", number, "east north")
+    fig.line("east", "north", source=track, line_color=MEASUREMENT_COLOUR, line_width=1.0)
+    _draw_dots(fig, track, MEASUREMENT_COLOUR, 3, nonselection_fill_alpha=0.6)
+    _draw_dots(fig, shown_source, KF_COLOUR, 4, name="ours")
+    _draw_dots(
+        fig,
+        cursor,
+        None,
+        12,
+        marker="circle_x",
+        line_color=EKF2_COLOUR,
+        line_width=2.0,
+        name="ekf2",
+    )
+    return fig
+
+
+def _phase_plot(number: int) -> Any:
+    """The phase plane: position and velocity with their ellipse of 2σ, and what was measured."""
+    fig = figure(
+        name=f"step-{number}",
+        height=330,
+        sizing_mode="stretch_width",
+        x_range=_page_range(),
+        y_range=_page_range(),
+        tools="",
+        toolbar_location=None,
+        x_axis_label="position (m)",
+        y_axis_label="velocity (m/s)",
+    )
+    band: dict[str, Any] = {"left": 0.0, "right": 0.0, "visible": False}
+    fig.add_layout(
+        BoxAnnotation(
+            name="band", fill_color=MEASUREMENT_COLOUR, fill_alpha=0.25, line_color=None, **band
+        )
+    )
+    fig.add_layout(
         Span(dimension="height", location=0.0, visible=False, name="measurement", line_dash=[2, 2])
     )
-    trail = _source("trail-means", number, "p v")
-    before, now = _source("before", number, "p v"), _source("now", number, "p v")
-    mean = _source("mean", number, "p v")
-    made.line("p", "v", source=trail, line_color=MEASUREMENT, line_width=1.0, name="measured")
-    made.line("p", "v", source=before, **OURS_LINE | {"line_dash": [6, 3]})
-    made.patch("p", "v", source=now, fill_color=OURS, fill_alpha=0.25, **OURS_LINE)
-    _dots(made, mean, OURS, 7, name="ours")
-    return made
+    trail = _empty_source("trail-means", number, "p v")
+    before, current = _empty_source("before", number, "p v"), _empty_source("now", number, "p v")
+    mean = _empty_source("mean", number, "p v")
+    fig.line("p", "v", source=trail, line_color=MEASUREMENT_COLOUR, line_width=1.0, name="measured")
+    fig.line("p", "v", source=before, **KF_LINE | {"line_dash": [6, 3]})
+    fig.patch("p", "v", source=current, fill_color=KF_COLOUR, fill_alpha=0.25, **KF_LINE)
+    _draw_dots(fig, mean, KF_COLOUR, 7, name="ours")
+    return fig

@@ -148,7 +148,7 @@ const Explore = (async () => {
   function toAddress() {
     const parts = { axis: settings.axis, input: settings.input };
     for (const knob of KNOBS) parts[knob.id] = String(settings[knob.key]);
-    Object.assign(parts, Grid.toAddress(), Practice.toAddress());
+    Object.assign(parts, Practice.toAddress());
     if (view !== "filter") parts.view = view;
     if (chosen.step !== null) parts.measurement = String(chosen.step + 1);
     const text = `#${new URLSearchParams(parts)}`;
@@ -168,7 +168,6 @@ const Explore = (async () => {
     const input = parts.get("input");
     if (input === "zero" || (input === "imu" && hasImu)) settings.input = input;
     else if (input !== null) ignored.push("input");
-    ignored.push(...Grid.fromAddress(parts));
     if (parts.has("view") && !isView(parts.get("view"))) ignored.push("view");
     else open(parts.get("view") ?? view, false);
     const step = Number(parts.get("measurement"));
@@ -361,21 +360,19 @@ const Explore = (async () => {
   function replayed(flight, quick) {
     const axis = axisOf(flight), run = Engine.replay(flight, axis, settings);
     if (run === null) return { run, axis, numbers: null };
-    return { run, axis, numbers: numbers(flight, axis, run, quick) };
+    return { run, axis, numbers: numbers(axis, run, quick) };
   }
   /* What the filter's innovations say of it; unless quick, how far off it is too */
-  function numbers(flight, axis, run, quick = false) {
+  function numbers(axis, run, quick = false) {
     const ours = Engine.assess(run.updates.nu, run.updates.s) ?? { count: run.updates.nu.length };
     if (ours.nis !== undefined) ours.band = axis.bands.map((ends) => ends[ours.count - 1]);
     if (quick) return ours;
     let times = run.steps.time;
     if (typeof axis.ekf2 !== "string") {
-      const other = Grid.rows(flight, axis);
-      const [time, p, v] = other === null ? axis.ekf2.state : [other.t, other.p, other.v];
-      const at = Engine.stateAt(run, time);
+      const [time, p, v] = axis.ekf2.state, at = Engine.stateAt(run, time);
       ours.ekf2P = Engine.rmse(at.p, p);
       ours.ekf2V = Engine.rmse(at.v, v);
-      [times] = axis.ekf2.state;
+      times = time;
     }
     if (typeof axis.truth !== "string") {
       const at = Engine.stateAt(run, times), { p, v } = axis.truth;
@@ -394,8 +391,7 @@ const Explore = (async () => {
     return sum / count >= ranges.hidden[0] && nis < ranges.hidden[1]
       ? Math.sqrt(steps.p00.toSorted()[steps.p00.length >> 1]) : undefined;
   }
-  const ekf2Of = (flight, axis) => Grid.chosen(flight, axis)?.axes[axis.name]
-    ?? (typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary);
+  const ekf2Of = (axis) => typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary;
 
   // ------------------------------------------------------------------ the needle and the words
   const DECADES = [-1.3, 1.3]; // of the mean NIS that the scale shows
@@ -412,7 +408,7 @@ const Explore = (async () => {
     $("needles").append(scale);
   }
   function drawNeedle(flight, axis, ours) {
-    const [band, theirs, own] = $(`needle-${flight.number}`).children, ekf2 = ekf2Of(flight, axis);
+    const [band, theirs, own] = $(`needle-${flight.number}`).children, ekf2 = ekf2Of(axis);
     for (const [hand, one] of [[own, ours], [theirs, ekf2]]) {
       hand.hidden = one?.nis === undefined;
       if (!hand.hidden) hand.style.left = `${100 * place(one.nis)}%`;
@@ -433,7 +429,7 @@ const Explore = (async () => {
   }
   const tried = (flight, axis) => (changes) => {
     const run = Engine.replay(flight, axis, { ...settings, ...changes });
-    return run && numbers(flight, axis, run, true);
+    return run && numbers(axis, run, true);
   };
   function tell() {
     const sentences = flights.map((flight) => {
@@ -442,7 +438,7 @@ const Explore = (async () => {
       const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["a clock offset of", "offset", likely]]
         .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
         .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
-      const words = Story.sentence(axis, ours, ekf2Of(flight, axis))
+      const words = Story.sentence(axis, ours, ekf2Of(axis))
         + (Practice.hidden || flight.drifts ? "" : Story.cure(ours, candidates, tried(flight, axis)));
       for (const line of document.querySelectorAll(`#now-said-${flight.number}`)) {
         line.textContent = moved(flight) ? `The knobs stand elsewhere now: ${words}` : "";
@@ -467,7 +463,7 @@ const Explore = (async () => {
     ["Velocity: RMS to truth", (x) => x.truthV?.toFixed(3).concat(" m/s")],
   ];
   function drawTable(flight, axis, ours) {
-    const other = Grid.chosen(flight, axis), ekf2 = ekf2Of(flight, axis);
+    const ekf2 = ekf2Of(axis);
     let own = $(`table-${flight.number}`);
     if (own === null) {
       own = make("table", undefined, { id: `table-${flight.number}` });
@@ -482,7 +478,6 @@ const Explore = (async () => {
       }
       $("tables").append(own, make("p", "", { className: "note", id: `why-${flight.number}` }));
     }
-    own.tHead.rows[0].cells[2].textContent = other ? "EKF2 replayed" : "EKF2";
     ROWS.forEach(([, words], i) => {
       const row = own.tBodies[0].rows[i], left = ours && words(ours), right = words(ekf2);
       row.cells[1].textContent = left ?? "–";
@@ -540,12 +535,12 @@ const Explore = (async () => {
     const shift = flight.shift, seen = {};
     const take = (name, columns, keys) => { seen[name] = thin(columns, keys); give(name, flight, seen[name]); };
     if (typeof axis.ekf2 !== "string") {
-      const { state, variance, innovations } = axis.ekf2, other = Grid.rows(flight, axis);
-      const own = other ?? table(["t", "p", "v"], state);
+      const { state, variance, innovations } = axis.ekf2;
+      const own = table(["t", "p", "v"], state);
       take("state", { t: later(own.t, shift), p: own.p, v: own.v }, ["p", "v"]);
-      const sigma = other ?? table(["t", "sp", "sv"], variance);
+      const sigma = table(["t", "sp", "sv"], variance);
       take("variance", { t: later(sigma.t, shift), sp: sigma.sp, sv: sigma.sv }, ["sp", "sv"]);
-      const rows = other ?? table(["t", "nu", "sigma", "rejected"], innovations), t = later(rows.t, shift);
+      const rows = table(["t", "nu", "sigma", "rejected"], innovations), t = later(rows.t, shift);
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
         const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
         take(name, { t: Float64Array.from(which, (i) => t[i]),
@@ -559,7 +554,7 @@ const Explore = (async () => {
       take("truth_p", { t: later(p[0], shift), p: p[1] }, ["p"]);
       if (v !== null) take("truth_v", { t: later(v[0], shift), v: v[1] }, ["v"]);
       if (typeof axis.ekf2 !== "string") {
-        const other = Grid.rows(flight, axis), [time, own] = other ? [other.t, other.p] : axis.ekf2.state;
+        const [time, own] = axis.ekf2.state;
         const known = Engine.interp(time, ...p, NaN);
         take("error_ekf2", { t: later(time, shift), e: own.map((x, i) => x - known[i]) }, ["e"]);
       }
@@ -693,7 +688,6 @@ const Explore = (async () => {
     $("likely").disabled = typeof found === "string" || found.likely.includes(null);
     $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
     $("map-note").textContent = mapWords();
-    Grid.say(lone, axis);
     for (const flight of flights) {
       const done = runs[flight.number];
       drawTable(flight, done.axis, done.numbers);
@@ -723,7 +717,6 @@ const Explore = (async () => {
     " ": () => { open("step"); stepper.play(); }, s: () => stepper.faster(-1), f: () => stepper.faster(1) };
   const times = Times.start({ flights, settings, model, put, timeRange, figures, look, later, isSeen, keys, open });
   tabs();
-  Grid.start(flights, arrays, () => { axisShown = null; show(); });
   addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
   open(view, false);
   fromAddress();

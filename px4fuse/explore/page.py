@@ -10,12 +10,12 @@ from px4fuse.analysis import Analysis
 from px4fuse.explore.data import flight_data, ranges
 from px4fuse.explore.figures import FIGURES, document_json
 from px4fuse.explore.packing import Packer
-from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, template
+from px4fuse.webpage.safe import clean_values, inert_json, part, policy_hash, template
 
 # Longer text from a log is cut
 MAX_CHARACTERS = 2000
-SCRIPTS = ("dom", "story", "grid", "step", "times", "tour")
-HERE = "px4fuse.explore"
+SCRIPTS = ("dom", "story", "step", "times", "tour")
+PACKAGE = "px4fuse.explore"
 
 
 def html_text(analyses: Sequence[Analysis]) -> str:
@@ -32,7 +32,7 @@ def html_text(analyses: Sequence[Analysis]) -> str:
         Write it as UTF-8.
     """
     packer = Packer()
-    data = [flight_data(one, packer, beside=len(analyses) > 1) for one in analyses]
+    data = [flight_data(one, packer, side_by_side=len(analyses) > 1) for one in analyses]
     return page_text(
         data_scripts(data, analyses, packer),
         data,
@@ -62,7 +62,7 @@ def data_scripts(
     return "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
-            ("content", "application/json", inert_json(cleaned(content, MAX_CHARACTERS))),
+            ("content", "application/json", inert_json(clean_values(content, MAX_CHARACTERS))),
             ("document", "application/json", inert_json(document)),
             ("arrays", "text/plain", packer.text()),
         )
@@ -70,9 +70,15 @@ def data_scripts(
 
 
 def page_text(
-    scripts: str, data: list[dict[str, Any]], *, command: str, heading: str, title: str,
-    rounds: int = 0, choices: Mapping[str, str] = {},
-) -> str:  # fmt: skip
+    scripts: str,
+    data: list[dict[str, Any]],
+    *,
+    command: str,
+    heading: str,
+    title: str,
+    rounds: int = 0,
+    choices: Mapping[str, str] = {},
+) -> str:
     """The page around data that :func:`data_scripts` made.
 
     Parameters
@@ -91,13 +97,13 @@ def page_text(
         # BokehJS itself, without widgets, tables and formulas; what follows it only sets a log
         # level, and says so on the console
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
-        "engine": part("engine.js", HERE),
-        "script": "".join(part(f"{name}.js", HERE) for name in (*SCRIPTS, practice, "page")),
+        "engine": part("engine.js", PACKAGE),
+        "script": "".join(part(f"{name}.js", PACKAGE) for name in (*SCRIPTS, practice, "page")),
     }
     return template("explore/page.html").render(
         {f"{name}_hash": policy_hash(text) for name, text in code.items()},
         **code,
-        style=part("base.css") + part("page.css", HERE),
+        style=part("base.css") + part("page.css", PACKAGE),
         command=command,
         heading=heading,
         title=title,

@@ -73,11 +73,7 @@ const Times = (() => {
       for (const [low, high] of events.ground) add("on the ground", low, high, "");
       for (const [low, high] of events.silent) add("source silent", low, high, "");
       for (const [low, high] of events.dropout) add("log dropout", low, high, "");
-      const other = Grid.chosen(flight, axis);
-      if (other) {
-        for (const t of other.reset) add("EKF2 reset", t, t + sliver, "");
-        for (const t of other.rejected) add("EKF2 rejected", t, t + sliver, "");
-      } else if (typeof axis.ekf2 !== "string") {
+      if (typeof axis.ekf2 !== "string") {
         for (const t of events.reset) add("EKF2 reset", t, t + sliver, "");
         const [time, , , rejected] = axis.ekf2.innovations;
         (rejected ?? []).forEach((flag, i) => { if (flag) add("EKF2 rejected", time[i], time[i] + sliver, ""); });

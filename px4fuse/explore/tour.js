@@ -97,7 +97,7 @@ const Tour = (() => {
       if (lone.offset.why) base.offset = own.offset;
       const tried = (changes) => {
         const run = Engine.replay(lone, axis, { ...settings, ...changes }), p = run.updates.p00;
-        return { ...numbers(lone, axis, run), run, sigma: Math.sqrt(p.toSorted()[p.length >> 1]),
+        return { ...numbers(axis, run), run, sigma: Math.sqrt(p.toSorted()[p.length >> 1]),
           from: (other) => {
             const { time } = run.steps, from = time.length >> 3; // settled
             return Engine.rmse(run.steps.p.subarray(from), Engine.stateAt(other.run, time).p.subarray(from)) ?? 0;
@@ -108,7 +108,7 @@ const Tour = (() => {
       updates.nu.forEach((nu, i) => { if (nu * nu / updates.s[i] > updates.nu[step] ** 2 / updates.s[step]) step = i; });
       const worst = { step, sigmas: Math.abs(updates.nu[step]) / Math.sqrt(updates.s[step]), at: updates.time[step] };
       return { base, tried, axis, worst, why: lone.offset.why, offsets: [lone.offset.from, lone.offset.to],
-        ekf2: page.ekf2Of(lone, axis) };
+        ekf2: page.ekf2Of(axis) };
     }
     function go(to) {
       if (before === null) before = { settings: { ...settings }, view: page.view(), step: chosen.step };

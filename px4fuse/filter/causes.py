@@ -28,47 +28,47 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from px4fuse.arrays import Array, BoolArray, IntArray, cumulative_integral
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
-    moved,
+    integrate_acceleration,
     parabola_vertex,
     preintegrate,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, ned_acceleration, too_few
-from px4fuse.filter.steps import Timeline, timeline
+from px4fuse.filter.signals import Axis, ned_acceleration, too_few_measurements
+from px4fuse.filter.steps import Timeline, make_timeline
 from px4fuse.flight import Columns, Flight, Unavailable
 
-CAUSES = "causes beyond noise"
+ANALYSIS_NAME = "causes beyond noise"
 MIN_MEASUREMENTS = 50
 # Slow error of the logged attitude: its root mean square, and how far apart it is independent
 TILT_SIGMA_RAD = 0.002
-KNOT_S = 15.0
+KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
-FORWARD, RIGHT, TURN = range(3)
-CONSTANTS = 3
+FORWARD, RIGHT, ROTATION = range(3)
+CONSTANT_COUNT = 3
 # With biases and tilt taken out, less noise of the acceleration is left than the filter needs
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
-SCALES = np.linspace(0.7, 1.3, 7)
+SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # A step is sought at no more times than these
-MAX_STEPS = 800
+MAX_STEP_TIMES = 800
 # So many of them are tried together: the responses of all would be the largest arrays of a run
-STEPS_AT_ONCE = 200
+STEP_BATCH_SIZE = 200
 # The vehicle's own reading is relied on across this time, in which bursts of outliers end
-BURST_S = 1.0
+OUTLIER_BURST_S = 1.0
 # A run of outliers that begins within this time after a step belongs to it
-AFTER_STEP_S = 6.0
+OUTLIERS_AFTER_STEP_S = 6.0
 # Chance that a flight without a step shows one anywhere
-STEP_FALSE_ALARM = 1e-3
+STEP_FALSE_ALARM_P = 1e-3
 # Chance that a measurement that is no outlier beside a step is taken for one; places of it tried
-AGREES, PLACES = 1e-3, 6
+FALSE_OUTLIER_P, MAX_TRIED_TIMES = 1e-3, 6
 MAX_JUMPS = 3
-BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
-BIAS_SIGMAS = 4.0  # 6e-5 of clean flights lie beyond
+MIN_BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
+MIN_BIAS_SIGMAS = 4.0  # 6e-5 of clean flights lie beyond
 # Measurements that a step must have on either side
-EDGE = 8
+MIN_SIDE_MEASUREMENTS = 8
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Jump:
 
 
 @dataclass(frozen=True)
-class Explained:
+class BiasScaleJumpFit:
     """What explains the innovations of some axes better than noise alone.
 
     Attributes
@@ -102,7 +102,7 @@ class Explained:
     forward_bias, right_bias : Estimate
         Accelerometer bias (m/s²) along the body's axes; a constant tilt of the attitude is the
         same where the nose keeps its heading.
-    turn : Estimate
+    rotation : Estimate
         Of the source's frame against the attitude (rad, clockwise seen from above), with the biases
         accounted for.
     scale : Estimate
@@ -114,12 +114,12 @@ class Explained:
 
     forward_bias: Estimate
     right_bias: Estimate
-    turn: Estimate
+    rotation: Estimate
     scale: Estimate
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
     def bias(self) -> Estimate:
@@ -128,15 +128,21 @@ class Explained:
         return Estimate(math.hypot(one.value, other.value), math.hypot(one.sigma, other.sigma))
 
     @property
-    def biased(self) -> bool:
+    def has_bias(self) -> bool:
         """Whether the accelerometer has a bias that matters, beyond chance."""
-        return self.bias.value >= max(BIAS_M_S2, BIAS_SIGMAS * self.bias.sigma)
+        return self.bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * self.bias.sigma)
 
 
-def explained(
-    flight: Flight, axes: tuple[Axis, ...], settings: Settings, *, sigma_a_m_s2: float,
-    sigma_z_m: float, outlier_time_s: Array, clock_offset_s: float,
-) -> Explained | Unavailable:  # fmt: skip
+def bias_scale_jump_fit(
+    flight: Flight,
+    axes: tuple[Axis, ...],
+    settings: Settings,
+    *,
+    sigma_a_m_s2: float,
+    sigma_z_m: float,
+    outlier_time_s: Array,
+    clock_offset_s: float,
+) -> BiasScaleJumpFit | Unavailable:
     """Estimate biases and scale, and look for jumps of the source.
 
     Parameters
@@ -157,57 +163,61 @@ def explained(
     -------
     Explained, or Unavailable where there is no acceleration or too few measurements.
     """
-    model = hypotheses_of(flight, axes, settings, sigma_z_m, clock_offset_s)
+    model = make_design_matrix(flight, axes, settings, sigma_z_m, clock_offset_s)
     if isinstance(model, Unavailable):
         return model
     skip = np.isin(axes[0].measurement_time_s[-len(model.time_s) :], outlier_time_s)
     if (count := int(np.count_nonzero(~skip))) < MIN_MEASUREMENTS:
-        return too_few(CAUSES, count, MIN_MEASUREMENTS)
-    levels = sigma_a_m_s2 * SIGMA_A_FACTORS
-    sigma_a, found = _fit_noise(model, levels, skip)
-    jumps, skip = _jumps(model, sigma_a, skip)
+        return too_few_measurements(ANALYSIS_NAME, count, MIN_MEASUREMENTS)
+    sigma_a_grid = sigma_a_m_s2 * SIGMA_A_FACTORS
+    sigma_a, fit = _fit_sigma_a(model, sigma_a_grid, skip)
+    jumps, skip = _find_jumps(model, sigma_a, skip)
     if jumps:
-        model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
-        sigma_a, found = _fit_noise(model, levels, skip)
-    forward, right, turn = map(found.estimate, (FORWARD, RIGHT, TURN))
-    return Explained(forward, right, turn, _scale(model, sigma_a, skip), jumps, sigma_a)
+        model = replace(
+            model, step_columns=unit_steps(model.time_s, [jump.time_s for jump in jumps])
+        )
+        sigma_a, fit = _fit_sigma_a(model, sigma_a_grid, skip)
+    forward, right, turn = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
+    return BiasScaleJumpFit(forward, right, turn, _fit_scale(model, sigma_a, skip), jumps, sigma_a)
 
 
-def _fit_noise(model: Hypotheses, levels: Array, skip: BoolArray) -> tuple[float, HypothesisFit]:
+def _fit_sigma_a(
+    model: DesignMatrix, sigma_a_grid: Array, skip: BoolArray
+) -> tuple[float, DesignFit]:
     """The most likely of some SIGMA_A, and what is fitted with it."""
-    fitted = cache(lambda at: model.fit(float(levels[at]), skip))
-    best = _lowest(lambda at: fitted(at).score, len(levels))
-    return float(levels[best]), fitted(best)
+    fit_at = cache(lambda index: model.fit(float(sigma_a_grid[index]), skip))
+    best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
+    return float(sigma_a_grid[best_index]), fit_at(best_index)
 
 
-def _lowest(score: Callable[[int], float], count: int) -> int:
+def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
     """Index of the least of some scores that have one minimum, sought from the middle."""
-    at = count // 2
-    step = 1 if at + 1 < count and score(at + 1) < score(at) else -1
-    while 0 <= at + step < count and score(at + step) < score(at):
-        at += step
-    return at
+    index = count // 2
+    step = 1 if index + 1 < count and score(index + 1) < score(index) else -1
+    while 0 <= index + step < count and score(index + step) < score(index):
+        index += step
+    return index
 
 
-def _scale(model: Hypotheses, sigma_a: float, skip: BoolArray) -> Estimate:
+def _fit_scale(model: DesignMatrix, sigma_a: float, skip: BoolArray) -> Estimate:
     """Scale of the source minus 1, from the likelihood of a few; a turn's share is put back."""
-    fitted = cache(lambda at: model.fit(sigma_a, skip, float(SCALES[at])))
+    fit_at = cache(lambda at: model.fit(sigma_a, skip, float(SCALE_GRID[at])))
     # with S's logarithm, which grows with the scale, this would be biased towards zero
-    lowest = _lowest(lambda at: fitted(at).square, len(SCALES))
-    at = int(np.clip(lowest, 1, len(SCALES) - 2))
-    score = np.array([fitted(near).square / 2.0 for near in (at - 1, at, at + 1)])
-    shift, bend = parabola_vertex(score, 1)
-    step = float(SCALES[1] - SCALES[0])
-    if bend <= 0.0:
+    lowest_index = _index_of_minimum(lambda at: fit_at(at).square_sum, len(SCALE_GRID))
+    at = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
+    scores = np.array([fit_at(neighbour).square_sum / 2.0 for neighbour in (at - 1, at, at + 1)])
+    shift, curvature = parabola_vertex(scores, 1)
+    step = float(SCALE_GRID[1] - SCALE_GRID[0])
+    if curvature <= 0.0:
         return Estimate(0.0, float("inf"))
-    found = SCALES[at] + float(np.clip(shift, -1.5, 1.5)) * step
-    sigma = step / np.sqrt(bend) * max(fitted(at).spread, 1.0)
-    turned = np.hypot(1.0, fitted(at).coefficients[TURN])
-    return Estimate(float(found * turned - 1.0), float(sigma))
+    scale = SCALE_GRID[at] + float(np.clip(shift, -1.5, 1.5)) * step
+    sigma = step / np.sqrt(curvature) * max(fit_at(at).residual_rms, 1.0)
+    rotation_factor = np.hypot(1.0, fit_at(at).coefficients[ROTATION])
+    return Estimate(float(scale * rotation_factor - 1.0), float(sigma))
 
 
-def _jumps(
-    model: Hypotheses, sigma_a: float, skip: BoolArray
+def _find_jumps(
+    model: DesignMatrix, sigma_a: float, skip: BoolArray
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Steps of the source that stay, in order of time, and what is an outlier beside them.
 
@@ -217,183 +227,223 @@ def _jumps(
     """
     jumps: list[Jump] = []
     for _ in range(MAX_JUMPS):
-        model = replace(model, steps=steps(model.time_s, [jump.time_s for jump in jumps]))
-        starts = model.time_s[np.flatnonzero(skip & ~np.concatenate([[False], skip[:-1]]))]
-        proposed = [*_scan(model, sigma_a, skip, starts), *_scan(model, sigma_a, skip)[:1]]
-        chance = STEP_FALSE_ALARM / max(len(starts), 1)
-        judged = [_judge(model, sigma_a, skip, time_s, chance) for time_s in proposed]
-        named = [jump for jump in judged if jump is not None]
-        if not named:
+        model = replace(
+            model, step_columns=unit_steps(model.time_s, [jump.time_s for jump in jumps])
+        )
+        outlier_run_starts = model.time_s[
+            np.flatnonzero(skip & ~np.concatenate([[False], skip[:-1]]))
+        ]
+        candidate_times = [
+            *_significant_step_times(model, sigma_a, skip, outlier_run_starts),
+            *_significant_step_times(model, sigma_a, skip)[:1],
+        ]
+        chance = STEP_FALSE_ALARM_P / max(len(outlier_run_starts), 1)
+        candidates = [
+            _test_step(model, sigma_a, skip, time_s, chance) for time_s in candidate_times
+        ]
+        significant = [jump for jump in candidates if jump is not None]
+        if not significant:
             break
-        best, skip = _placed(model, sigma_a, skip, max(named, key=lambda jump: jump.chi_square))
-        jumps.append(best)
+        best_jump, skip = _locate_jump(
+            model, sigma_a, skip, max(significant, key=lambda jump: jump.chi_square)
+        )
+        jumps.append(best_jump)
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), skip
 
 
-def _from(time_s: Array, start_s: float, length_s: float) -> BoolArray:
+def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
     return np.asarray((time_s >= start_s) & (time_s < start_s + length_s))
 
 
-def _scan(
-    model: Hypotheses, sigma_a: float, skip: BoolArray, times: Array | None = None
+def _significant_step_times(
+    model: DesignMatrix, sigma_a: float, skip: BoolArray, times: Array | None = None
 ) -> list[float]:
     """The times at which a step would explain more than chance, by default of all; most first."""
     if times is None:
-        times = model.time_s[EDGE:-EDGE]
-        times = times[:: max(1, -(-len(times) // MAX_STEPS))]
+        times = model.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
+        times = times[:: max(1, -(-len(times) // MAX_STEP_TIMES))]
     if not len(times):
         return []
-    chi_square = _step_squares(model, sigma_a, skip, times)
-    least = chdtri(len(model.legs), STEP_FALSE_ALARM / len(model.time_s))
+    chi_square = _step_chi_squares(model, sigma_a, skip, times)
+    threshold = chdtri(len(model.intervals), STEP_FALSE_ALARM_P / len(model.time_s))
     order = np.argsort(-chi_square)
-    return [float(times[at]) for at in order if chi_square[at] >= least]
+    return [float(times[index]) for index in order if chi_square[index] >= threshold]
 
 
-def _step_squares(model: Hypotheses, sigma_a: float, skip: BoolArray, times: Array) -> Array:
+def _step_chi_squares(model: DesignMatrix, sigma_a: float, skip: BoolArray, times: Array) -> Array:
     """χ² of a step at each time: what it takes away of the squares, summed over the axes."""
-    data, columns, log_s = model.laid_out(sigma_a, skip)
-    base = model.regress(data, columns, log_s, skip)
+    data, columns, log_s = model.whitened_design(sigma_a, skip)
+    base_fit = model.regress(data, columns, log_s, skip)
     chi_square = np.zeros(len(times))
-    for few in np.array_split(np.arange(len(times)), -(-len(times) // STEPS_AT_ONCE)):
-        added = steps(model.time_s, times[few])
-        for axis, legs in enumerate(model.legs):
-            if axis in (alike[0] for alike in model.alike):
-                still = np.broadcast_to(0.0, added.shape)
-                alone = _with_signals(legs, still, still, added)
-                response = model.whitened(alone, sigma_a, skip)[0][~skip]
-            rest, mixed = base.rest[base.axis == axis], columns[axis][~skip].T @ response
-            size = np.sum(response**2, axis=0) - np.sum(mixed * (base.covariance @ mixed), axis=0)
-            chi_square[few] += (rest @ response / base.spreads[axis]) ** 2 / np.maximum(size, 1e-9)
+    for batch in np.array_split(np.arange(len(times)), -(-len(times) // STEP_BATCH_SIZE)):
+        step_signals = unit_steps(model.time_s, times[batch])
+        for axis, intervals in enumerate(model.intervals):
+            if axis in (axis_group[0] for axis_group in model.axis_groups):
+                zero_signal = np.broadcast_to(0.0, step_signals.shape)
+                step_interval = _replace_signals(intervals, zero_signal, zero_signal, step_signals)
+                response = model.whitened(step_interval, sigma_a, skip)[0][~skip]
+            residual, cross_product = (
+                base_fit.residual[base_fit.axis == axis],
+                columns[axis][~skip].T @ response,
+            )
+            information = np.sum(response**2, axis=0) - np.sum(
+                cross_product * (base_fit.covariance @ cross_product), axis=0
+            )
+            chi_square[batch] += (residual @ response / base_fit.axis_rms[axis]) ** 2 / np.maximum(
+                information, 1e-9
+            )
     return chi_square
 
 
-def _placed(
-    model: Hypotheses, sigma_a: float, skip: BoolArray, jump: Jump
+def _locate_jump(
+    model: DesignMatrix, sigma_a: float, skip: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
     """A jump at the most likely time near its own, with its size, and what is an outlier then."""
-    near = np.abs(model.time_s - jump.time_s) <= BURST_S
+    is_near = np.abs(model.time_s - jump.time_s) <= OUTLIER_BURST_S
     # with the step in the middle of what is not known, what follows is no outlier where it agrees
-    square = model.with_step(jump.time_s)[0].squares(sigma_a, skip | near)
-    after = near | _from(model.time_s, jump.time_s, AFTER_STEP_S)
-    skip = np.where(after & ~near, square > chdtri(len(model.legs), AGREES), skip)
-    times = model.time_s[near]
-    likely = np.argsort(-_step_squares(model, sigma_a, skip & ~near, times))[:PLACES]
-    placed = []
-    for at in times[likely].tolist():
-        square = model.with_step(at)[0].squares(sigma_a, skip | near)
-        placed.append((at, np.where(near, square > chdtri(len(model.legs), AGREES), skip)))
+    chi_square = model.with_step(jump.time_s)[0].residual_squares(sigma_a, skip | is_near)
+    is_after = is_near | _is_in_window(model.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
+    skip = np.where(
+        is_after & ~is_near, chi_square > chdtri(len(model.intervals), FALSE_OUTLIER_P), skip
+    )
+    times = model.time_s[is_near]
+    best_indices = np.argsort(-_step_chi_squares(model, sigma_a, skip & ~is_near, times))[
+        :MAX_TRIED_TIMES
+    ]
+    placements = []
+    for candidate_s in times[best_indices].tolist():
+        chi_square = model.with_step(candidate_s)[0].residual_squares(sigma_a, skip | is_near)
+        placements.append(
+            (
+                candidate_s,
+                np.where(is_near, chi_square > chdtri(len(model.intervals), FALSE_OUTLIER_P), skip),
+            )
+        )
     # an outlier beside a step looks like one: fewest are left where it is
-    time_s, skip = min(placed, key=lambda each: np.count_nonzero(each[1]))
-    stepped, columns = model.with_step(time_s)
-    found = stepped.fit(sigma_a, skip)
-    step_m = tuple(found.estimate(int(column)) for column in columns)
+    time_s, skip = min(placements, key=lambda placement: np.count_nonzero(placement[1]))
+    stepped_model, columns = model.with_step(time_s)
+    design_fit = stepped_model.fit(sigma_a, skip)
+    step_m = tuple(design_fit.estimate(int(column)) for column in columns)
     return replace(jump, time_s=time_s, step_m=step_m), skip
 
 
-def _judge(
-    model: Hypotheses, sigma_a: float, skip: BoolArray, time_s: float, chance: float
+def _test_step(
+    model: DesignMatrix, sigma_a: float, skip: BoolArray, time_s: float, chance: float
 ) -> Jump | None:
     """A step at a time, where what comes later still asks for it; None where that is chance."""
-    later = skip | _from(model.time_s, time_s, BURST_S)
+    skip_with_burst = skip | _is_in_window(model.time_s, time_s, OUTLIER_BURST_S)
     model, columns = model.with_step(time_s)
-    before = np.count_nonzero(~later & (model.time_s < time_s))
-    if min(before, np.count_nonzero(~later & (model.time_s >= time_s))) < EDGE:
+    count_before = np.count_nonzero(~skip_with_burst & (model.time_s < time_s))
+    if (
+        min(count_before, np.count_nonzero(~skip_with_burst & (model.time_s >= time_s)))
+        < MIN_SIDE_MEASUREMENTS
+    ):
         return None
-    found = model.fit(sigma_a, later)
-    size, covariance = found.coefficients[columns], found.covariance[np.ix_(columns, columns)]
-    size = size / found.spreads
+    design_fit = model.fit(sigma_a, skip_with_burst)
+    size, covariance = (
+        design_fit.coefficients[columns],
+        design_fit.covariance[np.ix_(columns, columns)],
+    )
+    size = size / design_fit.axis_rms
     chi_square = float(size @ np.linalg.solve(covariance, size))
     if chi_square < chdtri(len(columns), chance):
         return None
-    return Jump(time_s, tuple(found.estimate(int(at)) for at in columns), chi_square)
+    return Jump(time_s, tuple(design_fit.estimate(int(column)) for column in columns), chi_square)
 
 
 @dataclass(frozen=True)
-class HypothesisFit:
+class DesignFit:
     """Generalised least squares of whitened innovations on their columns.
 
     Attributes
     ----------
     axis : ndarray of int, shape (n,)
         Which axis each row is of: all of one, then of the next.
-    rest : ndarray, shape (n,)
+    residual : ndarray, shape (n,)
         What the columns leave of the innovations.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
-    square : float
+    square_sum : float
         Sum of squares that remains, what the prior adds included.
     score : float
         Restricted negative log-likelihood.
-    spread : float
+    residual_rms : float
         Root mean square that remains, 1 where the noises are right.
     """
 
     axis: IntArray
-    rest: Array
+    residual: Array
     coefficients: Array
     covariance: Array
-    square: float
+    square_sum: float
     score: float
-    spread: float
+    residual_rms: float
 
     @property
-    def spreads(self) -> Array:
+    def axis_rms(self) -> Array:
         """Root mean square that remains along each axis, at least 1: one may be the noisier."""
-        square = np.bincount(self.axis, self.rest**2) / np.bincount(self.axis)
-        return np.sqrt(np.maximum(square, 1.0))
+        mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
+        return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
         """One coefficient, its σ widened where more remains than the noises say."""
-        sigma = float(np.sqrt(self.covariance[column, column])) * max(self.spread, 1.0)
+        sigma = float(np.sqrt(self.covariance[column, column])) * max(self.residual_rms, 1.0)
         return Estimate(float(self.coefficients[column]), sigma)
 
 
 @dataclass(frozen=True)
-class Hypotheses:
+class DesignMatrix:
     """Axes with their columns: what every hypothesis is fitted on.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Of the measurements, as they were stamped.
-    legs : tuple of Preintegrated
+    intervals : tuple of Preintegrated
         Of each axis, with several signals: what was measured, then what each constant adds.
-    hats : (ndarray, ndarray), shape (m, h)
+    hat_signals : (ndarray, ndarray), shape (m, h)
         Position and velocity that slow accelerations add, with coefficients of their own for each
         axis.
-    prior : ndarray, shape (k,)
+    prior_sigma : ndarray, shape (k,)
         Standard deviations of the columns' coefficients before the data, steps left out.
     sigma_z_m : float
-    steps : ndarray, shape (m, j)
+    step_columns : ndarray, shape (m, j)
         Added to the measurements, in j more columns for each axis.
     """
 
     time_s: Array
-    legs: tuple[Preintegrated, ...]
-    hats: tuple[Array, Array]
-    prior: Array
+    intervals: tuple[Preintegrated, ...]
+    hat_signals: tuple[Array, Array]
+    prior_sigma: Array
     sigma_z_m: float
-    steps: Array
+    step_columns: Array
 
-    def with_step(self, time_s: float) -> tuple[Hypotheses, IntArray]:
+    def with_step(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
         """The same with one more step, and its column of each axis."""
-        model = replace(self, steps=np.hstack([self.steps, steps(self.time_s, [time_s])]))
-        width, count = len(self.prior), model.steps.shape[1]
-        return model, width + count * (1 + np.arange(len(self.legs))) - 1
+        model = replace(
+            self, step_columns=np.hstack([self.step_columns, unit_steps(self.time_s, [time_s])])
+        )
+        first_step_column, count = len(self.prior_sigma), model.step_columns.shape[1]
+        return model, first_step_column + count * (1 + np.arange(len(self.intervals))) - 1
 
     @cached_property
-    def alike(self) -> list[list[int]]:
+    def axis_groups(self) -> list[list[int]]:
         """Axes with the same filter: all, but where gaps in the IMU tell less of one."""
-        same = all(np.array_equal(each.noise_fixed, self.legs[0].noise_fixed) for each in self.legs)
-        every = list(range(len(self.legs)))
-        return [every] if same else [[axis] for axis in every]
+        has_same_filter = all(
+            np.array_equal(intervals.noise_fixed, self.intervals[0].noise_fixed)
+            for intervals in self.intervals
+        )
+        all_axes = list(range(len(self.intervals)))
+        return [all_axes] if has_same_filter else [[axis] for axis in all_axes]
 
-    def whitened(self, legs: Preintegrated, sigma_a: float, skip: BoolArray) -> tuple[Array, float]:
+    def whitened(
+        self, intervals: Preintegrated, sigma_a: float, skip: BoolArray
+    ) -> tuple[Array, float]:
         """Innovations over √S of signals along any axis, (m, k), and Σ ln S of those used."""
-        nu, s = innovations(legs, sigma_a, self.sigma_z_m, skip)
+        nu, s = innovations(intervals, sigma_a, self.sigma_z_m, skip)
         nu /= np.sqrt(s)[:, None]
         return nu, float(np.sum(np.log(s[~skip])))
 
-    def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> HypothesisFit:
+    def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> DesignFit:
         """Fit all columns, with the acceleration (and its noise) scaled.
 
         Parameters
@@ -403,72 +453,89 @@ class Hypotheses:
             Measurements that are neither fused nor fitted.
         scale : float
         """
-        return self.regress(*self.laid_out(sigma_a, skip, scale), skip)
+        return self.regress(*self.whitened_design(sigma_a, skip, scale), skip)
 
-    def regress(self, data: Array, columns: Array, log_s: float, skip: BoolArray) -> HypothesisFit:
-        """Fit what :meth:`laid_out` gave, without the measurements that are left out."""
+    def regress(self, data: Array, columns: Array, log_s: float, skip: BoolArray) -> DesignFit:
+        """Fit what :meth:`whitened_design` gave, without the measurements that are left out."""
         axis = np.repeat(np.arange(len(data)), np.count_nonzero(~skip))
         data, columns = data[:, ~skip].ravel(), columns[:, ~skip].reshape(len(axis), -1)
         count = columns.shape[1]
-        prior = np.append(self.prior, np.full(count - len(self.prior), np.inf))
-        information = np.diag(prior**-2.0) + columns.T @ columns
+        prior_sigma = np.append(self.prior_sigma, np.full(count - len(self.prior_sigma), np.inf))
+        information = np.diag(prior_sigma**-2.0) + columns.T @ columns
         # a column that nothing excites (a turn in hover) must not stop the others
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
         moment, factor = columns.T @ data, cho_factor(information)
         covariance = cho_solve(factor, np.eye(count))
         coefficients = covariance @ moment
-        square = float(data @ data - coefficients @ moment)
-        score = 0.5 * (square + log_s) + float(np.sum(np.log(np.diag(factor[0]))))
-        spread = float(np.sqrt(max(square, 0.0) / max(len(data) - CONSTANTS, 1)))
-        rest = data - columns @ coefficients
-        return HypothesisFit(axis, rest, coefficients, covariance, square, score, spread)
+        square_sum = float(data @ data - coefficients @ moment)
+        score = 0.5 * (square_sum + log_s) + float(np.sum(np.log(np.diag(factor[0]))))
+        residual_rms = float(np.sqrt(max(square_sum, 0.0) / max(len(data) - CONSTANT_COUNT, 1)))
+        residual = data - columns @ coefficients
+        return DesignFit(axis, residual, coefficients, covariance, square_sum, score, residual_rms)
 
-    def squares(self, sigma_a: float, skip: BoolArray) -> Array:
+    def residual_squares(self, sigma_a: float, skip: BoolArray) -> Array:
         """What a fit leaves of every measurement, over its σ: squares summed over the axes."""
-        data, columns, log_s = self.laid_out(sigma_a, skip)
-        found = self.regress(data, columns, log_s, skip)
-        rest = data - columns @ found.coefficients
-        return np.asarray(np.sum(rest**2, axis=0)) / max(found.spread, 1.0) ** 2
+        data, columns, log_s = self.whitened_design(sigma_a, skip)
+        fit = self.regress(data, columns, log_s, skip)
+        residual = data - columns @ fit.coefficients
+        return np.asarray(np.sum(residual**2, axis=0)) / max(fit.residual_rms, 1.0) ** 2
 
-    def laid_out(
+    def whitened_design(
         self, sigma_a: float, skip: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
         """Whitened innovations (a, m) of all axes and their columns (a, m, k), and Σ ln S."""
-        hats, steps, axes = self.hats[0].shape[1], self.steps.shape[1], len(self.legs)
-        width = len(self.prior)
+        hat_count, step_count, axes = (
+            self.hat_signals[0].shape[1],
+            self.step_columns.shape[1],
+            len(self.intervals),
+        )
+        width = len(self.prior_sigma)
         data = np.empty((axes, len(skip)))
-        columns = np.zeros((axes, len(skip), width + axes * steps))
+        columns = np.zeros((axes, len(skip), width + axes * step_count))
         # acceleration in the source's own length: of what was measured, and of a turn of it
-        factor = np.ones(1 + CONSTANTS)
-        factor[[0, 1 + TURN]] = scale
-        still, log_s = np.zeros_like(self.hats[0]), 0.0
-        for alike in self.alike:
-            legs = [self.legs[at] for at in alike]
-            dp = [*(factor * each.delta_position_m for each in legs), self.hats[0]]
-            dv = [*(factor * each.delta_velocity_m_s for each in legs), self.hats[1]]
-            measured = [*(each.measurement_m for each in legs), still, self.steps]
-            dp, dv = ([*each, 0.0 * self.steps] for each in (dp, dv))
-            own = _with_signals(legs[0], *map(np.hstack, (dp, dv, measured)))
-            normalised, own_log_s = self.whitened(own, scale * sigma_a, skip)
-            log_s += len(alike) * own_log_s
-            *each_own, common = np.split(normalised, len(factor) * np.arange(1, 1 + len(legs)), 1)
-            for at, signals in zip(alike, each_own, strict=True):
-                data[at] = signals[:, 0]
-                first, step = CONSTANTS + hats * at, width + steps * at
-                columns[at][:, :CONSTANTS] = signals[:, 1:]
-                which = np.r_[first : first + hats, step : step + steps]
-                columns[at][:, which] = common
+        factor = np.ones(1 + CONSTANT_COUNT)
+        factor[[0, 1 + ROTATION]] = scale
+        zero_signal, log_s = np.zeros_like(self.hat_signals[0]), 0.0
+        for axis_group in self.axis_groups:
+            intervals = [self.intervals[axis] for axis in axis_group]
+            dp = [*(factor * array.delta_position_m for array in intervals), self.hat_signals[0]]
+            dv = [*(factor * array.delta_velocity_m_s for array in intervals), self.hat_signals[1]]
+            measurements = [
+                *(array.measurement_m for array in intervals),
+                zero_signal,
+                self.step_columns,
+            ]
+            dp, dv = ([*array, 0.0 * self.step_columns] for array in (dp, dv))
+            group_signals = _replace_signals(intervals[0], *map(np.hstack, (dp, dv, measurements)))
+            normalised, group_log_s = self.whitened(group_signals, scale * sigma_a, skip)
+            log_s += len(axis_group) * group_log_s
+            *axis_signals, common = np.split(
+                normalised, len(factor) * np.arange(1, 1 + len(intervals)), 1
+            )
+            for axis, signals in zip(axis_group, axis_signals, strict=True):
+                data[axis] = signals[:, 0]
+                first_hat, first_step = CONSTANT_COUNT + hat_count * axis, width + step_count * axis
+                columns[axis][:, :CONSTANT_COUNT] = signals[:, 1:]
+                common_columns = np.r_[
+                    first_hat : first_hat + hat_count, first_step : first_step + step_count
+                ]
+                columns[axis][:, common_columns] = common
         return data, columns, log_s
 
 
-def _with_signals(legs: Preintegrated, dp: Array, dv: Array, measured_m: Array) -> Preintegrated:
-    return replace(legs, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m)
+def _replace_signals(
+    intervals: Preintegrated, dp: Array, dv: Array, measured_m: Array
+) -> Preintegrated:
+    return replace(intervals, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m)
 
 
-def hypotheses_of(
-    flight: Flight, axes: tuple[Axis, ...], settings: Settings, sigma_z: float,
+def make_design_matrix(
+    flight: Flight,
+    axes: tuple[Axis, ...],
+    settings: Settings,
+    sigma_z: float,
     clock_offset_s: float,
-) -> Hypotheses | Unavailable:  # fmt: skip
+) -> DesignMatrix | Unavailable:
     """Lay out the axes with the columns that every hypothesis is fitted beside.
 
     Parameters
@@ -484,46 +551,57 @@ def hypotheses_of(
         Added to the stamps first.
     """
     acceleration, attitude = ned_acceleration(flight), flight.attitude
-    for needed in (acceleration, axes[0].acceleration, attitude):
-        if isinstance(needed, Unavailable):
-            return needed
+    for input_data in (acceleration, axes[0].acceleration, attitude):
+        if isinstance(input_data, Unavailable):
+            return input_data
     assert isinstance(acceleration, pd.DataFrame)
     assert isinstance(attitude, pd.DataFrame)
     if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
-        return too_few(CAUSES, len(axes[0].measurement_time_s), MIN_MEASUREMENTS)
+        return too_few_measurements(
+            ANALYSIS_NAME, len(axes[0].measurement_time_s), MIN_MEASUREMENTS
+        )
     time_s = axes[0].measurement_time_s + clock_offset_s
     shifted = [replace(axis, measurement_time_s=time_s) for axis in axes]
     settings = replace(settings, input="imu")
-    line = timeline(shifted[0], settings)
-    common = _common_columns(attitude, acceleration)
-    legs = []
+    line = make_timeline(shifted[0], settings)
+    common = _common_accelerations(attitude, acceleration)
+    intervals = []
     for axis in shifted:
-        own = preintegrate(axis, settings)
-        columns = [(own.delta_position_m, own.delta_velocity_m_s)]
-        columns += [_added(value @ axis.direction, when, line) for when, value in common]
-        dp, dv = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
+        interval_input = preintegrate(axis, settings)
+        columns = [(interval_input.delta_position_m, interval_input.delta_velocity_m_s)]
+        columns += [
+            _integrate_signal(value @ axis.direction, input_time_s, line)
+            for input_time_s, value in common
+        ]
+        dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*columns, strict=True))
         measured = np.zeros_like(dp)
         # the filter starts at the first one
-        measured[:, 0] = own.measurement_m - own.initial.position_m
-        start = replace(own.initial, position_m=0.0)
-        legs.append(replace(_with_signals(own, dp, dv, measured), initial=start))
+        measured[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
+        start = replace(interval_input.initial, position_m=0.0)
+        intervals.append(replace(_replace_signals(interval_input, dp, dv, measured), initial=start))
     time_s = axes[0].measurement_time_s[-len(measured) :]
-    fine, hats = _hats(time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s)
-    slow = [_added(hat, fine, line) for hat in hats]
-    position, velocity = (np.stack(part, axis=1) for part in zip(*slow, strict=True))
-    tilt = np.full(len(axes) * len(hats), TILT_SIGMA_RAD * constants.g)
-    prior = np.append(np.full(CONSTANTS, np.inf), tilt)
-    return Hypotheses(time_s, tuple(legs), (position, velocity), prior, sigma_z, steps(time_s, []))
+    hat_time_s, hat_functions = _hat_functions(
+        time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s
+    )
+    hat_responses = [_integrate_signal(hat, hat_time_s, line) for hat in hat_functions]
+    position, velocity = (np.stack(arrays, axis=1) for arrays in zip(*hat_responses, strict=True))
+    tilt = np.full(len(axes) * len(hat_functions), TILT_SIGMA_RAD * constants.g)
+    prior_sigma = np.append(np.full(CONSTANT_COUNT, np.inf), tilt)
+    return DesignMatrix(
+        time_s, tuple(intervals), (position, velocity), prior_sigma, sigma_z, unit_steps(time_s, [])
+    )
 
 
-def _added(acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline) -> tuple[Array, Array]:
+def _integrate_signal(
+    acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline
+) -> tuple[Array, Array]:
     """Position and velocity that an acceleration adds between the measurements."""
     time = np.asarray(time_s, dtype=np.float64)
     velocity = np.interp(line.time_s, time, cumulative_integral(acceleration_m_s2, time))
-    return moved(line, np.diff(velocity) / np.diff(line.time_s))
+    return integrate_acceleration(line, np.diff(velocity) / np.diff(line.time_s))
 
 
-def _common_columns(
+def _common_accelerations(
     attitude: pd.DataFrame, acceleration: pd.DataFrame
 ) -> list[tuple[pd.Index, Array]]:
     """NED acceleration that takes out a bias forward and right, and that a turn adds; and when."""
@@ -534,14 +612,14 @@ def _common_columns(
     return [*biases, (acceleration.index, np.column_stack([-east, north, 0.0 * north]))]
 
 
-def _hats(start_s: float, end_s: float) -> tuple[Array, Array]:
+def _hat_functions(start_s: float, end_s: float) -> tuple[Array, Array]:
     """Hat functions between knots, of which any slow signal is made, at times so fine (n, h)."""
-    count = int(np.clip(np.ceil((end_s - start_s) / KNOT_S), 1, MAX_KNOTS)) + 1
+    count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     time = np.linspace(start_s, end_s, 20 * (count - 1) + 1)
     knots = np.linspace(start_s, end_s, count)
-    return time, np.array([np.interp(time, knots, hat) for hat in np.eye(count)])
+    return time, np.array([np.interp(time, knots, weights) for weights in np.eye(count)])
 
 
-def steps(time_s: Array, starts_s: Iterable[float]) -> Array:
+def unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
     """Unit steps of the measurements, shape (m, j)."""
     return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)

@@ -20,18 +20,18 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array
-from px4fuse.display import brief
-from px4fuse.filter.fitting import Noises, fitted, most_likely, of_ratios
+from px4fuse.display import one_line_repr
+from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_likelihood
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal import Fitted, paired_products
+from px4fuse.filter.marginal import FittedPositions, products_by_stretch
 from px4fuse.filter.motion import (
     COARSE_MEASUREMENTS,
     COARSE_POINTS,
     CONSTANT_SIGMA,
-    SEARCH_S,
+    MAX_OFFSET_S,
     PreparedMotion,
     SignalCache,
-    motion,
+    prepare_motion,
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, within
@@ -41,19 +41,19 @@ from px4fuse.record import Count, NotNegative, Record, Share, Span
 FINE_POINTS, CURVE_POINTS = 11, 121
 # EKF2 that takes fixes for younger or older than they are turns its heading until both agree, by
 # 5° for 0.2 s: a heading that is believed would hide the offset
-HEADING_RAD, WRONG_HEADING_RAD = float(CONSTANT_SIGMA[2]), 0.2
+HEADING_SIGMA_RAD, GNSS_HEADING_SIGMA_RAD = float(CONSTANT_SIGMA[2]), 0.2
 # A wider interval says nothing that a student could use
 MAX_HALF_INTERVAL_S = 0.15
 # A part that says less than this about its own offset (s) says nothing about a change
 MAX_PART_SIGMA_S = 0.15
 # Parts further apart than chance would put them (two-sided)
-CHANGE_P = 0.005
+MAX_CHANGE_P = 0.005
 # Standard deviations beyond which an offset is not chance: 0.3 % of clean flights lie there
-SURE_SIGMAS = 3.0
+OFFSET_SIGMAS = 3.0
 # Flights simulated for the scatter that the IMU's noise adds
-REPLICATES = 96
+SIMULATION_COUNT = 96
 # Steps of ln σ by which the noises are tried at every offset
-NOISE_STEP = 0.1
+LOG_SIGMA_STEP = 0.1
 
 
 class PartOffset(Record, frozen=True):
@@ -111,9 +111,9 @@ class Clock(Record, frozen=True, kw_only=True):
         return self.offset_s - self.applied_s
 
     @property
-    def chance_s(self) -> float:
-        """How far chance may take it from the truth: ``SURE_SIGMAS`` standard deviations (s)."""
-        return SURE_SIGMAS * self.sigma_s
+    def three_sigma_s(self) -> float:
+        """How far chance may take it from the truth: ``OFFSET_SIGMAS`` standard deviations (s)."""
+        return OFFSET_SIGMAS * self.sigma_s
 
 
 class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):
@@ -127,16 +127,16 @@ class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):
         Noises at the maximum.
     """
 
-    written_as = Clock
+    schema_type = Clock
     curve_s: Array
     curve_drop: Array
     sigma_a_m_s2: float
     sigma_z_m: float
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-def estimate_clock_offset(
+def estimate_time_offset(
     flight: Flight,
     track: PositionTrack,
     segment: Segment,
@@ -175,52 +175,60 @@ def estimate_clock_offset(
     samples = samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
         samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]
-    moved = motion(
+    prepared_motion = prepare_motion(
         flight,
         samples.index.to_numpy(),
         samples.to_numpy(),
         directions=np.eye(3)[:axes],
         dt_s=settings.dt_s,
         signals=signals,
-        heading_sigma_rad=WRONG_HEADING_RAD if track.origin.is_gnss else HEADING_RAD,
+        heading_sigma_rad=GNSS_HEADING_SIGMA_RAD if track.origin.is_gnss else HEADING_SIGMA_RAD,
     )
-    if isinstance(moved, Unavailable):
-        return moved
+    if isinstance(prepared_motion, Unavailable):
+        return prepared_motion
     progress("clock offset")
-    few = moved.thinned(COARSE_MEASUREMENTS)
-    offset, _ = moved.search(noises)
+    coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
+    offset, _ = prepared_motion.search(noises)
     sigma, width = 0.0, 0.1
-    for some in (few, moved):
-        noises = most_likely([some.at(offset)], noises, some.weight, outliers=False).noises
-        curve = _around(offset, width, FINE_POINTS)
-        totals = fitted(some.blocks(curve), noises, some.weight).totals()[0]
-        offset, sigma = _vertex(curve, totals)
-        width = float(np.clip(3.5 * sigma, 0.01, SEARCH_S))
-    factor = _scatter(moved, offset, noises, sigma**-2.0)
+    for each_motion in (coarse_motion, prepared_motion):
+        noises = maximise_likelihood(
+            [each_motion.at(offset)], noises, each_motion.weight, outliers=False
+        ).noises
+        curve = _offset_grid(offset, width, FINE_POINTS)
+        totals = fit_noises(each_motion.blocks(curve), noises, each_motion.weight).totals()[0]
+        offset, sigma = _minimum_and_sigma(curve, totals)
+        width = float(np.clip(3.5 * sigma, 0.01, MAX_OFFSET_S))
+    factor = _variance_inflation(prepared_motion, offset, noises, sigma**-2.0)
     while True:
-        points, curve = (_around(offset, width, count) for count in (FINE_POINTS, CURVE_POINTS))
-        profile = CubicSpline(points, _profiled(moved, points, noises, offset))(curve)
+        points, curve = (
+            _offset_grid(offset, width, count) for count in (FINE_POINTS, CURVE_POINTS)
+        )
+        profile = CubicSpline(
+            points, _profile_over_noises(prepared_motion, points, noises, offset)
+        )(curve)
         low, high = profile_interval(curve, profile, PROFILE_DROP * factor)
-        closed = low is not None and high is not None
-        if closed or width >= 2.0 * SEARCH_S:
+        is_closed = low is not None and high is not None
+        if is_closed or width >= 2.0 * MAX_OFFSET_S:
             break
         width *= 2.0
-    offset = _vertex(curve, profile)[0]
+    offset = _minimum_and_sigma(curve, profile)[0]
     # an IMU sample is the mean over its interval, stamped somewhere in it
-    resolution = 0.5 * moved.imu_interval_s
+    resolution = 0.5 * prepared_motion.imu_interval_s
     ends = curve[0] if low is None else low, curve[-1] if high is None else high
-    widened = np.hypot(np.array(ends) - offset, 1.96 * resolution)
-    low, high = float(offset - widened[0]), float(offset + widened[1])
+    half_widths = np.hypot(np.array(ends) - offset, 1.96 * resolution)
+    low, high = float(offset - half_widths[0]), float(offset + half_widths[1])
     reason = ""
-    if not closed or (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
-        fits = f"the positions fit offsets from {low:+.2f} s to {high:+.2f} s almost equally well"
-        reason = f"{fits}: too little acceleration, or too noisy a source"
+    if not is_closed or (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
+        range_text = (
+            f"the positions fit offsets from {low:+.2f} s to {high:+.2f} s almost equally well"
+        )
+        reason = f"{range_text}: too little acceleration, or too noisy a source"
     parts: tuple[PartOffset, ...] = ()
     change_p = None
     if not reason:
         progress("changes of the clock")
-        parts, change_p = _parts(moved, offset, noises, factor)
-    drift, drift_sigma = _drift(parts)
+        parts, change_p = _offset_per_part(prepared_motion, offset, noises, factor)
+    drift, drift_sigma = _clock_drift(parts)
     applied = settings.clock_offset_s
     return ClockOffset(
         offset_s=applied + offset,
@@ -237,116 +245,137 @@ def estimate_clock_offset(
         change_p=change_p,
         sigma_a_m_s2=noises.sigma_a_m_s2,
         sigma_z_m=noises.sigma_z_m,
-        count=len(moved.time_s),
+        count=len(prepared_motion.time_s),
     )
 
 
-def _around(offset: float, width: float, count: int) -> Array:
+def _offset_grid(offset: float, width: float, count: int) -> Array:
     """Offsets within the search, so far to either side."""
-    low, high = np.clip([offset - width, offset + width], -SEARCH_S, SEARCH_S).tolist()
+    low, high = np.clip([offset - width, offset + width], -MAX_OFFSET_S, MAX_OFFSET_S).tolist()
     return np.linspace(low, high, count)
 
 
-def _profiled(moved: PreparedMotion, curve: Array, noises: Noises, offset: float) -> Array:
+def _profile_over_noises(
+    prepared_motion: PreparedMotion, curve: Array, noises: Noises, offset: float
+) -> Array:
     """-ln p over offsets, the noises maximised at each by a Newton step from the best ones.
 
     The step's slopes are taken at each offset; the bends, which hardly change, at the best one.
     """
     sigma_z, sigma_a = noises.sigma_z_m, noises.sigma_a_m_s2
     offsets = np.append(curve, offset)
-    ratios = sigma_a / sigma_z * np.exp(NOISE_STEP * np.array([-1.0, 0.0, 1.0]))
+    ratios = sigma_a / sigma_z * np.exp(LOG_SIGMA_STEP * np.array([-1.0, 0.0, 1.0]))
 
     @cache
-    def fits(walk: float) -> list[Fitted]:
-        return of_ratios(moved.blocks(offsets), ratios.tolist(), walk, moved.weight, sigma_z)
+    def fits_at_walk(walk: float) -> list[FittedPositions]:
+        return fit_ratios(
+            prepared_motion.blocks(offsets), ratios.tolist(), walk, prepared_motion.weight, sigma_z
+        )
 
-    def at(shift_a: int, shift_z: int) -> Array:
-        scale = sigma_z * float(np.exp(NOISE_STEP * shift_z))
-        found = fits(noises.walk_m / scale)[1 + shift_a - shift_z]
-        return np.asarray(found.totals(np.array([scale]))[0])
+    def profile_at(shift_a: int, shift_z: int) -> Array:
+        scale = sigma_z * float(np.exp(LOG_SIGMA_STEP * shift_z))
+        fit = fits_at_walk(noises.walk_m / scale)[1 + shift_a - shift_z]
+        return np.asarray(fit.totals(np.array([scale]))[0])
 
-    middle = at(0, 0)
-    ahead, back = (np.array([at(sign, 0), at(0, sign)]) for sign in (1, -1))
-    slope = (ahead - back)[:, :-1] / (2.0 * NOISE_STEP)
-    bend = np.diag((ahead + back)[:, -1] - 2.0 * middle[-1])
-    both = at(1, 1)[-1] + at(-1, -1)[-1] - 2.0 * middle[-1]
-    bend[0, 1] = bend[1, 0] = 0.5 * (both - bend[0, 0] - bend[1, 1])
-    bend /= NOISE_STEP**2
-    if np.any(np.linalg.eigvalsh(bend) <= 0.0):  # SIGMA_A at the end of its search
-        return middle[:-1]
-    gain = 0.5 * np.einsum("it,ij,jt->t", slope, np.linalg.inv(bend), slope)
-    return np.asarray(middle[:-1] - gain)
+    centre = profile_at(0, 0)
+    forward, backward = (np.array([profile_at(sign, 0), profile_at(0, sign)]) for sign in (1, -1))
+    slope = (forward - backward)[:, :-1] / (2.0 * LOG_SIGMA_STEP)
+    hessian = np.diag((forward + backward)[:, -1] - 2.0 * centre[-1])
+    mixed = profile_at(1, 1)[-1] + profile_at(-1, -1)[-1] - 2.0 * centre[-1]
+    hessian[0, 1] = hessian[1, 0] = 0.5 * (mixed - hessian[0, 0] - hessian[1, 1])
+    hessian /= LOG_SIGMA_STEP**2
+    if np.any(np.linalg.eigvalsh(hessian) <= 0.0):  # SIGMA_A at the end of its search
+        return centre[:-1]
+    gain = 0.5 * np.einsum("it,ij,jt->t", slope, np.linalg.inv(hessian), slope)
+    return np.asarray(centre[:-1] - gain)
 
 
-def _scatter(moved: PreparedMotion, offset: float, noises: Noises, information: float) -> float:
+def _variance_inflation(
+    prepared_motion: PreparedMotion, offset: float, noises: Noises, information: float
+) -> float:
     """Variance of the estimate over that by the curvature alone, from simulated noise.
 
     The score of τ is eᵀM(v + n): e the residuals, v the velocity, n the noise of the velocity that
     the IMU measures, M the inverse covariance with the constants taken out. Its part eᵀMn is
     random even where nothing moves, and e holds the same noise.
     """
-    here = moved.at(offset)
-    joined, count, axes = here.joined, len(moved.time_s), len(moved.directions)
-    legs, rng = int(np.count_nonzero(joined)), np.random.default_rng(count)
+    positions = prepared_motion.at(offset)
+    joined, count, axes = (
+        positions.joined,
+        len(prepared_motion.time_s),
+        len(prepared_motion.directions),
+    )
+    interval_count, rng = int(np.count_nonzero(joined)), np.random.default_rng(count)
 
-    def normal(size: int) -> Array:
-        return rng.standard_normal((size, axes, REPLICATES)).transpose(1, 2, 0)
+    def draw_normal(size: int) -> Array:
+        return rng.standard_normal((size, axes, SIMULATION_COUNT)).transpose(1, 2, 0)
 
-    q00, q01, q11 = noises.sigma_a_m_s2**2 * here.noise_unit[:, joined]
-    dp, dv = np.zeros((2, axes, REPLICATES, count - 1))
-    dp[..., joined] = np.sqrt(q00) * normal(legs)
-    dv[..., joined] = np.sqrt(q11 - q01**2 / q00) * normal(legs)
+    q00, q01, q11 = noises.sigma_a_m_s2**2 * positions.noise_unit[:, joined]
+    dp, dv = np.zeros((2, axes, SIMULATION_COUNT, count - 1))
+    dp[..., joined] = np.sqrt(q00) * draw_normal(interval_count)
+    dv[..., joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
     dv[..., joined] += q01 / q00 * dp[..., joined]
-    error = noises.sigma_z_m * normal(count)
+    error = noises.sigma_z_m * draw_normal(count)
     # of the velocity, from the start of each stretch
     speed = np.zeros_like(error)
-    for begin, end in here.stretches:
+    for begin, end in positions.stretches:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=speed[..., begin + 1 : end])
     if noises.walk_m:  # the source's own walk is in the residuals, but nothing the IMU measured
-        dp[..., joined] += noises.walk_m * np.sqrt(here.length_s[joined]) * normal(legs)
-    here, variance = here.over(1.0, noises.walk_m, moved.weight / noises.sigma_z_m**2)
-    products = paired_products(here, noises.sigma_a_m_s2, variance, (error, dp, dv), speed)
+        dp[..., joined] += (
+            noises.walk_m * np.sqrt(positions.length_s[joined]) * draw_normal(interval_count)
+        )
+    positions, variance = positions.over(
+        1.0, noises.walk_m, prepared_motion.weight / noises.sigma_z_m**2
+    )
+    products = products_by_stretch(positions, noises.sigma_a_m_s2, variance, (error, dp, dv), speed)
     return 1.0 + float(np.var(products.sum(axis=0))) / information
 
 
-def _vertex(grid: Array, profile: Array) -> tuple[float, float]:
+def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
     """Minimum of a profile by a parabola, and the standard deviation that its bend gives."""
-    at = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
+    index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
-    shift, bend = parabola_vertex(profile, at)
-    if bend <= 0.0:
+    shift, curvature = parabola_vertex(profile, index)
+    if curvature <= 0.0:
         return float(grid[int(np.argmin(profile))]), float(grid[-1] - grid[0])
-    return float(grid[at] + np.clip(shift, -1.0, 1.0) * step), float(step / np.sqrt(bend))
+    return float(grid[index] + np.clip(shift, -1.0, 1.0) * step), float(step / np.sqrt(curvature))
 
 
-def _parts(
-    moved: PreparedMotion, offset: float, noises: Noises, factor: float
+def _offset_per_part(
+    prepared_motion: PreparedMotion, offset: float, noises: Noises, factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
     """Offset of each stretch by itself, and the p-value of no change, by the likelihood ratio."""
-    coarse = offset + np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
-    coarse = coarse[np.abs(coarse) <= SEARCH_S]
-    tried = fitted(moved.blocks(coarse), noises, moved.weight).by_stretch()[0]
+    coarse = offset + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_POINTS)
+    coarse = coarse[np.abs(coarse) <= MAX_OFFSET_S]
+    coarse_profiles = fit_noises(
+        prepared_motion.blocks(coarse), noises, prepared_motion.weight
+    ).by_stretch()[0]
     grid = np.linspace(coarse[0], coarse[-1], CURVE_POINTS)
-    profiles = CubicSpline(coarse, tried, axis=1)(grid)
-    found, used = [], []
-    for begin, end, profile in zip(moved.edges, moved.edges[1:], profiles, strict=False):
-        middle, sigma = _vertex(grid, profile)
+    profiles = CubicSpline(coarse, coarse_profiles, axis=1)(grid)
+    part_offsets, drops = [], []
+    for begin, end, profile in zip(
+        prepared_motion.edges, prepared_motion.edges[1:], profiles, strict=False
+    ):
+        middle, sigma = _minimum_and_sigma(grid, profile)
         sigma *= float(np.sqrt(factor))
         if sigma < MAX_PART_SIGMA_S:
-            first, last = moved.time_s[[begin, end - 1]].tolist()
-            found.append(PartOffset(first, last, middle, sigma))
-            used.append(profile - profile.min())
-    if len(found) < 2:
-        return tuple(found), None
-    ratio = 2.0 * float(np.sum(used, axis=0).min()) / factor
-    return tuple(found), float(chdtrc(len(found) - 1, ratio))
+            first, last = prepared_motion.time_s[[begin, end - 1]].tolist()
+            part_offsets.append(PartOffset(first, last, middle, sigma))
+            drops.append(profile - profile.min())
+    if len(part_offsets) < 2:
+        return tuple(part_offsets), None
+    ratio = 2.0 * float(np.sum(drops, axis=0).min()) / factor
+    return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, ratio))
 
 
-def _drift(parts: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
+def _clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
     """Drift of the source's clock (ppm) with its standard deviation."""
-    if len(parts) < 3:
+    if len(part_offsets) < 3:
         return None, None
-    rows = [((part.start_s + part.end_s) / 2.0, part.offset_s, part.sigma_s) for part in parts]
+    rows = [
+        ((part_offset.start_s + part_offset.end_s) / 2.0, part_offset.offset_s, part_offset.sigma_s)
+        for part_offset in part_offsets
+    ]
     time, offset, sigma = np.transpose(rows)
     line, covariance = np.polyfit(time - time.mean(), offset, 1, w=1.0 / sigma, cov="unscaled")
     return float(line[0]) * 1e6, float(np.sqrt(covariance[0, 0])) * 1e6

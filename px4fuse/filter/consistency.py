@@ -18,7 +18,7 @@ from px4fuse.record import (
     Record,
     Share,
     Unavailable,
-    lacking,
+    missing_data,
 )
 
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
@@ -28,7 +28,7 @@ MIN_INNOVATIONS = 10
 CONFIDENCE = 0.95
 LJUNG_BOX_LAGS = 10
 # √S that is off by fewer times is no finding: R is a rule of thumb, and tracks hardly change
-SIGMA_OFF = 1.25
+SIGMA_FACTOR_FINDING = 1.25
 GATE_SIGMA = 5.0  # EKF2_EVP_GATE's default, used where no gate is in force
 
 
@@ -55,7 +55,7 @@ class NisVerdict(Record, frozen=True, kw_only=True):
     verdict: Verdict
 
     @property
-    def times_off(self) -> float:
+    def sigma_error_factor(self) -> float:
         """By how many times √S is too large or too small, 1 or more."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
@@ -115,7 +115,7 @@ def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
     return low, high
 
 
-def verdict_of(nis_mean: float, band: tuple[float, float]) -> Verdict:
+def classify_mean_nis(nis_mean: float, band: tuple[float, float]) -> Verdict:
     """Two-sided verdict on a mean NIS."""
     if nis_mean < band[0]:
         return "variance overstated"
@@ -132,7 +132,7 @@ def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
         "nis_mean": mean,
         "nis_band": band,
         "sigma_factor": float(np.sqrt(1.0 / mean)),
-        "verdict": verdict_of(mean, band),
+        "verdict": classify_mean_nis(mean, band),
     }
 
 
@@ -163,13 +163,13 @@ def assess(
     -------
     Consistency, or Unavailable with fewer than ten finite innovations.
     """
-    finite = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
-    nu, s = innovation_m[finite], innovation_variance_m2[finite]
+    is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
+    nu, s = innovation_m[is_usable], innovation_variance_m2[is_usable]
     count = len(nu)
     if count < MIN_INNOVATIONS:
-        return lacking("innovations_few", count=count, least=MIN_INNOVATIONS)
+        return missing_data("innovations_few", count=count, least=MIN_INNOVATIONS)
     if np.ptp(nu) == 0.0:
-        return lacking("innovations_alike")
+        return missing_data("innovations_alike")
     normalised = nu / np.sqrt(s)
     std = float(np.std(nu, ddof=1))
     bias_t = float(np.sqrt(count) * np.mean(nu) / std)
@@ -204,8 +204,8 @@ def assess_horizontal(
     -------
     HorizontalNis, or None below ten innovations.
     """
-    usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
-    nis = np.sum([nu[usable] ** 2 / s[usable] for nu, s in (north, east)], axis=0)
+    is_usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
+    nis = np.sum([nu[is_usable] ** 2 / s[is_usable] for nu, s in (north, east)], axis=0)
     if len(nis) < MIN_INNOVATIONS or not nis.any():
         return None
     return HorizontalNis(**_verdict_fields(nis, 2))

@@ -17,7 +17,13 @@ from scipy.special import chdtri, comb, expit
 
 from px4fuse.arrays import Array
 from px4fuse.filter.likelihood import Preintegrated
-from px4fuse.filter.marginal import Fitted, Positions, centred, fit, squares
+from px4fuse.filter.marginal import (
+    FittedPositions,
+    Positions,
+    centre_on_path,
+    expected_squares,
+    fit_positions,
+)
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
 SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
@@ -27,21 +33,21 @@ WALK_SEARCH_M = (1e-4, 1.0)
 SLOW_SEARCH_M, SLOW_SEARCH_S = (1e-3, 10.0), (0.05, 60.0)
 MAX_PASSES = 12
 # Of the maximisation, in the end and while the outliers still change
-MAX_STEPS, ROUGH_STEPS = 50, 3
+MAX_STEPS, ROUGH_MAX_STEPS = 50, 3
 # Outliers are at least this many times as wide as the rest: less is not told from it
-LEAST_WIDTH = 3.0
+MIN_WIDTH = 3.0
 FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.005, 10.0, 0.4
 # SIGMA_Z is at most this many times what the median of the squares says
-BULK = 1.2
-SETTLED = 0.01
+MAX_SIGMA_RATIO = 1.2
+MAX_PROBABILITY_CHANGE = 0.01
 # -ln p of each measurement where it cannot be computed; any that can be is far below
-FAR = 1e6
+UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for slopes
 SLOPE_STEP = 1e-4
 # Nodes about each place, and their distance in ln σ; while the outliers still change, few
 NODES, ROUGH_NODES = (10, 0.25), (6, 0.2)
 # Precision of a start that is known (1/m² and s²/m²): to a micrometre
-KNOWN = 1e12
+KNOWN_START_PRECISION = 1e12
 
 
 @dataclass(frozen=True)
@@ -67,9 +73,12 @@ class Noises:
 
 
 SEARCHES = {
-    "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2, "sigma_z_m": SIGMA_Z_SEARCH_M, "walk_m": WALK_SEARCH_M,
-    "slow_m": SLOW_SEARCH_M, "tau_s": SLOW_SEARCH_S,
-}  # fmt: skip
+    "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2,
+    "sigma_z_m": SIGMA_Z_SEARCH_M,
+    "walk_m": WALK_SEARCH_M,
+    "slow_m": SLOW_SEARCH_M,
+    "tau_s": SLOW_SEARCH_S,
+}
 
 
 class Likelihood:
@@ -82,7 +91,7 @@ class Likelihood:
 
     Parameters
     ----------
-    parts : sequence of Positions
+    axis_positions : sequence of Positions
         With one choice of the legs.
     weight : ndarray, shape (m,)
     sigma_z_m : float
@@ -92,65 +101,72 @@ class Likelihood:
     """
 
     def __init__(
-        self, parts: Sequence[Positions], weight: Array, sigma_z_m: float, rough: bool = False
+        self,
+        axis_positions: Sequence[Positions],
+        weight: Array,
+        sigma_z_m: float,
+        rough: bool = False,
     ) -> None:
-        self.parts, self.weight, self.sigma_z_m = parts, weight, sigma_z_m
-        self.tabulated = not any(part.noise_fixed.any() for part in parts)
+        self.axis_positions, self.weight, self.sigma_z_m = axis_positions, weight, sigma_z_m
+        self.tabulated = not any(positions.noise_fixed.any() for positions in axis_positions)
         self.nodes, self.step = nodes, step = ROUGH_NODES if rough else NODES
 
         @cache
-        def fits(of_ratio: int) -> list[Fitted]:
-            ratio = float(np.exp(step * of_ratio))
-            return [of_ratios([part], [ratio], 0.0, weight, sigma_z_m)[0] for part in parts]
+        def fits(ratio_index: int) -> list[FittedPositions]:
+            ratio = float(np.exp(step * ratio_index))
+            return [
+                fit_ratios([positions], [ratio], 0.0, weight, sigma_z_m)[0]
+                for positions in axis_positions
+            ]
 
         @cache
-        def row(of_ratio: int, of_z: int) -> Array:
-            scales = np.exp(step * (of_z + np.arange(nodes)))
-            totals = [each.totals(scales)[:, 0] for each in fits(of_ratio)]
+        def row(ratio_index: int, z_index: int) -> Array:
+            scales = np.exp(step * (z_index + np.arange(nodes)))
+            totals = [fitted_part.totals(scales)[:, 0] for fitted_part in fits(ratio_index)]
             return np.asarray(np.sum(totals, axis=0))
 
         @cache
-        def values(of_ratio: int, of_z: int) -> Array:
+        def values(ratio_index: int, z_index: int) -> Array:
             """At the nodes about one place, from the first ones on."""
-            return np.array([row(of_ratio + at, of_z) for at in range(nodes)])
+            return np.array([row(ratio_index + node, z_index) for node in range(nodes)])
 
         self._values = values
 
     def __call__(self, noises: Noises) -> float:
         """-ln p with some noises."""
         if noises.walk_m or noises.slow_m or not self.tabulated:
-            return negative_log_likelihood(self.parts, noises, self.weight)
+            return negative_log_likelihood(self.axis_positions, noises, self.weight)
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
-        before = (self.nodes - 1) // 2
-        first, first_z = floor(ln_ratio) - before, floor(ln_z) - before
-        across = _between(ln_ratio - first, self.nodes)
-        along = _between(ln_z - first_z, self.nodes)
-        return float(across @ self._values(first, first_z) @ along)
+        node_offset = (self.nodes - 1) // 2
+        first, first_z = floor(ln_ratio) - node_offset, floor(ln_z) - node_offset
+        ratio_weights = _interpolation_weights(ln_ratio - first, self.nodes)
+        z_weights = _interpolation_weights(ln_z - first_z, self.nodes)
+        return float(ratio_weights @ self._values(first, first_z) @ z_weights)
 
 
 @cache
-def _signs(count: int) -> Array:
+def _barycentric_signs(count: int) -> Array:
     nodes = np.arange(count)
     return np.asarray((-1.0) ** nodes * comb(count - 1, nodes))
 
 
-def _between(at: float, count: int) -> Array:
+def _interpolation_weights(position: float, count: int) -> Array:
     """Weights of values at 0, 1, ... for the polynomial through them (Berrut, Trefethen 2004)."""
-    away = at - np.arange(count)
-    if not away.all():
-        return np.asarray(away == 0.0, dtype=np.float64)
-    weights = _signs(count) / away
+    distances = position - np.arange(count)
+    if not distances.all():
+        return np.asarray(distances == 0.0, dtype=np.float64)
+    weights = _barycentric_signs(count) / distances
     return np.asarray(weights / weights.sum())
 
 
-def of_ratios(
+def fit_ratios(
     blocks: Iterable[Positions],
     ratios: Sequence[float],
     walk: float,
     weight: Array,
     sigma_z_m: float,
-) -> list[Fitted]:
+) -> list[FittedPositions]:
     """Fit with noises over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
 
     Parameters
@@ -164,26 +180,35 @@ def of_ratios(
     weight : ndarray, shape (m,)
     sigma_z_m : float
     """
-    scaled = (positions.over(sigma_z_m, walk, weight) for positions in blocks)
-    fits = [[fit(few, ratio, variance) for ratio in ratios] for few, variance in scaled]
+    scaled_blocks = (positions.over(sigma_z_m, walk, weight) for positions in blocks)
+    fits_by_block = [
+        [fit_positions(scaled_block, ratio, variance_m2) for ratio in ratios]
+        for scaled_block, variance_m2 in scaled_blocks
+    ]
     return [
-        replace(of_one[0], gram=np.concatenate([each.gram for each in of_one], axis=1))
-        for of_one in zip(*fits, strict=True)
+        replace(
+            block_fits[0], gram=np.concatenate([block_fit.gram for block_fit in block_fits], axis=1)
+        )
+        for block_fits in zip(*fits_by_block, strict=True)
     ]
 
 
-def fitted(blocks: Iterable[Positions], noises: Noises, weight: Array) -> Fitted:
+def fit_noises(blocks: Iterable[Positions], noises: Noises, weight: Array) -> FittedPositions:
     """Fit with some noises and weights."""
     sigma = noises.sigma_z_m
     ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
     if noises.slow_m:
-        blocks = (replace(each, slow=(noises.slow_m, noises.tau_s)) for each in blocks)
-    return of_ratios(blocks, [ratio], walk, weight, sigma)[0].scaled(sigma)
+        blocks = (replace(positions, slow=(noises.slow_m, noises.tau_s)) for positions in blocks)
+    return fit_ratios(blocks, [ratio], walk, weight, sigma)[0].scaled(sigma)
 
 
-def negative_log_likelihood(parts: Sequence[Positions], noises: Noises, weight: Array) -> float:
+def negative_log_likelihood(
+    axis_positions: Sequence[Positions], noises: Noises, weight: Array
+) -> float:
     """-ln p of the measurements of all parts but for a constant."""
-    return float(sum(fitted([part], noises, weight).totals()[0, 0] for part in parts))
+    return float(
+        sum(fit_noises([positions], noises, weight).totals()[0, 0] for positions in axis_positions)
+    )
 
 
 @dataclass(frozen=True)
@@ -195,7 +220,7 @@ class NoiseFit:
     noises : Noises
     weight : ndarray, shape (m,)
         What each measurement counts: 1 for a good one, 1/width² for an outlier.
-    outlier : ndarray, shape (m,)
+    outlier_probability : ndarray, shape (m,)
         Probability that it is one.
     score : Likelihood
         With these weights.
@@ -206,28 +231,30 @@ class NoiseFit:
 
     noises: Noises
     weight: Array
-    outlier: Array
+    outlier_probability: Array
     score: Likelihood
     widening: float
 
 
-def filter_part(legs: Preintegrated) -> Positions:
+def filter_positions(intervals: Preintegrated) -> Positions:
     """The lesson's filter of one axis: its constants are the errors of its start, with P₀."""
-    count = len(legs.measurement_m)
+    count = len(intervals.measurement_m)
     initial = np.zeros((count + 1, 2))
-    initial[0] = KNOWN
-    measured = np.concatenate([[np.nan], legs.measurement_m - legs.initial.position_m])[:, None]
+    initial[0] = KNOWN_START_PRECISION
+    measured = np.concatenate([[np.nan], intervals.measurement_m - intervals.initial.position_m])[
+        :, None
+    ]
     dp, dv = np.zeros((2, 1, 1, 3, count))
-    dp[0, 0, 0], dv[0, 0, 0] = legs.delta_position_m, legs.delta_velocity_m_s
+    dp[0, 0, 0], dv[0, 0, 0] = intervals.delta_position_m, intervals.delta_velocity_m_s
     # an error of the start moves the first leg
-    dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, legs.length_s[0]), 1.0
-    return centred(
+    dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, intervals.length_s[0]), 1.0
+    return centre_on_path(
         Positions(
             measurement_m=measured,
             start=np.array([0]),
-            length_s=legs.length_s,
-            noise_unit=legs.noise_unit.T,
-            noise_fixed=legs.noise_fixed.T,
+            length_s=intervals.length_s,
+            noise_unit=intervals.noise_unit.T,
+            noise_fixed=intervals.noise_fixed.T,
             initial=initial,
             constant_sigma=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
             delta_position_m=dp,
@@ -236,14 +263,14 @@ def filter_part(legs: Preintegrated) -> Positions:
     )
 
 
-def most_likely(
-    parts: Sequence[Positions], start: Noises, weight: Array, outliers: bool = True
+def maximise_likelihood(
+    axis_positions: Sequence[Positions], start: Noises, weight: Array, outliers: bool = True
 ) -> NoiseFit:
     """Fit the noises, and find the outliers.
 
     Parameters
     ----------
-    parts : sequence of Positions
+    axis_positions : sequence of Positions
         With the same measurements.
     start : Noises
         To start with. A walk and a slow error are fitted where they are not zero.
@@ -252,55 +279,67 @@ def most_likely(
     outliers : bool
         Whether they are sought; else the weights stay.
     """
-    outlier = np.zeros_like(weight)
+    outlier_probability = np.zeros_like(weight)
     share, width, noises = FIRST_SHARE, FIRST_WIDTH, start
-    for again in range(MAX_PASSES if outliers else 0):
-        likelihood = Likelihood(parts, weight, start.sigma_z_m, rough=True)
-        noises = _maximise(likelihood, noises, ROUGH_STEPS if again else MAX_STEPS)
-        square, count = _squares(parts, noises, weight)
+    for pass_index in range(MAX_PASSES if outliers else 0):
+        likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, rough=True)
+        noises = _maximise(likelihood, noises, ROUGH_MAX_STEPS if pass_index else MAX_STEPS)
+        square, count = _squares(axis_positions, noises, weight)
         # outliers raise the noise that hides them: the median does not follow them
-        bulk = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
-        if bulk > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
+        median_square = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
+        if median_square > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
             break
-        variance = min(noises.sigma_z_m**2, BULK**2 * bulk)
-        found = _outlier_probability(square / variance, count, share, width)
-        if found.sum() < 1.0 and found.max() < 0.5 and not outlier.any():
+        variance = min(noises.sigma_z_m**2, MAX_SIGMA_RATIO**2 * median_square)
+        probability = _outlier_probability(square / variance, count, share, width)
+        if probability.sum() < 1.0 and probability.max() < 0.5 and not outlier_probability.any():
             break
-        share = float(np.clip(found.mean(), 0.5 / len(found), MAX_SHARE))
-        wide = float(np.sum(found * square) / max(np.sum(found * count), 1e-9)) / variance
-        width = max(LEAST_WIDTH, float(np.sqrt(wide)))
-        weight = 1.0 - found * (1.0 - width**-2.0)
-        settled = bool(np.max(np.abs(found - outlier)) < SETTLED)
-        outlier = found
-        if settled:
+        share = float(np.clip(probability.mean(), 0.5 / len(probability), MAX_SHARE))
+        square_width = (
+            float(np.sum(probability * square) / max(np.sum(probability * count), 1e-9)) / variance
+        )
+        width = max(MIN_WIDTH, float(np.sqrt(square_width)))
+        weight = 1.0 - probability * (1.0 - width**-2.0)
+        is_settled = bool(
+            np.max(np.abs(probability - outlier_probability)) < MAX_PROBABILITY_CHANGE
+        )
+        outlier_probability = probability
+        if is_settled:
             break
         noises = replace(noises, sigma_z_m=float(np.sqrt(variance)))
-    likelihood = Likelihood(parts, weight, start.sigma_z_m)
+    likelihood = Likelihood(axis_positions, weight, start.sigma_z_m)
     noises = _maximise(likelihood, noises)
     widening = 1.0
-    if outlier.any():
-        square, count = _squares(parts, noises, weight)
-        widening = widened_by_outliers(square / noises.sigma_z_m**2, count, outlier, width)
-    return NoiseFit(noises, weight, outlier, likelihood, widening)
+    if outlier_probability.any():
+        square, count = _squares(axis_positions, noises, weight)
+        widening = outlier_variance_factor(
+            square / noises.sigma_z_m**2, count, outlier_probability, width
+        )
+    return NoiseFit(noises, weight, outlier_probability, likelihood, widening)
 
 
-def _squares(parts: Sequence[Positions], noises: Noises, weight: Array) -> tuple[Array, Array]:
-    """:func:`squares` of all parts together, at the most likely constants."""
-    found = []
-    for part in parts:
-        constants = fitted([part], noises, weight).constants()[:, 0]
-        own, variance = part.over(1.0, noises.walk_m, weight / noises.sigma_z_m**2)
-        found.append(squares(own, noises.sigma_a_m_s2, variance, constants))
-    square, count = np.sum(found, axis=0)[:, -len(weight) :]
+def _squares(
+    axis_positions: Sequence[Positions], noises: Noises, weight: Array
+) -> tuple[Array, Array]:
+    """:func:`expected_squares` of all parts together, at the most likely constants."""
+    results = []
+    for positions in axis_positions:
+        constants = fit_noises([positions], noises, weight).constants()[:, 0]
+        scaled_positions, variance = positions.over(
+            1.0, noises.walk_m, weight / noises.sigma_z_m**2
+        )
+        results.append(expected_squares(scaled_positions, noises.sigma_a_m_s2, variance, constants))
+    square, count = np.sum(results, axis=0)[:, -len(weight) :]
     return square, count
 
 
 def _outlier_probability(square: Array, count: Array, share: float, width: float) -> Array:
-    odds = np.log(share / (1.0 - share)) - count * np.log(width)
-    return np.asarray(expit(odds + 0.5 * square * (1.0 - width**-2.0)))
+    log_odds = np.log(share / (1.0 - share)) - count * np.log(width)
+    return np.asarray(expit(log_odds + 0.5 * square * (1.0 - width**-2.0)))
 
 
-def widened_by_outliers(square: Array, count: Array, outlier: Array, width: float) -> float:
+def outlier_variance_factor(
+    square: Array, count: Array, outlier_probability: Array, width: float
+) -> float:
     """Variance of ln σ over that with known outliers, at the maximum of the likelihood.
 
     The information of the data is that of the complete data, in which each measurement is known to
@@ -313,24 +352,41 @@ def widened_by_outliers(square: Array, count: Array, outlier: Array, width: floa
         Of each measurement's error over σ², summed over its axes.
     count : ndarray, shape (m,)
         Axes.
-    outlier : ndarray, shape (m,)
+    outlier_probability : ndarray, shape (m,)
         Probability that it is one.
     width : float
         Outliers' σ over σ.
     """
-    share = float(np.mean(outlier))
-    total, wide = 2.0 * float(np.sum(count)), 2.0 * float(np.sum(count * outlier))
-    told, narrow = len(square) * share * (1.0 - share), width**-2.0
-    complete = np.array([[total, wide, 0.0], [wide, wide, 0.0], [0.0, 0.0, told]])
-    steps = np.stack([square * (narrow - 1.0), square * narrow - count, np.ones_like(square)])
-    missing = (steps * (outlier * (1.0 - outlier))) @ steps.T
-    observed = complete - missing
-    if np.linalg.eigvalsh(observed)[0] <= 0.0:  # hardly any outlier: what they are adds nothing
+    share = float(np.mean(outlier_probability))
+    sigma_information, outlier_information = (
+        2.0 * float(np.sum(count)),
+        2.0 * float(np.sum(count * outlier_probability)),
+    )
+    share_information, inverse_square_width = len(square) * share * (1.0 - share), width**-2.0
+    complete_information = np.array(
+        [
+            [sigma_information, outlier_information, 0.0],
+            [outlier_information, outlier_information, 0.0],
+            [0.0, 0.0, share_information],
+        ]
+    )
+    scores = np.stack(
+        [
+            square * (inverse_square_width - 1.0),
+            square * inverse_square_width - count,
+            np.ones_like(square),
+        ]
+    )
+    missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
+    observed_information = complete_information - missing_information
+    if (
+        np.linalg.eigvalsh(observed_information)[0] <= 0.0
+    ):  # hardly any outlier: what they are adds nothing
         return 1.0
-    return max(1.0, total * float(np.linalg.inv(observed)[0, 0]))
+    return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))
 
 
-def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> Noises:
+def _maximise(likelihood: Likelihood, start: Noises, max_steps: int = MAX_STEPS) -> Noises:
     values = {name: value for name, value in vars(start).items() if value}
     bounds = np.log([SEARCHES[name] for name in values])
     count = len(likelihood.weight)
@@ -338,18 +394,18 @@ def _maximise(likelihood: Likelihood, start: Noises, steps: int = MAX_STEPS) -> 
     def score(logs: Array) -> float:
         # of each measurement: the first step is as long as the slope, at most 1
         try:
-            return likelihood(made(logs)) / count
+            return likelihood(to_noises(logs)) / count
         except np.linalg.LinAlgError:  # so far from the data that rounding is all: the step is cut
-            return FAR
+            return UNCOMPUTABLE_SCORE
 
-    def made(logs: Array) -> Noises:
+    def to_noises(logs: Array) -> Noises:
         return Noises(**dict(zip(values, np.exp(logs).tolist(), strict=True)))
 
-    found = minimize(
+    result = minimize(
         score,
         np.clip(np.log([*values.values()]), *bounds.T),
         method="L-BFGS-B",
         bounds=bounds.tolist(),
-        options={"eps": SLOPE_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": steps},
+        options={"eps": SLOPE_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": max_steps},
     )
-    return made(found.x)
+    return to_noises(result.x)

@@ -19,34 +19,34 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, cumulative_integral
-from px4fuse.display import brief
-from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, noise_of_many_steps
+from px4fuse.display import one_line_repr
+from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, continuous_noise_unit
 from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
-from px4fuse.record import NotNegative, Record, Share, lacking
+from px4fuse.record import NotNegative, Record, Share, missing_data
 
-PART_S = 2.0
+PART_LENGTH_S = 2.0
 MIN_PARTS = 3
 MIN_MEASUREMENTS = 50
 MIN_PART_SAMPLES = 3
 # More say nothing new about a heading, but cost time
 MAX_MEASUREMENTS = 1000
 # Parts further apart than chance would put them
-DRIFT_P = 0.002
+MAX_DRIFT_P = 0.002
 MIN_DRIFT_DEG = 5.5
 # Turning faster, a late stamp looks like a wrong heading: 0.2 s of it are 2°
 MAX_TURN_RATE_DEG_S = 10.0
 # What two headings differ by that agree: mounting, vibration, rounding
-LEAST_SIGMA_DEG = 0.5
+MIN_SIGMA_DEG = 0.5
 MAX_ATTITUDE_INTERVAL_S = 0.11
 LINEARISATIONS = 3
 # About a turn so near the last run is as good as about the right one
 SMALL_TURN_RAD = 0.01
 STATE_COUNT = 7
 TURN = 6
-CROSSED = np.array([[1.0, -1.0], [-1.0, 1.0]])
+ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])
 # Of the start: position (m), velocity (m/s), acceleration's error (m/s²) and turn (rad)
 INITIAL_SIGMAS = np.repeat([INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, 0.3, 0.6], [2, 2, 2, 1])
 GAP_SIGMA = 5.0  # m and m/s, over a gap of the IMU
@@ -54,7 +54,7 @@ GAP_SIGMA = 5.0  # m and m/s, over a gap of the IMU
 # SIGMA_A (m/s²)
 TURN_WALKS = np.radians([0.0, 0.3, 1.0, 3.0])
 BIAS_WALKS = np.array([0.003, 0.03])
-SIGMA_AS = np.array([0.03, 0.1, 0.3, 1.0])
+SIGMA_A_GRID = np.array([0.03, 0.1, 0.3, 1.0])
 
 
 class HeadingPart(Record, frozen=True):
@@ -93,32 +93,32 @@ class HeadingError(Record, frozen=True):
     drift_p: Share
     by: Literal["orientation", "positions"]
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
     def ends(self) -> tuple[HeadingPart, HeadingPart]:
         """The parts of the least and of the greatest turn, the earlier one first."""
-        turns = [part.heading_error_deg for part in self.parts]
-        first, last = sorted((int(np.argmin(turns)), int(np.argmax(turns))))
-        return self.parts[first], self.parts[last]
+        turns_deg = [heading_part.heading_error_deg for heading_part in self.parts]
+        first_index, last_index = sorted((int(np.argmin(turns_deg)), int(np.argmax(turns_deg))))
+        return self.parts[first_index], self.parts[last_index]
 
 
-def turned(
+def combine_heading_parts(
     parts: tuple[HeadingPart, ...], drift_p: float, by: Literal["orientation", "positions"]
 ) -> HeadingError:
     """What the parts of a flight say together."""
-    turns = [part.heading_error_deg for part in parts]
+    turns_deg = [heading_part.heading_error_deg for heading_part in parts]
     return HeadingError(
-        turn_deg=float(np.mean(turns)),
-        sigma_deg=float(np.mean([part.sigma_deg for part in parts])),
-        drifts=drift_p < DRIFT_P and max(turns) - min(turns) >= MIN_DRIFT_DEG,
+        turn_deg=float(np.mean(turns_deg)),
+        sigma_deg=float(np.mean([heading_part.sigma_deg for heading_part in parts])),
+        drifts=drift_p < MAX_DRIFT_P and max(turns_deg) - min(turns_deg) >= MIN_DRIFT_DEG,
         parts=parts,
         drift_p=drift_p,
         by=by,
     )
 
 
-def heading_error(
+def estimate_heading_error(
     flight: Flight,
     track: PositionTrack,
     segment: Segment,
@@ -148,39 +148,52 @@ def heading_error(
         return flight.attitude
     if np.median(np.diff(flight.attitude.index.to_numpy())) > MAX_ATTITUDE_INTERVAL_S:
         return Unavailable("heading error", "the attitude is too slow", "Log it at 10 Hz or more.")
-    compared = None
+    by_orientation = None
     if track.orientation is not None:
-        compared = _by_orientation(flight.attitude, track.orientation, segment, offset_s)
-        if compared is not None and compared.drifts:
-            return compared
+        by_orientation = _compare_orientations(
+            flight.attitude, track.orientation, segment, offset_s
+        )
+        if by_orientation is not None and by_orientation.drifts:
+            return by_orientation
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         return acceleration
     samples = within(track.samples, segment)[Columns.POSITION[:2]].dropna()
     samples = samples.set_axis(samples.index.to_numpy() + offset_s)
-    low, high = acceleration.index[[0, -1]]
-    samples = samples[(samples.index >= low) & (samples.index <= high)]
-    slow = np.median(np.diff(acceleration.index.to_numpy())) > MAX_IMU_INTERVAL_S
+    first_s, last_s = acceleration.index[[0, -1]]
+    samples = samples[(samples.index >= first_s) & (samples.index <= last_s)]
+    is_slow = np.median(np.diff(acceleration.index.to_numpy())) > MAX_IMU_INTERVAL_S
     count = len(samples)
-    if slow or count < MIN_MEASUREMENTS:
-        return lacking("heading_slow_imu") if slow else lacking("heading_few", count=count)
+    if is_slow or count < MIN_MEASUREMENTS:
+        return (
+            missing_data("heading_slow_imu")
+            if is_slow
+            else missing_data("heading_few", count=count)
+        )
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
-    found = _by_positions(acceleration, samples, settings.dt_s, sigma_z_m)
+    result = _estimate_from_positions(acceleration, samples, settings.dt_s, sigma_z_m)
     # how the source's own axes lie in the vehicle is not known, but that they do not turn is
-    return found if compared is None else structs.replace(found, drift_p=1.0, drifts=False)
+    return result if by_orientation is None else structs.replace(result, drift_p=1.0, drifts=False)
 
 
-def _parts(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
+def _mean_per_part(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
     """Means over parts of equal length, in degrees."""
     # of a long flight only some measurements were taken
-    count = max(int(min((time[-1] - time[0]) / PART_S, len(time) / (2 * MIN_PART_SAMPLES))), 1)
+    count = max(
+        int(min((time[-1] - time[0]) / PART_LENGTH_S, len(time) / (2 * MIN_PART_SAMPLES))), 1
+    )
     edges = np.searchsorted(time, np.linspace(time[0], time[-1], count + 1)[1:-1])
-    kept = [at for at in np.split(np.arange(len(time)), edges) if len(at) >= MIN_PART_SAMPLES]
-    ends = [time[at[[0, -1]]].tolist() for at in kept]
-    means = [
-        np.degrees([turn[at].mean(), np.sqrt(np.mean(sigma[at] ** 2))]).tolist() for at in kept
+    part_rows = [
+        rows for rows in np.split(np.arange(len(time)), edges) if len(rows) >= MIN_PART_SAMPLES
     ]
-    return tuple(HeadingPart(*end, *mean) for end, mean in zip(ends, means, strict=True))
+    part_ends = [time[rows[[0, -1]]].tolist() for rows in part_rows]
+    part_means = [
+        np.degrees([turn[rows].mean(), np.sqrt(np.mean(sigma[rows] ** 2))]).tolist()
+        for rows in part_rows
+    ]
+    return tuple(
+        HeadingPart(*span, *mean) for span, mean in zip(part_ends, part_means, strict=True)
+    )
 
 
 def heading_rad(quaternions: pd.DataFrame) -> Array:
@@ -190,111 +203,117 @@ def heading_rad(quaternions: pd.DataFrame) -> Array:
     return np.unwrap(angles)
 
 
-def _by_orientation(
+def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
     """The source's heading minus the attitude's, while the vehicle hardly turns."""
-    inside = within(orientation, segment)
-    time = inside.index.to_numpy() + offset_s
-    known = attitude.index.to_numpy()
-    covered = (time >= known[0]) & (time <= known[-1])
-    if np.count_nonzero(covered) < MIN_PARTS * MIN_PART_SAMPLES:
+    samples = within(orientation, segment)
+    time = samples.index.to_numpy() + offset_s
+    attitude_s = attitude.index.to_numpy()
+    is_covered = (time >= attitude_s[0]) & (time <= attitude_s[-1])
+    if np.count_nonzero(is_covered) < MIN_PARTS * MIN_PART_SAMPLES:
         return None
-    own, time = heading_rad(inside)[covered], time[covered]
-    yaw = np.interp(time, known, heading_rad(attitude))
-    turn = own - yaw
+    source_heading, time = heading_rad(samples)[is_covered], time[is_covered]
+    yaw = np.interp(time, attitude_s, heading_rad(attitude))
+    turn = source_heading - yaw
     turn -= 2.0 * np.pi * np.round(np.median(turn) / (2.0 * np.pi))
-    calm = np.abs(np.gradient(yaw, time)) < np.radians(MAX_TURN_RATE_DEG_S)
-    if np.count_nonzero(calm) < MIN_PARTS * MIN_PART_SAMPLES:
+    is_calm = np.abs(np.gradient(yaw, time)) < np.radians(MAX_TURN_RATE_DEG_S)
+    if np.count_nonzero(is_calm) < MIN_PARTS * MIN_PART_SAMPLES:
         return None
-    time, turn = time[calm], turn[calm]
+    time, turn = time[is_calm], turn[is_calm]
     # what two neighbours differ by is noise; it does not shrink with their number
     noise = 1.4826 * np.median(np.abs(np.diff(turn))) / np.sqrt(2.0)
-    sigma = np.full(len(time), max(float(noise), np.radians(LEAST_SIGMA_DEG)))
-    parts = _parts(time, turn, sigma)
-    if len(parts) < MIN_PARTS:
+    sigma = np.full(len(time), max(float(noise), np.radians(MIN_SIGMA_DEG)))
+    heading_parts = _mean_per_part(time, turn, sigma)
+    if len(heading_parts) < MIN_PARTS:
         return None
-    found = np.array([part.heading_error_deg for part in parts])
-    square = np.sum((found - found.mean()) ** 2) / np.degrees(sigma[0]) ** 2
-    return turned(parts, float(chdtrc(len(parts) - 1, square)), "orientation")
+    turns_deg = np.array([heading_part.heading_error_deg for heading_part in heading_parts])
+    chi_square = np.sum((turns_deg - turns_deg.mean()) ** 2) / np.degrees(sigma[0]) ** 2
+    return combine_heading_parts(
+        heading_parts, float(chdtrc(len(heading_parts) - 1, chi_square)), "orientation"
+    )
 
 
-def _by_positions(
+def _estimate_from_positions(
     acceleration: pd.DataFrame, samples: pd.DataFrame, dt_s: float, sigma_z: float
 ) -> HeadingError:
     """The turn as a state that may walk, by the most likely of some walks and noises."""
-    time, measured = samples.index.to_numpy(), samples.to_numpy()
-    legs = _legs(acceleration, time)
+    time, measured_m = samples.index.to_numpy(), samples.to_numpy()
+    interval_inputs = _interval_inputs(acceleration, time)
     # of an acceleration that SIGMA_A is over one DT, the walk over a second
-    grid = np.array(list(product(TURN_WALKS, BIAS_WALKS, SIGMA_AS * np.sqrt(dt_s))))
-    still = grid[:, 0] == 0.0
+    grid = np.array(list(product(TURN_WALKS, BIAS_WALKS, SIGMA_A_GRID * np.sqrt(dt_s))))
+    has_no_walk = grid[:, 0] == 0.0
     turn = 0.0
     for _ in range(LINEARISATIONS):
-        log_p, _, steps = _filter(legs, measured, turn, grid[still], sigma_z)
+        log_p, _, steps = _run_filters(
+            interval_inputs, measured_m, turn, grid[has_no_walk], sigma_z
+        )
         step = float(steps[-1].x[np.argmax(log_p), TURN])
         turn += step
         if abs(step) < SMALL_TURN_RAD:
             break
     turn = float(np.angle(np.exp(1j * turn)))
-    log_p, scale, steps = _filter(legs, measured, turn, grid, sigma_z)
-    best = int(np.argmax(log_p))
-    ratio = 2.0 * (log_p[best] - log_p[still].max())
-    smoothed, variance = _smooth(steps, best)
+    log_p, scale, steps = _run_filters(interval_inputs, measured_m, turn, grid, sigma_z)
+    best_index = int(np.argmax(log_p))
+    ratio = 2.0 * (log_p[best_index] - log_p[has_no_walk].max())
+    smoothed, variance = _smooth_turn(steps, best_index)
     # at the end of its range a walk is half of the time none
-    p = 0.5 * float(chdtrc(1, ratio)) if ratio > 0.0 else 1.0
-    sigma = np.sqrt(scale[best] * np.maximum(variance, 0.0))
-    return turned(_parts(time, turn + smoothed, sigma), p, "positions")
+    p_value = 0.5 * float(chdtrc(1, ratio)) if ratio > 0.0 else 1.0
+    sigma = np.sqrt(scale[best_index] * np.maximum(variance, 0.0))
+    return combine_heading_parts(_mean_per_part(time, turn + smoothed, sigma), p_value, "positions")
 
 
-def _legs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Array, Array]:
+def _interval_inputs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Array, Array]:
     """What the acceleration adds between measurements; how long that is; whether the IMU was there.
 
     The first has shape (n, 4): north and east of position (m), then of velocity (m/s).
     """
-    known, value = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
-    speed = cumulative_integral(value, known)
-    both = np.hstack([speed, cumulative_integral(speed, known)])
-    both = np.column_stack([np.interp(time, known, one) for one in both.T])
+    imu_s, acceleration_m_s2 = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
+    velocity = cumulative_integral(acceleration_m_s2, imu_s)
+    integrals = np.hstack([velocity, cumulative_integral(velocity, imu_s)])
+    integrals = np.column_stack([np.interp(time, imu_s, column) for column in integrals.T])
     dt = np.diff(time)
-    gaps = np.concatenate([[0.0], np.cumsum(np.diff(known) > IMU_GAP_S)])
-    passed = np.diff(np.interp(time, known, gaps)) > 0.0
-    change = np.diff(both, axis=0)
-    return np.hstack([change[:, 2:] - both[:-1, :2] * dt[:, None], change[:, :2]]), dt, passed
+    gaps = np.concatenate([[0.0], np.cumsum(np.diff(imu_s) > IMU_GAP_S)])
+    has_gap = np.diff(np.interp(time, imu_s, gaps)) > 0.0
+    change = np.diff(integrals, axis=0)
+    return np.hstack([change[:, 2:] - integrals[:-1, :2] * dt[:, None], change[:, :2]]), dt, has_gap
 
 
-def _transitions(moved: Array, dt_s: Array, turn: float) -> tuple[Array, Array]:
+def _transitions(increments: Array, dt_s: Array, turn: float) -> tuple[Array, Array]:
     """F and the input of every leg, the rotation to first order about ``turn``."""
     count, dt = len(dt_s), dt_s[:, None, None]
     cosine, sine = np.cos(turn), np.sin(turn)
     rotation = np.array([[cosine, -sine], [sine, cosine]])
-    slope = np.array([[-sine, -cosine], [cosine, -sine]])
-    moved = moved.reshape(count, 2, 2)
+    rotation_slope = np.array([[-sine, -cosine], [cosine, -sine]])
+    increments = increments.reshape(count, 2, 2)
     F = np.tile(np.eye(STATE_COUNT), (count, 1, 1))
     F[:, :2, 2:4] = F[:, 2:4, 4:6] = dt * np.eye(2)
     F[:, :2, 4:6] = dt**2 / 2.0 * np.eye(2)
-    F[:, :4, TURN] = (moved @ slope.T).reshape(count, 4)
-    push = np.zeros((count, STATE_COUNT))
-    push[:, :4] = (moved @ rotation.T).reshape(count, 4)
-    return F, push
+    F[:, :4, TURN] = (increments @ rotation_slope.T).reshape(count, 4)
+    inputs = np.zeros((count, STATE_COUNT))
+    inputs[:, :4] = (increments @ rotation.T).reshape(count, 4)
+    return F, inputs
 
 
-def _noise(dt_s: Array, gap: Array, noises: Array) -> Array:
+def _process_noise(dt_s: Array, gap: Array, noises: Array) -> Array:
     """Q of every leg for each of k settings, shape (n, k, 7, 7)."""
     position, velocity, bias = (slice(axis, axis + 2) for axis in (0, 2, 4))
-    pair, count = np.eye(2), len(noises)
-    level = (noises[:, 2] ** 2)[:, None, None] * pair
+    identity, count = np.eye(2), len(noises)
+    sigma_a_block = (noises[:, 2] ** 2)[:, None, None] * identity
     # of each: what is added for one of q00, q01, q11, a second and a gap
-    of_00, of_01, of_11, of_second, of_gap = made = np.zeros((5, count, STATE_COUNT, STATE_COUNT))
-    of_00[:, position, position] = of_11[:, velocity, velocity] = level
-    of_01[:, position, velocity] = of_01[:, velocity, position] = level
-    of_second[:, bias, bias] = (noises[:, 1] ** 2)[:, None, None] * pair
-    of_second[:, TURN, TURN] = noises[:, 0] ** 2
-    of_gap[:, position, position] = of_gap[:, velocity, velocity] = GAP_SIGMA**2 * pair
-    amounts = np.stack([*noise_of_many_steps(dt_s), dt_s, gap], axis=1)
-    return np.asarray((amounts @ made.reshape(5, -1)).reshape(-1, *made.shape[1:]))
+    unit_00, unit_01, unit_11, unit_second, unit_gap = unit_noises = np.zeros(
+        (5, count, STATE_COUNT, STATE_COUNT)
+    )
+    unit_00[:, position, position] = unit_11[:, velocity, velocity] = sigma_a_block
+    unit_01[:, position, velocity] = unit_01[:, velocity, position] = sigma_a_block
+    unit_second[:, bias, bias] = (noises[:, 1] ** 2)[:, None, None] * identity
+    unit_second[:, TURN, TURN] = noises[:, 0] ** 2
+    unit_gap[:, position, position] = unit_gap[:, velocity, velocity] = GAP_SIGMA**2 * identity
+    amounts = np.stack([*continuous_noise_unit(dt_s), dt_s, gap], axis=1)
+    return np.asarray((amounts @ unit_noises.reshape(5, -1)).reshape(-1, *unit_noises.shape[1:]))
 
 
-class _Step(NamedTuple):
+class _FilterStep(NamedTuple):
     """F of one leg, and the states and covariances of k filters before and after their update."""
 
     F: Array
@@ -304,28 +323,34 @@ class _Step(NamedTuple):
     P: Array
 
 
-def _filter(
-    legs: tuple[Array, Array, Array], measured: Array, turn: float, noises: Array, sigma_z: float
-) -> tuple[Array, Array, list[_Step]]:
+def _run_filters(
+    interval_inputs: tuple[Array, Array, Array],
+    measured_m: Array,
+    turn: float,
+    noises: Array,
+    sigma_z: float,
+) -> tuple[Array, Array, list[_FilterStep]]:
     """Ln p of k filters with the best scale of all noises, that of the variances, and all steps.
 
     The first step is the start.
     """
-    moved, length, gap = legs
+    increments, length_s, has_gap = interval_inputs
     count = len(noises)
     x = np.zeros((count, STATE_COUNT))
-    x[:, :2] = measured[0]
+    x[:, :2] = measured_m[0]
     P = np.tile(np.diag(INITIAL_SIGMAS**2), (count, 1, 1))
-    steps = [_Step(np.eye(STATE_COUNT), x, P, x, P)]
+    steps = [_FilterStep(np.eye(STATE_COUNT), x, P, x, P)]
     square, log_s = np.zeros(count), np.zeros(count)
     R = sigma_z**2 * np.eye(2)
-    Q_of = _noise(length, gap, noises)
-    for z, F, push, Q in zip(measured[1:], *_transitions(moved, length, turn), Q_of, strict=True):
-        x_prior, P_prior = x @ F.T + push, F @ P @ F.T + Q
+    Q_of = _process_noise(length_s, has_gap, noises)
+    for z, F, input_step, Q in zip(
+        measured_m[1:], *_transitions(increments, length_s, turn), Q_of, strict=True
+    ):
+        x_prior, P_prior = x @ F.T + input_step, F @ P @ F.T + Q
         S = P_prior[:, :2, :2] + R
         # S⁻¹ of two rows and columns, written out
         determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
-        inverse = S[:, ::-1, ::-1] * CROSSED / determinant[:, None, None]
+        inverse = S[:, ::-1, ::-1] * ADJUGATE_SIGNS / determinant[:, None, None]
         K = np.swapaxes(P_prior[:, :2, :], 1, 2) @ inverse
         y = (z - x_prior[:, :2])[..., None]
         square += (np.swapaxes(y, 1, 2) @ inverse @ y)[:, 0, 0]
@@ -333,21 +358,21 @@ def _filter(
         x = x_prior + (K @ y)[..., 0]
         P = P_prior - K @ P_prior[:, :2, :]
         P = (P + np.swapaxes(P, 1, 2)) / 2.0
-        steps.append(_Step(F, x_prior, P_prior, x, P))
-    size = 2 * len(length)
+        steps.append(_FilterStep(F, x_prior, P_prior, x, P))
+    size = 2 * len(length_s)
     scale = square / size
     return -0.5 * (size * np.log(scale) + log_s), scale, steps
 
 
-def _smooth(steps: list[_Step], which: int) -> tuple[Array, Array]:
+def _smooth_turn(steps: list[_FilterStep], filter_index: int) -> tuple[Array, Array]:
     """Turn at every measurement by all of them, and its variance (Rauch et al. 1965)."""
-    state, covariance = steps[-1].x[which], steps[-1].P[which]
-    found = [(state[TURN], covariance[TURN, TURN])]
-    for now, after in zip(steps[-2::-1], steps[:0:-1], strict=True):
-        P_prior, P = after.P_prior[which], now.P[which]
-        gain = np.linalg.solve(P_prior, after.F @ P).T
-        state = now.x[which] + gain @ (state - after.x_prior[which])
+    state, covariance = steps[-1].x[filter_index], steps[-1].P[filter_index]
+    turns = [(state[TURN], covariance[TURN, TURN])]
+    for step, next_step in zip(steps[-2::-1], steps[:0:-1], strict=True):
+        P_prior, P = next_step.P_prior[filter_index], step.P[filter_index]
+        gain = np.linalg.solve(P_prior, next_step.F @ P).T
+        state = step.x[filter_index] + gain @ (state - next_step.x_prior[filter_index])
         covariance = P + gain @ (covariance - P_prior) @ gain.T
-        found.append((state[TURN], covariance[TURN, TURN]))
-    turn, variance = np.array(found[::-1]).T
+        turns.append((state[TURN], covariance[TURN, TURN]))
+    turn, variance = np.array(turns[::-1]).T
     return turn, variance

@@ -17,18 +17,24 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import Timeline, timeline
+from px4fuse.filter.steps import Timeline, make_timeline
 
 Row = tuple[float, ...]
 # Columns of ``Replay.updates``
-UPDATES = [
-    "measurement_m", "innovation_m", "innovation_variance_m2", "gain_position", "gain_velocity",
-    "prior_position_m", "prior_position_variance_m2", "prior_velocity_variance_m2_s2",
-]  # fmt: skip
+UPDATE_COLUMNS = [
+    "measurement_m",
+    "innovation_m",
+    "innovation_variance_m2",
+    "gain_position",
+    "gain_velocity",
+    "prior_position_m",
+    "prior_position_variance_m2",
+    "prior_velocity_variance_m2_s2",
+]
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class Replay:
     updates: pd.DataFrame
     input_gap_s: float = field(default=0.0)
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Replay:
@@ -83,20 +89,27 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     # scipy.stats, which filterpy imports, costs a third of a second: not where nothing is replayed
     from filterpy.kalman import KalmanFilter  # noqa: PLC0415
 
-    line = timeline(axis, settings, initial)
+    line = make_timeline(axis, settings, initial)
     start = initial or InitialState(line.time_s[0], axis.measurement_m[0])
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
     kalman.x = np.array([[start.position_m], [start.velocity_m_s]])
-    kalman.P = model.matrix(model.INITIAL_COVARIANCE)
+    kalman.P = model.symmetric_matrix(model.INITIAL_COVARIANCE)
     kalman.H = model.H
     kalman.R = np.array([[settings.sigma_z_m**2]])
     kalman.inv = np.reciprocal  # S is 1 by 1
-    states, updates = [_row(kalman.x, kalman.P)], []
+    states, updates = [_state_row(kalman.x, kalman.P)], []
     for dt, u, extra, measurement in zip(
-        np.diff(line.time_s), line.acceleration_m_s2, line.input_variance_m2_s4,
-        line.measurement[1:], strict=True,
-    ):  # fmt: skip
-        Q = (settings.sigma_a_m_s2**2 + extra) * settings.dt_s * model.matrix(model.noise(dt))
+        np.diff(line.time_s),
+        line.acceleration_m_s2,
+        line.input_variance_m2_s4,
+        line.measurement[1:],
+        strict=True,
+    ):
+        Q = (
+            (settings.sigma_a_m_s2**2 + extra)
+            * settings.dt_s
+            * model.symmetric_matrix(model.process_noise_unit(dt))
+        )
         kalman.predict(u=np.array([[u]]), B=model.input_matrix(dt), F=model.transition(dt), Q=Q)
         if measurement >= 0:
             z = axis.measurement_m[measurement]
@@ -104,7 +117,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
             y, S, K = kalman.y[0, 0], kalman.S[0, 0], kalman.K[:, 0]
             x, P = kalman.x_prior, kalman.P_prior
             updates.append((z, y, S, *K, x[0, 0], P[0, 0], P[1, 1]))
-        states.append(_row(kalman.x, kalman.P))
+        states.append(_state_row(kalman.x, kalman.P))
     return as_replay(axis, settings, line, states, updates)
 
 
@@ -113,23 +126,25 @@ def as_replay(
 ) -> Replay:
     """A replay of its rows: state and covariance after each step, and what each update was."""
     times = line.time_s, line.time_s[line.measurement >= 0]
-    time, fused = (pd.Index(at, name="time_s") for at in times)
+    time, update_index = (pd.Index(update_time_s, name="time_s") for update_time_s in times)
     steps = pd.DataFrame(states, index=time, columns=model.STATES + model.COVARIANCES)
     steps["acceleration_m_s2"] = np.append(line.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
-    return Replay(axis, settings, steps, pd.DataFrame(updates, fused, UPDATES), line.input_gap_s)
+    return Replay(
+        axis, settings, steps, pd.DataFrame(updates, update_index, UPDATE_COLUMNS), line.input_gap_s
+    )
 
 
-def _row(x: Array, P: Array) -> Row:
+def _state_row(x: Array, P: Array) -> Row:
     """State and covariance as a row of ``Replay.steps``."""
     return x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]
 
 
-def _ahead(run: Replay, times: Array) -> tuple[IntArray, Array, BoolArray]:
+def _step_before(run: Replay, times: Array) -> tuple[IntArray, Array, BoolArray]:
     """The step before each time, how long ago it was (s), and whether the time is outside."""
     edges = run.steps.index.to_numpy()
-    at = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)
-    return at, times - edges[at], (times < edges[0]) | (times > edges[-1])
+    step_index = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)
+    return step_index, times - edges[step_index], (times < edges[0]) | (times > edges[-1])
 
 
 def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
@@ -138,19 +153,22 @@ def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
     Nothing later than the time itself is used: interpolating between two steps would let a
     measurement act before it arrived. NaN outside the replay.
     """
-    at, ahead, outside = _ahead(run, times)
+    index, elapsed_s, outside = _step_before(run, times)
     position, velocity, acceleration = (
-        run.steps[column].to_numpy()[at] for column in (*model.STATES, "acceleration_m_s2")
+        run.steps[column].to_numpy()[index] for column in (*model.STATES, "acceleration_m_s2")
     )
-    position, velocity = model.move(position, velocity, acceleration, ahead)
+    position, velocity = model.propagate_state(position, velocity, acceleration, elapsed_s)
     return np.where(outside, np.nan, position), np.where(outside, np.nan, velocity)
 
 
 def variance_at(run: Replay, times: Array) -> tuple[Array, Array]:
     """Variances (m², m²/s²) that belong to :func:`state_at`: P = FPFᵀ + Q from the step before."""
-    at, ahead, outside = _ahead(run, times)
-    p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[at].T
-    extra = run.steps["input_variance_m2_s4"].to_numpy()[at]
+    index, elapsed_s, outside = _step_before(run, times)
+    p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[index].T
+    extra = run.steps["input_variance_m2_s4"].to_numpy()[index]
     q = (run.settings.sigma_a_m_s2**2 + extra) * run.settings.dt_s
-    (p00, _, p11), (q00, _, q11) = model.spread((p00, p01, p11), ahead), model.noise(ahead)
+    (p00, _, p11), (q00, _, q11) = (
+        model.propagate_covariance((p00, p01, p11), elapsed_s),
+        model.process_noise_unit(elapsed_s),
+    )
     return np.where(outside, np.nan, p00 + q * q00), np.where(outside, np.nan, p11 + q * q11)

@@ -18,18 +18,25 @@ from scipy.optimize import brentq
 from scipy.special import chdtri
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.filter.model import INITIAL_COVARIANCE, Symmetric, move, noise, spread, update
+from px4fuse.filter.model import (
+    INITIAL_COVARIANCE,
+    Symmetric,
+    process_noise_unit,
+    propagate_covariance,
+    propagate_state,
+    update_step,
+)
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import Timeline, timeline
+from px4fuse.filter.steps import Timeline, make_timeline
 
 # Half of the 95 % point of chi-square: the drop of log-likelihood that bounds an interval
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # ln σ at which the end of an interval is sought first
-FIRST_REACH = 0.05
+FIRST_LOG_DISTANCE = 0.05
 # Step of ln σ for bends; of those, how far a parabola is followed at once, and how often
-BEND_STEP = 0.05
-FAR_STEPS, PARABOLAS = 6.0, 4
+CURVATURE_STEP = 0.05
+MAX_PARABOLA_STEPS, MAX_PARABOLAS = 6.0, 4
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,7 @@ class Preintegrated:
 
     def first(self, count: int) -> Preintegrated:
         """The first measurements only."""
-        arrays = {name: of[:count] for name, of in vars(self).items() if name != "initial"}
+        arrays = {name: values[:count] for name, values in vars(self).items() if name != "initial"}
         return replace(self, **arrays)
 
 
@@ -71,25 +78,31 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    line = timeline(axis, settings)
-    ends, leg, rest = _legs(line)
+    line = make_timeline(axis, settings)
+    end_steps, interval_index, remaining_s = _interval_index(line)
     time = line.time_s
-    unit = settings.dt_s * np.stack(spread(noise(np.diff(time)), rest), 1)
-    dp, dv = moved(line, line.acceleration_m_s2)
+    noise_unit = settings.dt_s * np.stack(
+        propagate_covariance(process_noise_unit(np.diff(time)), remaining_s), 1
+    )
+    dp, dv = integrate_acceleration(line, line.acceleration_m_s2)
     return Preintegrated(
-        length_s=np.diff(time[np.concatenate([[0], ends])]),
+        length_s=np.diff(time[np.concatenate([[0], end_steps])]),
         delta_position_m=dp,
         delta_velocity_m_s=dv,
-        noise_unit=np.stack([np.bincount(leg, unit[:, i]) for i in range(3)], 1),
+        noise_unit=np.stack([np.bincount(interval_index, noise_unit[:, i]) for i in range(3)], 1),
         noise_fixed=np.stack(
-            [np.bincount(leg, unit[:, i] * line.input_variance_m2_s4) for i in range(3)], 1
+            [
+                np.bincount(interval_index, noise_unit[:, i] * line.input_variance_m2_s4)
+                for i in range(3)
+            ],
+            1,
         ),
-        measurement_m=axis.measurement_m[line.measurement[ends]],
+        measurement_m=axis.measurement_m[line.measurement[end_steps]],
         initial=InitialState(float(time[0]), float(axis.measurement_m[0])),
     )
 
 
-def moved(line: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
+def integrate_acceleration(line: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
     """What an acceleration adds to position (m) and velocity (m/s) between the measurements.
 
     Parameters
@@ -102,22 +115,28 @@ def moved(line: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
     -------
     delta_position_m, delta_velocity_m_s : ndarray, shape (m,)
     """
-    _, leg, rest = _legs(line)
-    still = np.zeros(len(rest))
-    dp, dv = move(*move(still, still, acceleration_m_s2, np.diff(line.time_s)), still, rest)
+    _, interval_index, remaining_s = _interval_index(line)
+    zero_state = np.zeros(len(remaining_s))
+    dp, dv = propagate_state(
+        *propagate_state(zero_state, zero_state, acceleration_m_s2, np.diff(line.time_s)),
+        zero_state,
+        remaining_s,
+    )
     # numpy's stubs call the sums of weights integers
-    return np.asarray(np.bincount(leg, dp), float), np.asarray(np.bincount(leg, dv), float)
+    return np.asarray(np.bincount(interval_index, dp), float), np.asarray(
+        np.bincount(interval_index, dv), float
+    )
 
 
-def _legs(line: Timeline) -> tuple[IntArray, IntArray, Array]:
+def _interval_index(line: Timeline) -> tuple[IntArray, IntArray, Array]:
     """Last step of each leg; of each step its leg, and the time from its end to the leg's."""
-    ends = np.flatnonzero(line.measurement >= 0)
-    leg = np.searchsorted(ends, np.arange(1, len(line.time_s)))
-    return ends, leg, line.time_s[ends[leg]] - line.time_s[1:]
+    end_steps = np.flatnonzero(line.measurement >= 0)
+    interval_index = np.searchsorted(end_steps, np.arange(1, len(line.time_s)))
+    return end_steps, interval_index, line.time_s[end_steps[interval_index]] - line.time_s[1:]
 
 
 def innovations(
-    legs: Preintegrated,
+    intervals: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
     skip: BoolArray | None = None,
@@ -126,7 +145,7 @@ def innovations(
 
     Parameters
     ----------
-    legs : Preintegrated
+    intervals : Preintegrated
     sigma_a_m_s2, sigma_z_m : array_like
         Broadcast against each other to a grid of shape (...).
     skip : ndarray of bool, shape (m,), optional
@@ -137,13 +156,13 @@ def innovations(
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
         Of k signals through one filter of shape (m, k) and (m,).
     """
-    steps = recursion(legs, sigma_a_m_s2, sigma_z_m, skip)
+    steps = run_filter(intervals, sigma_a_m_s2, sigma_z_m, skip)
     nu, s = zip(*(step[:2] for step in steps), strict=True)
     return np.array(nu), np.array(s)
 
 
 @dataclass(frozen=True)
-class States:
+class FilterStates:
     """The filter just after each measurement, each of shape (m, ...) for a grid of settings."""
 
     gain: Array
@@ -153,24 +172,26 @@ class States:
     nis: Array
 
 
-def states(legs: Preintegrated, sigma_a_m_s2: ArrayLike, sigma_z_m: ArrayLike) -> States:
+def filter_states(
+    intervals: Preintegrated, sigma_a_m_s2: ArrayLike, sigma_z_m: ArrayLike
+) -> FilterStates:
     """Gain, velocity and standard deviations for every combination of settings.
 
     Parameters
     ----------
-    legs : Preintegrated
+    intervals : Preintegrated
     sigma_a_m_s2, sigma_z_m : array_like
         Broadcast against each other to a grid of shape (...).
     """
     rows = [
         (k0, v, np.sqrt(p00), np.sqrt(p11), nu**2 / s)
-        for nu, s, k0, _, v, (p00, _, p11) in recursion(legs, sigma_a_m_s2, sigma_z_m, None)
+        for nu, s, k0, _, v, (p00, _, p11) in run_filter(intervals, sigma_a_m_s2, sigma_z_m, None)
     ]
-    return States(*(np.array(column) for column in zip(*rows, strict=True)))
+    return FilterStates(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def recursion(
-    legs: Preintegrated,
+def run_filter(
+    intervals: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
     skip: BoolArray | None,
@@ -183,7 +204,7 @@ def recursion(
 
     Parameters
     ----------
-    legs : Preintegrated
+    intervals : Preintegrated
     sigma_a_m_s2, sigma_z_m : array_like
         Broadcast against each other to a grid of shape (...).
     skip : ndarray of bool, shape (m,), or None
@@ -201,79 +222,82 @@ def recursion(
     q, r = np.broadcast_arrays(*squares)
     if not q.ndim:  # in plain floats: fifty times as fast as arrays of a single element
         q, r = q.item(), r.item()
-    p, v = legs.initial.position_m, legs.initial.velocity_m_s + 0.0 * q  # of the grid's shape
+    p, v = (
+        intervals.initial.position_m,
+        intervals.initial.velocity_m_s + 0.0 * q,
+    )  # of the grid's shape
     covariance: Symmetric[Any] = INITIAL_COVARIANCE
     variance = r
-    for dt, dp, dv, unit, fixed, z, skipped, counts in zip(
-        legs.length_s.tolist(),
-        _rows(legs.delta_position_m),
-        _rows(legs.delta_velocity_m_s),
-        legs.noise_unit.tolist(),
-        legs.noise_fixed.tolist(),
-        _rows(legs.measurement_m),
-        [False] * len(legs.measurement_m) if skip is None else skip.tolist(),
-        [1.0] * len(legs.measurement_m) if weight is None else weight.tolist(),
+    for dt, dp, dv, unit, fixed, z, is_skipped, weight_k in zip(
+        intervals.length_s.tolist(),
+        _measurement_rows(intervals.delta_position_m),
+        _measurement_rows(intervals.delta_velocity_m_s),
+        intervals.noise_unit.tolist(),
+        intervals.noise_fixed.tolist(),
+        _measurement_rows(intervals.measurement_m),
+        [False] * len(intervals.measurement_m) if skip is None else skip.tolist(),
+        [1.0] * len(intervals.measurement_m) if weight is None else weight.tolist(),
         strict=True,
     ):
-        r = variance / counts
+        r = variance / weight_k
         # x = Fx + Ba, P = FPFᵀ + Q
         p, v = p + dt * v + dp, v + dv
-        p00, p01, p11 = spread(covariance, dt)
+        p00, p01, p11 = propagate_covariance(covariance, dt)
         p00 = p00 + q * unit[0] + fixed[0]
         p01 = p01 + q * unit[1] + fixed[1]
         p11 = p11 + q * unit[2] + fixed[2]
         covariance = p00, p01, p11
-        (nu, s, k0, _), after = update(p, v, covariance, z, r)
-        if not skipped:
-            p, v, covariance = after
+        (nu, s, k0, _), updated = update_step(p, v, covariance, z, r)
+        if not is_skipped:
+            p, v, covariance = updated
         yield nu, s, k0, p, v, covariance
 
 
-def _rows(values: Array) -> list[Any]:
+def _measurement_rows(values: Array) -> list[Any]:
     """What the filter takes in turn: numbers, or a row of several signals."""
     return values.tolist() if values.ndim == 1 else list(values)
 
 
-def total_over_grid(
-    legs: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
+def score_grid(
+    intervals: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
 ) -> Array:
     """-ln p of all axes but for a constant, of the shape of the grid of settings.
 
     Parameters
     ----------
-    legs : list of Preintegrated
+    intervals : list of Preintegrated
     sigma_a_m_s2, sigma_z_m : ndarray
         Broadcast against each other.
     weight : ndarray, shape (m,)
         What each measurement counts: its variance is SIGMA_Z² over that.
     """
     total = np.zeros(np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
-    for leg in legs:
-        for nu, s, *_ in recursion(leg, sigma_a_m_s2, sigma_z_m, None, weight):
+    for interval in intervals:
+        for nu, s, *_ in run_filter(interval, sigma_a_m_s2, sigma_z_m, None, weight):
             total += 0.5 * (np.log(s) + nu**2 / s)
     return total
 
 
-def parabola_vertex(profile: Array, at: int) -> tuple[float, float]:
+def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     """Vertex of the parabola through three points of a profile.
 
     Parameters
     ----------
     profile : ndarray, shape (n,)
         At equal steps.
-    at : int
+    index : int
         Index of the middle one, 1 to n - 2.
 
     Returns
     -------
     shift : float
         From the middle point to the minimum, in steps; 0 where there is none.
-    bend : float
+    curvature : float
         Second difference, per square step.
     """
-    left, middle, right = profile[at - 1 : at + 2]
-    bend = left - 2.0 * middle + right
-    return (0.5 * (left - right) / bend if bend > 0.0 else 0.0), bend
+    left, middle, right = profile[index - 1 : index + 2]
+    curvature = left - 2.0 * middle + right
+    return (0.5 * (left - right) / curvature if curvature > 0.0 else 0.0), curvature
 
 
 def profile_interval(
@@ -289,12 +313,15 @@ def profile_interval(
         How far above its minimum the interval reaches.
     """
     drop = profile - profile.min()
-    inside = np.flatnonzero(drop <= allowed)
+    inside_indices = np.flatnonzero(drop <= allowed)
     ends: list[float | None] = []
-    for edge, beyond in ((inside[0], inside[0] - 1), (inside[-1], inside[-1] + 1)):
-        if 0 <= beyond < len(grid):
-            share = (allowed - drop[edge]) / (drop[beyond] - drop[edge])
-            ends.append(float(grid[edge] + share * (grid[beyond] - grid[edge])))
+    for edge_index, outside_index in (
+        (inside_indices[0], inside_indices[0] - 1),
+        (inside_indices[-1], inside_indices[-1] + 1),
+    ):
+        if 0 <= outside_index < len(grid):
+            share = (allowed - drop[edge_index]) / (drop[outside_index] - drop[edge_index])
+            ends.append(float(grid[edge_index] + share * (grid[outside_index] - grid[edge_index])))
         else:
             ends.append(None)
     return ends[0], ends[1]
@@ -320,41 +347,49 @@ def profile_ends(
     widening : float
         Of the variance, by what the score does not hold.
     """
-    least, root = score(*best), float(np.sqrt(PROFILE_DROP * widening))
+    best_score, root_drop = score(*best), float(np.sqrt(PROFILE_DROP * widening))
 
-    def end(side: float, bound: float) -> float | None:
-        other = best[1]
+    def find_end(direction: float, bound: float) -> float | None:
+        other_log = best[1]
 
         @cache  # where the other parameter is sought from depends on the call before
         def excess(distance: float) -> float:
             """How far √(drop), which is nearly a line, lies above that of the interval's end."""
-            nonlocal other
+            nonlocal other_log
             if distance == 0.0:
-                return -root
-            lowest, other = _lowest(lambda at: score(best[0] + side * distance, at), other)
-            return float(np.sqrt(max(lowest - least, 0.0)) - root)
+                return -root_drop
+            lowest_score, other_log = _minimise_by_parabolas(
+                lambda other_log_value: score(best[0] + direction * distance, other_log_value),
+                other_log,
+            )
+            return float(np.sqrt(max(lowest_score - best_score, 0.0)) - root_drop)
 
-        reach = side * (float(np.log(bound)) - best[0])
-        far = min(FIRST_REACH, reach)
-        while excess(far) < 0.0:
-            if far == reach:
+        max_distance = direction * (float(np.log(bound)) - best[0])
+        distance_limit = min(FIRST_LOG_DISTANCE, max_distance)
+        while excess(distance_limit) < 0.0:
+            if distance_limit == max_distance:
                 return None
-            far = min(2.0 * far, reach)
-        return float(np.exp(best[0] + side * brentq(excess, 0.0, far, xtol=1e-3 * far)))
+            distance_limit = min(2.0 * distance_limit, max_distance)
+        return float(
+            np.exp(
+                best[0]
+                + direction * brentq(excess, 0.0, distance_limit, xtol=1e-3 * distance_limit)
+            )
+        )
 
-    return end(-1.0, bounds[0]), end(1.0, bounds[1])
+    return find_end(-1.0, bounds[0]), find_end(1.0, bounds[1])
 
 
-def _lowest(score: Callable[[float], float], near: float) -> tuple[float, float]:
+def _minimise_by_parabolas(score: Callable[[float], float], start: float) -> tuple[float, float]:
     """Least value of a score and where it is, by parabolas from near there."""
-    for _ in range(PARABOLAS):
-        profile = np.array([score(near + k * BEND_STEP) for k in (-1.0, 0.0, 1.0)])
+    for _ in range(MAX_PARABOLAS):
+        profile = np.array([score(start + k * CURVATURE_STEP) for k in (-1.0, 0.0, 1.0)])
         middle = float(profile[1])
         if np.ptp(profile) == 0.0:  # there is no other parameter
-            return middle, near
-        shift, bend = parabola_vertex(profile, 1)
-        step = shift if bend > 0.0 else np.sign(profile[0] - profile[2]) * FAR_STEPS
-        near += float(np.clip(step, -FAR_STEPS, FAR_STEPS)) * BEND_STEP
-        if bend > 0.0 and abs(step) <= 1.0:
-            return middle - 0.5 * shift**2 * bend, near
-    return score(near), near
+            return middle, start
+        shift, curvature = parabola_vertex(profile, 1)
+        step = shift if curvature > 0.0 else np.sign(profile[0] - profile[2]) * MAX_PARABOLA_STEPS
+        start += float(np.clip(step, -MAX_PARABOLA_STEPS, MAX_PARABOLA_STEPS)) * CURVATURE_STEP
+        if curvature > 0.0 and abs(step) <= 1.0:
+            return middle - 0.5 * shift**2 * curvature, start
+    return score(start), start

@@ -23,18 +23,18 @@ from scipy.linalg import lapack
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 
-ONE = np.ones(1)
+UNIT_SCALE = np.ones(1)
 # SIGMA_A and SIGMA_Z of a smooth path
-PATH_NOISES = 0.5, 0.1
+PATH_SIGMAS = 0.5, 0.1
 # Precision of a start (1/m²) above which it is known, below which as good as nothing is
-HELD = 1e-3
+KNOWN_START_PRECISION = 1e-3
 # Position noise of a leg that is always there, over a measurement's and over its own: Q has an
 # inverse, also that of a single step, which is of rank one, or without process noise
-LEAST_SHARE = 1e-5
+MIN_NOISE_SHARE = 1e-5
 # Signals whose states are found at once: more take more memory, and no less time
-AT_ONCE = 8
+SIGNAL_BATCH_SIZE = 8
 # A determinant below this share of its terms is their rounding
-SINGULAR = 1e-12
+MIN_DETERMINANT_SHARE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -95,12 +95,14 @@ class Positions:
         weight : ndarray
             What each of the last measurements counts; one before is the filter's start.
         """
-        fixed = self.noise_fixed / sigma_z_m**2
-        fixed[0] += self.length_s * walk**2
-        extra = np.ones(len(self.measurement_m) - len(weight))
+        noise_fixed = self.noise_fixed / sigma_z_m**2
+        noise_fixed[0] += self.length_s * walk**2
+        start_weights = np.ones(len(self.measurement_m) - len(weight))
         slow = self.slow and (self.slow[0] / sigma_z_m, self.slow[1])
-        scaled = replace(self, noise_fixed=fixed, initial=self.initial * sigma_z_m**2, slow=slow)
-        return scaled, 1.0 / np.concatenate([extra, weight])
+        scaled_positions = replace(
+            self, noise_fixed=noise_fixed, initial=self.initial * sigma_z_m**2, slow=slow
+        )
+        return scaled_positions, 1.0 / np.concatenate([start_weights, weight])
 
     def systems(
         self, sigma_a_m_s2: float, variance_m2: Array
@@ -109,29 +111,37 @@ class Positions:
 
         An axis that is measured at the same times as another shares its system.
         """
-        known = np.isfinite(self.measurement_m)
+        is_measured = np.isfinite(self.measurement_m)
         noise = sigma_a_m_s2**2 * self.noise_unit + self.noise_fixed
-        left = list(range(known.shape[1]))
-        while left:
-            own = known[:, left[0]]
-            axes = [axis for axis in left if np.array_equal(known[:, axis], own)]
-            left = [axis for axis in left if axis not in axes]
+        remaining_axes = list(range(is_measured.shape[1]))
+        while remaining_axes:
+            is_axis_measured = is_measured[:, remaining_axes[0]]
+            axes = [
+                axis
+                for axis in remaining_axes
+                if np.array_equal(is_measured[:, axis], is_axis_measured)
+            ]
+            remaining_axes = [axis for axis in remaining_axes if axis not in axes]
             precision = self.initial.copy()
             # a stretch that this axis hardly measures is held by its start, and says nothing
-            few = np.add.reduceat(own.astype(int), self.start) < 2
-            used = own & ~np.repeat(few, np.diff([*self.start, len(known)]))
-            precision[:, 0] += np.where(used, 1.0 / variance_m2, 0.0)
-            precision[self.start[few]] += 1.0
-            said = (precision > 0.0) & ((precision > self.initial) | (self.initial > HELD))
+            has_few = np.add.reduceat(is_axis_measured.astype(int), self.start) < 2
+            is_used = is_axis_measured & ~np.repeat(
+                has_few, np.diff([*self.start, len(is_measured)])
+            )
+            precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
+            precision[self.start[has_few]] += 1.0
+            is_known = (precision > 0.0) & (
+                (precision > self.initial) | (self.initial > KNOWN_START_PRECISION)
+            )
             system = factorise(self.length_s, noise, self.joined, precision, self.slow)
             # where the start is as good as unknown, what is known of it does not count
-            vague = float(np.sum(np.log(precision[(precision > 0.0) & ~said])))
-            system = replace(system, log_determinant=system.log_determinant + vague)
-            yield axes, system, int(np.count_nonzero(said)) - 2 * len(self.start)
+            log_unknown_precision = float(np.sum(np.log(precision[(precision > 0.0) & ~is_known])))
+            system = replace(system, log_determinant=system.log_determinant + log_unknown_precision)
+            yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.start)
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedPositions:
     """Positions fitted with one pair of noises, for T clock offsets.
 
     Attributes
@@ -150,7 +160,7 @@ class Fitted:
     freedom: int
     constant_sigma: Array
 
-    def scaled(self, sigma: float) -> Fitted:
+    def scaled(self, sigma: float) -> FittedPositions:
         """The same with all noises ``sigma`` times as large."""
         log_determinant = self.log_determinant + 2.0 * self.freedom * float(np.log(sigma))
         return replace(self, gram=self.gram / sigma**2, log_determinant=log_determinant)
@@ -160,7 +170,7 @@ class Fitted:
         information = self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0)
         return np.asarray(-np.linalg.solve(information, self.gram[..., 1:, :1])[..., 0])
 
-    def by_stretch(self, scales: Array = ONE) -> Array:
+    def by_stretch(self, scales: Array = UNIT_SCALE) -> Array:
         """-ln p of each stretch but for what the noises alone make, shape (k, s, T).
 
         Parameters
@@ -177,15 +187,15 @@ class Fitted:
         log_lower = np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
         return np.asarray(0.5 * (gram[..., 0, 0] - np.sum(cross * solved, axis=-1)) + log_lower)
 
-    def totals(self, scales: Array = ONE) -> Array:
+    def totals(self, scales: Array = UNIT_SCALE) -> Array:
         """-ln p of all with all noises so many times as large, but for a constant, (k, T)."""
         noises_alone = 0.5 * self.log_determinant + self.freedom * np.log(scales)
         return np.asarray(self.by_stretch(scales).sum(axis=1) + noises_alone[:, None])
 
 
-def fit(
+def fit_positions(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, measured_m: Array | None = None
-) -> Fitted:
+) -> FittedPositions:
     """Fit positions with one pair of noises.
 
     Parameters
@@ -204,24 +214,24 @@ def fit(
     dp, dv = positions.delta_position_m, positions.delta_velocity_m_s
     gram = np.zeros((len(positions.start), *dp.shape[1:3], dp.shape[2]))
     log_determinant, freedom = 0.0, 0
-    for axes, system, own in positions.systems(sigma_a_m_s2, variance_m2):
+    for axes, system, axis_freedom in positions.systems(sigma_a_m_s2, variance_m2):
         log_determinant += len(axes) * system.log_determinant
-        freedom += len(axes) * own
+        freedom += len(axes) * axis_freedom
         data = measured_m[axes]
-        legs, explained = system.whiten(data, dp[axes], dv[axes])
-        parts = (np.sqrt(system.precision[:, 0]) * data, *legs, explained)
-        for at, (begin, end) in enumerate(positions.stretches):
+        intervals, explained = system.whiten(data, dp[axes], dv[axes])
+        signals = (np.sqrt(system.precision[:, 0]) * data, *intervals, explained)
+        for segment_index, (begin, end) in enumerate(positions.stretches):
             rows = slice(begin, end - 1)
             states = slice(system.states * begin, system.states * end)
-            for sign, part, here in zip(
-                (1.0, 1.0, 1.0, -1.0), parts, (slice(begin, end), rows, rows, states), strict=True
+            for sign, array, columns in zip(
+                (1.0, 1.0, 1.0, -1.0), signals, (slice(begin, end), rows, rows, states), strict=True
             ):
-                signal = part[..., here]
-                gram[at] += sign * (signal @ np.swapaxes(signal, -1, -2)).sum(axis=0)
-    return Fitted(gram, log_determinant, freedom, positions.constant_sigma)
+                signal = array[..., columns]
+                gram[segment_index] += sign * (signal @ np.swapaxes(signal, -1, -2)).sum(axis=0)
+    return FittedPositions(gram, log_determinant, freedom, positions.constant_sigma)
 
 
-def centred(positions: Positions, *, scaled: bool = False) -> Positions:
+def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
     """The same data about a smooth path through them, from zero where a stretch starts.
 
     The likelihood is the same, but it is no longer a small difference of large squares.
@@ -234,23 +244,23 @@ def centred(positions: Positions, *, scaled: bool = False) -> Positions:
     """
     measured = positions.measurement_m.copy()
     dp, dv = positions.delta_position_m.copy(), positions.delta_velocity_m_s.copy()
-    sigma_a, sigma_z = PATH_NOISES
+    sigma_a, sigma_z = PATH_SIGMAS
     for axes, system, _ in positions.systems(sigma_a, np.full(len(measured), sigma_z**2)):
         data = np.nan_to_num(measured[:, axes].T)[:, None]
         state = system.solve(data, dp[axes, :, 0], dv[axes, :, 0])
         state[:, :, positions.start] = 0.0
         path, speed = state[..., 0], state[..., 1]
         measured[:, axes] -= path[:, 0].T
-        way = np.diff(path) - positions.length_s * speed[..., :-1]
+        path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
         # one path is taken out of all; a scale is of the path to which each input leads
-        for part, leads in ((dp, way), (dv, np.diff(speed))):
-            part[axes, :, 0] -= leads[:, :1]
+        for array, increment in ((dp, path_increment), (dv, np.diff(speed))):
+            array[axes, :, 0] -= increment[:, :1]
             if scaled:
-                part[axes, :, -1] = leads
+                array[axes, :, -1] = increment
     return replace(positions, measurement_m=measured, delta_position_m=dp, delta_velocity_m_s=dv)
 
 
-def squares(
+def expected_squares(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, constants: Array
 ) -> tuple[Array, Array]:
     """Expected square of each measurement's error given all data, summed over its axes.
@@ -272,19 +282,19 @@ def squares(
     """
     weight = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
     # of each leg, by the stretch in which it ends
-    of_leg = np.repeat(weight, np.diff([*positions.start, len(variance_m2)]), axis=0)[1:]
-    moved = positions.delta_position_m, positions.delta_velocity_m_s
-    dp, dv = (np.einsum("akn,nk->an", part[:, 0], of_leg) for part in moved)
+    interval_weight = np.repeat(weight, np.diff([*positions.start, len(variance_m2)]), axis=0)[1:]
+    increments = positions.delta_position_m, positions.delta_velocity_m_s
+    dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_weight) for array in increments)
     square = np.zeros(len(variance_m2))
     for axes, system, _ in positions.systems(sigma_a_m_s2, variance_m2):
         measured = positions.measurement_m[:, axes].T
         error = measured - system.solve(np.nan_to_num(measured), dp[axes], dv[axes])[..., 0]
-        spread = np.where(np.isnan(error), np.nan, system.position_variance())
-        square += np.nansum(error**2 + spread, axis=0)
+        position_variance = np.where(np.isnan(error), np.nan, system.position_variance())
+        square += np.nansum(error**2 + position_variance, axis=0)
     return square, np.isfinite(positions.measurement_m).sum(axis=1)
 
 
-def paired_products(
+def products_by_stretch(
     positions: Positions,
     sigma_a_m_s2: float,
     variance_m2: Array,
@@ -308,26 +318,39 @@ def paired_products(
     -------
     ndarray, shape (s, k)
     """
-    error, *legs = signals
+    measurement_errors, *increments = signals
     constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
-    found = []
-    for begin in range(0, measured_m.shape[1], AT_ONCE):
-        few = np.s_[:, begin : begin + AT_ONCE]
+    results = []
+    for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
+        batch = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
         # one set of signals, then the other, then those of the constants
         dp, dv = (
-            np.concatenate([leg[few], 0.0 * leg[few], of_constant], axis=1)[:, None]
-            for leg, of_constant in zip(legs, constants, strict=True)
+            np.concatenate([increment[batch], 0.0 * increment[batch], constant_signal], axis=1)[
+                :, None
+            ]
+            for increment, constant_signal in zip(increments, constants, strict=True)
         )
-        measured = np.zeros((*dp.shape[:3], error.shape[-1]))
-        one, other, rest = np.split(np.arange(dp.shape[2]), np.array([1, 2]) * error[few].shape[1])
-        measured[:, 0, one], measured[:, 0, other] = error[few], measured_m[few]
-        both = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
-        gram = fit(both, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
-        information = gram[:, rest[:, None], rest] + np.diag(positions.constant_sigma**-2.0)
-        taken = np.linalg.solve(information, gram[:, rest[:, None], other])
-        by_constants = np.einsum("skc,sck->sk", gram[:, one[:, None], rest], taken)
-        found.append(gram[:, one, other] - by_constants)
-    return np.concatenate(found, axis=1)
+        measured = np.zeros((*dp.shape[:3], measurement_errors.shape[-1]))
+        first_rows, second_rows, constant_rows = np.split(
+            np.arange(dp.shape[2]), np.array([1, 2]) * measurement_errors[batch].shape[1]
+        )
+        measured[:, 0, first_rows], measured[:, 0, second_rows] = (
+            measurement_errors[batch],
+            measured_m[batch],
+        )
+        all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
+        gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
+        information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
+            positions.constant_sigma**-2.0
+        )
+        constant_coefficients = np.linalg.solve(
+            information, gram[:, constant_rows[:, None], second_rows]
+        )
+        by_constants = np.einsum(
+            "skc,sck->sk", gram[:, first_rows[:, None], constant_rows], constant_coefficients
+        )
+        results.append(gram[:, first_rows, second_rows] - by_constants)
+    return np.concatenate(results, axis=1)
 
 
 @dataclass(frozen=True)
@@ -343,7 +366,7 @@ class BandedSystem:
         Between any two states.
     inverse : ndarray, shape (3, m - 1)
         Q⁻¹ by elements 00, 01, 11; zero where a stretch begins.
-    root : ndarray, shape (m - 1,)
+    inverse_sqrt_q11 : ndarray, shape (m - 1,)
         1/√Q₁₁, as Q⁻¹ has it but for rounding; zero where a stretch begins.
     bands, lower : ndarray, shape (2 + states, states · m)
         Bands of A and of its Cholesky factor.
@@ -354,7 +377,7 @@ class BandedSystem:
     precision: Array
     length_s: Array
     inverse: Array
-    root: Array
+    inverse_sqrt_q11: Array
     bands: Array
     lower: Array
     log_determinant: float
@@ -378,39 +401,41 @@ class BandedSystem:
 
         Returns
         -------
-        legs : two ndarray, shape (..., m - 1)
+        intervals : two ndarray, shape (..., m - 1)
             Over their covariance's root, zero where a stretch begins.
         explained : ndarray, shape (..., states · m)
         """
-        legs, right = self._sides(measured_m, dp, dv)
+        intervals, right = self._interval_sides(measured_m, dp, dv)
         explained, _ = lapack.dtbtrs(self.lower, right.T, uplo="L", overwrite_b=1)
-        return legs, explained.T.reshape(*dp.shape[:-1], -1)
+        return intervals, explained.T.reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
         """Most likely states: position and velocity first, shape (..., m, states); as `whiten`."""
-        _, right = self._sides(measured_m, dp, dv)
+        _, right = self._interval_sides(measured_m, dp, dv)
         state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.states))
 
-    def _sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[tuple[Array, Array], Array]:
+    def _interval_sides(
+        self, measured_m: Array, dp: Array, dv: Array
+    ) -> tuple[tuple[Array, Array], Array]:
         """Legs as `whiten`, and the right side of the equations, shape (columns, states · m)."""
         i00, i01, _ = self.inverse
         # Q⁻¹ = UᵀU; where a stretch begins it is zero
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
-        first, second = u00 * dp + u01 * dv, self.root * dv
-        g0, g1 = u00 * first, u01 * first + self.root * second
-        right = np.zeros((*dp.shape[:-1], len(self.precision), self.states))
-        right[..., 1:, 0], right[..., 1:, 1] = g0, g1
-        right[..., :-1, 0] -= g0
+        first, second = u00 * dp + u01 * dv, self.inverse_sqrt_q11 * dv
+        g0, g1 = u00 * first, u01 * first + self.inverse_sqrt_q11 * second
+        right_side = np.zeros((*dp.shape[:-1], len(self.precision), self.states))
+        right_side[..., 1:, 0], right_side[..., 1:, 1] = g0, g1
+        right_side[..., :-1, 0] -= g0
         g0 *= self.length_s
         g0 += g1
-        right[..., :-1, 1] -= g0
+        right_side[..., :-1, 1] -= g0
         if measured_m.any():
-            weighed = self.precision[:, 0] * measured_m
-            right[..., 0] += weighed
-            right[..., 2:] += weighed[..., None]
-        return (first, second), right.reshape(-1, self.states * len(self.precision))
+            weighted_m = self.precision[:, 0] * measured_m
+            right_side[..., 0] += weighted_m
+            right_side[..., 2:] += weighted_m[..., None]
+        return (first, second), right_side.reshape(-1, self.states * len(self.precision))
 
     def position_variance(self) -> Array:
         """Variance of each state's position given all data (m²), shape (m,).
@@ -419,13 +444,13 @@ class BandedSystem:
         block of A: the Cholesky factor's blocks from either end (Fraser and Potter 1969).
         """
         # A with its rows and columns in reverse
-        turned, size = np.zeros_like(self.bands), self.bands.shape[1]
+        reversed_bands, size = np.zeros_like(self.bands), self.bands.shape[1]
         for below in range(4):
-            turned[below, : size - below] = self.bands[below, : size - below][::-1]
-        behind, _ = lapack.dpbtrf(turned, lower=1, overwrite_ab=1)
+            reversed_bands[below, : size - below] = self.bands[below, : size - below][::-1]
+        reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
         (a, c), b = (self.lower[0, at::2] for at in (0, 1)), self.lower[1, 0::2]
         # of the reverse, each block has the velocity first
-        (d, f), e = (behind[0, at::2][::-1] for at in (0, 1)), behind[1, 0::2][::-1]
+        (d, f), e = (reversed_lower[0, at::2][::-1] for at in (0, 1)), reversed_lower[1, 0::2][::-1]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
         p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
@@ -462,12 +487,15 @@ def factorise(
     """
     q00, q01, q11 = noise
     measured = precision[:, 0]
-    least = LEAST_SHARE**2 * (1.0 / np.median(measured[measured > 0.0]) + q00)
+    min_noise = MIN_NOISE_SHARE**2 * (1.0 / np.median(measured[measured > 0.0]) + q00)
     # of a single step Q has no inverse but for that, which rounding would hide
     product = q00 * q11
-    own = product - q01**2
-    determinant = np.where(own > SINGULAR * product, own, 0.0) + least * q11
-    inverse = np.where(joined, np.stack([q11, -q01, q00 + least]) / determinant, 0.0)
+    raw_determinant = product - q01**2
+    determinant = (
+        np.where(raw_determinant > MIN_DETERMINANT_SHARE * product, raw_determinant, 0.0)
+        + min_noise * q11
+    )
+    inverse = np.where(joined, np.stack([q11, -q01, q00 + min_noise]) / determinant, 0.0)
     i00, i01, i11 = inverse
     slope = i00 * length_s
     cross = slope + i01
@@ -487,19 +515,21 @@ def factorise(
     log_noise = np.sum(np.log(determinant[joined]))
     if slow is not None:
         sigma, tau_s = slow
-        kept = np.where(joined, np.exp(-length_s / tau_s), 0.0)
-        variance = sigma**2 * np.append(1.0, 1.0 - kept**2)  # of what is new in each state
+        rho = np.where(joined, np.exp(-length_s / tau_s), 0.0)
+        variance = sigma**2 * np.append(1.0, 1.0 - rho**2)  # of what is new in each state
         error = columns[:, 2]
         position[:, 2] = measured
         error[:, 0] = measured + 1.0 / variance
-        error[:-1, 0] += kept**2 / variance[1:]
-        error[:-1, states] = -kept / variance[1:]
+        error[:-1, 0] += rho**2 / variance[1:]
+        error[:-1, states] = -rho / variance[1:]
         log_noise += np.sum(np.log(variance))
     bands = columns.reshape(-1, states + 2).T
-    lower, broken = lapack.dpbtrf(bands, lower=1)
-    if broken:
+    lower, is_singular = lapack.dpbtrf(bands, lower=1)
+    if is_singular:
         raise np.linalg.LinAlgError("a stretch has too few measurements")
     log_lower = 2.0 * np.sum(np.log(lower[0]))
     log_determinant = log_lower + log_noise - np.sum(np.log(precision[precision > 0.0]))
-    root = np.where(joined, 1.0 / np.sqrt(q11), 0.0)
-    return BandedSystem(precision, length_s, inverse, root, bands, lower, float(log_determinant))
+    inverse_sqrt_q11 = np.where(joined, 1.0 / np.sqrt(q11), 0.0)
+    return BandedSystem(
+        precision, length_s, inverse, inverse_sqrt_q11, bands, lower, float(log_determinant)
+    )

@@ -31,7 +31,7 @@ T = TypeVar("T", float, Array)
 Symmetric = tuple[T, T, T]
 
 
-def matrix(covariance: Symmetric[float]) -> Array:
+def symmetric_matrix(covariance: Symmetric[float]) -> Array:
     """Symmetric matrix of its elements 00, 01, 11, shape (2, 2)."""
     p00, p01, p11 = covariance
     return np.array([[p00, p01], [p01, p11]])
@@ -47,12 +47,12 @@ def input_matrix(dt_s: float) -> Array:
     return np.array([[dt_s**2 / 2.0], [dt_s]])
 
 
-def noise(dt_s: T) -> Symmetric[T]:
+def process_noise_unit(dt_s: T) -> Symmetric[T]:
     """Q(dt) over SIGMA_A² · DT, by element: what one step adds."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 
-def noise_of_many_steps(dt_s: T) -> Symmetric[T]:
+def continuous_noise_unit(dt_s: T) -> Symmetric[T]:
     """What many short steps of together ``dt_s`` add, over SIGMA_A² · DT, by element.
 
     The limit of ΣFQFᵀ: the position's noise of one step, dt³/4, is dt³/3 where the acceleration
@@ -61,32 +61,35 @@ def noise_of_many_steps(dt_s: T) -> Symmetric[T]:
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
 
-def move(position: T, velocity: T, acceleration: T, dt_s: T) -> tuple[T, T]:
+def propagate_state(position: T, velocity: T, acceleration: T, dt_s: T) -> tuple[T, T]:
     """X = Fx + Ba: position (m) and velocity (m/s) after ``dt_s``."""
-    moved = position + velocity * dt_s + acceleration * dt_s**2 / 2.0
-    return moved, velocity + acceleration * dt_s
+    new_position = position + velocity * dt_s + acceleration * dt_s**2 / 2.0
+    return new_position, velocity + acceleration * dt_s
 
 
-def spread(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
+def propagate_covariance(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
     """FPFᵀ, by element: the covariance after ``dt_s``, before Q is added."""
     p00, p01, p11 = covariance
     return p00 + 2.0 * dt_s * p01 + dt_s**2 * p11, p01 + dt_s * p11, p11
 
 
-def predict(
+def predict_step(
     position: T, velocity: T, covariance: Symmetric[T], acceleration: T, density: T, dt_s: T
 ) -> tuple[T, T, Symmetric[T]]:
     """X = Fx + Ba, P = FPFᵀ + Q: position, velocity and covariance after ``dt_s``.
 
     ``density`` (m²/s³) is what Q adds to the velocity's variance per second, SIGMA_A² · DT.
     """
-    (p00, p01, p11), (q00, q01, q11) = spread(covariance, dt_s), noise(dt_s)
+    (p00, p01, p11), (q00, q01, q11) = (
+        propagate_covariance(covariance, dt_s),
+        process_noise_unit(dt_s),
+    )
     after = p00 + density * q00, p01 + density * q01, p11 + density * q11
-    position, velocity = move(position, velocity, acceleration, dt_s)
+    position, velocity = propagate_state(position, velocity, acceleration, dt_s)
     return position, velocity, after
 
 
-def update(
+def update_step(
     position: T, velocity: T, covariance: Symmetric[T], measured: T, variance: T
 ) -> tuple[tuple[T, T, T, T], tuple[T, T, Symmetric[T]]]:
     """ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹; x = x + Kν, P = (I - KH)P.

@@ -6,7 +6,7 @@ their lateness. To first order the acceleration is linear in ten constants of ea
 of the initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body)
 and the scale of the positions. Each one's own signal is integrated once, and a clock offset only
 moves where the integrals are read. The signal of the scale is the path's own acceleration, which
-:func:`px4fuse.filter.marginal.centred` puts in: that of the IMU holds the very noise that is
+:func:`px4fuse.filter.marginal.centre_on_path` puts in: that of the IMU holds the very noise that is
 sought, and would pass much of it off as scale (errors in variables, Fuller 1987).
 """
 
@@ -21,12 +21,12 @@ from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, IntArray, cumulative_integral
-from px4fuse.filter.fitting import Noises, of_ratios
-from px4fuse.filter.marginal import Positions, centred
-from px4fuse.filter.model import noise_of_many_steps
+from px4fuse.filter.fitting import Noises, fit_ratios
+from px4fuse.filter.marginal import Positions, centre_on_path
+from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
 
 # Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
@@ -35,15 +35,15 @@ CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # To first order only while the angles stay small: longer flights are cut into stretches. A gyro
 # bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
 STRETCH_S = 30.0
-SEARCH_S = 0.6
+MAX_OFFSET_S = 0.6
 # The whole search is gone through in so many steps, with about so many of the measurements
 COARSE_POINTS, COARSE_MEASUREMENTS = 25, 600
 # Numbers of signals that are made at once, and of offsets at least
-BLOCK, LEAST_OFFSETS = 2**16, 3
+SIGNALS_PER_BATCH, MIN_OFFSETS = 2**16, 3
 # Of all stretches together, and of one
 MIN_MEASUREMENTS, MIN_STRETCH_MEASUREMENTS = 30, 15
 # Of a stretch of which only some are taken
-FEW_MEASUREMENTS = 5
+MIN_KEPT_MEASUREMENTS = 5
 # The IMU is averaged to this interval before it is integrated
 STEP_S = 0.02
 # Of position (1/m²) and velocity (s²/m²) where a stretch starts: as good as nothing, but enough
@@ -67,12 +67,12 @@ class Signals:
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
         """Position and velocity at other times, shape (..., 3, constants)."""
-        last = len(self.time_s) - 1
-        at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last)
-        ahead = (time_s - self.time_s[at])[..., None, None]
-        position, velocity, value = np.moveaxis(self.table[at], -3, 0)
-        position += ahead * (velocity + (0.5 * ahead) * value)
-        velocity += ahead * value
+        last_index = len(self.time_s) - 1
+        at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
+        elapsed_s = (time_s - self.time_s[at])[..., None, None]
+        position, velocity, acceleration = np.moveaxis(self.table[at], -3, 0)
+        position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
+        velocity += elapsed_s * acceleration
         return position, velocity
 
 
@@ -115,17 +115,23 @@ class PreparedMotion:
     imu_interval_s: float
     heading_sigma_rad: float = float(CONSTANT_SIGMA[2])
 
-    def thinned(self, count: int) -> PreparedMotion:
+    def downsample(self, count: int) -> PreparedMotion:
         """About so many of the measurements, in the stretches that keep a few; all without one."""
-        kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
-        counts = np.add.reduceat(kept.astype(int), self.edges[:-1])
-        enough = counts >= FEW_MEASUREMENTS
-        if not enough.any():
+        is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
+        counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
+        has_enough = counts >= MIN_KEPT_MEASUREMENTS
+        if not has_enough.any():
             return self
-        kept &= np.repeat(enough, np.diff(self.edges))
-        some = {name: getattr(self, name)[kept] for name in ("time_s", "measurement_m", "weight")}
-        signals = tuple(each for each, good in zip(self.signals, enough, strict=True) if good)
-        return replace(self, **some, edges=np.cumsum([0, *counts[enough]]), signals=signals)
+        is_kept &= np.repeat(has_enough, np.diff(self.edges))
+        arrays = {
+            name: getattr(self, name)[is_kept] for name in ("time_s", "measurement_m", "weight")
+        }
+        signals = tuple(
+            stretch_signals
+            for stretch_signals, is_good in zip(self.signals, has_enough, strict=True)
+            if is_good
+        )
+        return replace(self, **arrays, edges=np.cumsum([0, *counts[has_enough]]), signals=signals)
 
     def positions(self, offset_s: Array) -> Positions:
         """Positions, with what moves them where their stamps are corrected by each offset.
@@ -136,28 +142,28 @@ class PreparedMotion:
         ----------
         offset_s : ndarray, shape (T,)
         """
-        length = np.diff(self.time_s)
-        unit = self.dt_s * np.stack(noise_of_many_steps(length))
+        length_s = np.diff(self.time_s)
+        noise_unit = self.dt_s * np.stack(continuous_noise_unit(length_s))
         initial = np.zeros((len(self.time_s), 2))
         initial[self.edges[:-1]] = START_PRECISION
-        shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMA), len(length)
+        shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMA), len(length_s)
         dp, dv = np.zeros((2, *shape))
         for begin, end, signals in zip(self.edges, self.edges[1:], self.signals, strict=False):
             time = self.time_s[begin:end]
             # by axis, offset, constant and time
             position, velocity = (
-                np.moveaxis(self.directions @ part, (2, 0, 3, 1), range(4))
-                for part in signals.at(time + offset_s[:, None])
+                np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
+                for signal in signals.at(time + offset_s[:, None])
             )
-            leg = np.s_[:, :, :-1, begin : end - 1]
-            dv[leg] = np.diff(velocity)
-            dp[leg] = np.diff(position) - velocity[..., :-1] * np.diff(time)
+            rows = np.s_[:, :, :-1, begin : end - 1]
+            dv[rows] = np.diff(velocity)
+            dp[rows] = np.diff(position) - velocity[..., :-1] * np.diff(time)
         return Positions(
             measurement_m=self.measurement_m,
             start=self.edges[:-1],
-            length_s=length,
-            noise_unit=unit,
-            noise_fixed=np.zeros_like(unit),
+            length_s=length_s,
+            noise_unit=noise_unit,
+            noise_fixed=np.zeros_like(noise_unit),
             initial=initial,
             constant_sigma=np.concatenate(
                 [CONSTANT_SIGMA[:2], [self.heading_sigma_rad], CONSTANT_SIGMA[3:]]
@@ -172,11 +178,11 @@ class PreparedMotion:
 
     def blocks(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
         """The same at some offsets, a few at a time, with the scale as a constant or without."""
-        signals = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMA))
-        at_once = max(LEAST_OFFSETS, BLOCK // signals)
-        for few in np.split(offset_s, range(at_once, len(offset_s), at_once)):
-            positions = self.positions(few)
-            yield centred(positions, scaled=True) if scaled else positions
+        signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMA))
+        batch_size = max(MIN_OFFSETS, SIGNALS_PER_BATCH // signal_count)
+        for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
+            positions = self.positions(batch)
+            yield centre_on_path(positions, scaled=True) if scaled else positions
 
     def search(
         self, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
@@ -191,19 +197,19 @@ class PreparedMotion:
         scaled : bool
             Whether the scale of the positions is one of the constants.
         """
-        offsets = np.linspace(-SEARCH_S, SEARCH_S, COARSE_POINTS)
+        offsets = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_POINTS)
         sigma = noises.sigma_z_m
         ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
-        some = self.thinned(COARSE_MEASUREMENTS)
-        blocks = some.blocks(offsets, scaled=scaled)
-        fits = of_ratios(blocks, ratios, noises.walk_m / sigma, some.weight, sigma)
-        scores = np.stack([fitted.scaled(sigma).totals()[0] for fitted in fits])
-        level, at = np.unravel_index(np.argmin(scores), scores.shape)
-        sigma_a = noises.sigma_a_m_s2 * factors[int(level)]
-        return float(offsets[at]), replace(noises, sigma_a_m_s2=sigma_a)
+        coarse_motion = self.downsample(COARSE_MEASUREMENTS)
+        blocks = coarse_motion.blocks(offsets, scaled=scaled)
+        fits = fit_ratios(blocks, ratios, noises.walk_m / sigma, coarse_motion.weight, sigma)
+        scores = np.stack([fit.scaled(sigma).totals()[0] for fit in fits])
+        factor_index, offset_index = np.unravel_index(np.argmin(scores), scores.shape)
+        sigma_a = noises.sigma_a_m_s2 * factors[int(factor_index)]
+        return float(offsets[offset_index]), replace(noises, sigma_a_m_s2=sigma_a)
 
 
-def motion(
+def prepare_motion(
     flight: Flight,
     time_s: Array,
     measurement_m: Array,
@@ -236,36 +242,43 @@ def motion(
     if isinstance(attitude, Unavailable):
         return attitude
     signals = {} if signals is None else signals
-    of_stretch: list[Signals] = []
-    imu_time, known = imu.index.to_numpy(), attitude.index.to_numpy()
-    rows: list[IntArray] = []
-    for begin, end in _covered(imu_time, known):
-        inside = np.flatnonzero((time_s >= begin + SEARCH_S) & (time_s <= end - SEARCH_S))
-        if not len(inside):
+    stretch_signals: list[Signals] = []
+    imu_time, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    rows_by_stretch: list[IntArray] = []
+    for begin, end in _covered_spans(imu_time, attitude_s):
+        inside_rows = np.flatnonzero(
+            (time_s >= begin + MAX_OFFSET_S) & (time_s <= end - MAX_OFFSET_S)
+        )
+        if not len(inside_rows):
             continue
-        within = time_s[inside]
-        count = max(1, int(np.ceil((within[-1] - within[0]) / STRETCH_S)))
-        cuts = np.linspace(within[0], within[-1], count + 1)[1:-1]
-        for part in np.split(inside, np.searchsorted(within, cuts)):
-            if len(part) >= MIN_STRETCH_MEASUREMENTS:
-                rows.append(part)
-                around = time_s[part[0]] - SEARCH_S, time_s[part[-1]] + SEARCH_S
-                if around not in signals:
-                    signals[around] = signals_of(imu, attitude, around)
-                of_stretch.append(signals[around])
-    row = np.concatenate([np.zeros(0, dtype=np.intp), *rows])
-    if len(row) < MIN_MEASUREMENTS:
-        return lacking("motion_few", count=len(row), least=MIN_MEASUREMENTS)
-    edges = np.cumsum([0, *map(len, rows)])
+        inside_s = time_s[inside_rows]
+        count = max(1, int(np.ceil((inside_s[-1] - inside_s[0]) / STRETCH_S)))
+        cuts = np.linspace(inside_s[0], inside_s[-1], count + 1)[1:-1]
+        for stretch_rows in np.split(inside_rows, np.searchsorted(inside_s, cuts)):
+            if len(stretch_rows) >= MIN_STRETCH_MEASUREMENTS:
+                rows_by_stretch.append(stretch_rows)
+                span = (
+                    time_s[stretch_rows[0]] - MAX_OFFSET_S,
+                    time_s[stretch_rows[-1]] + MAX_OFFSET_S,
+                )
+                if span not in signals:
+                    signals[span] = make_signals(imu, attitude, span)
+                stretch_signals.append(signals[span])
+    used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_stretch])
+    if len(used_rows) < MIN_MEASUREMENTS:
+        return missing_data("motion_few", count=len(used_rows), least=MIN_MEASUREMENTS)
+    edges = np.cumsum([0, *map(len, rows_by_stretch)])
     # from the first of each stretch, whose place nothing says: numbers stay small
-    measured = pd.DataFrame(measurement_m[row])
-    first = measured.groupby(np.repeat(np.arange(len(rows)), np.diff(edges))).transform("first")
+    measured = pd.DataFrame(measurement_m[used_rows])
+    first = measured.groupby(np.repeat(np.arange(len(rows_by_stretch)), np.diff(edges))).transform(
+        "first"
+    )
     return PreparedMotion(
-        time_s[row],
+        time_s[used_rows],
         (measured - first).to_numpy(),
-        np.ones(len(row)) if weight is None else weight[row],
+        np.ones(len(used_rows)) if weight is None else weight[used_rows],
         edges,
-        tuple(of_stretch),
+        tuple(stretch_signals),
         directions,
         dt_s,
         float(np.median(np.diff(imu_time))),
@@ -273,7 +286,7 @@ def motion(
     )
 
 
-def _covered(imu_time: Array, attitude_time: Array) -> list[tuple[float, float]]:
+def _covered_spans(imu_time: Array, attitude_time: Array) -> list[tuple[float, float]]:
     """Start and end of all that IMU and attitude cover; nothing where the IMU is too slow."""
     if len(imu_time) < 2 or np.median(np.diff(imu_time)) > MAX_IMU_INTERVAL_S:
         return []
@@ -283,47 +296,53 @@ def _covered(imu_time: Array, attitude_time: Array) -> list[tuple[float, float]]
     return list(zip(begins.tolist(), ends.tolist(), strict=True))
 
 
-def signals_of(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
+def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
     """Acceleration in NED by the gyros' attitude, and what each constant adds to it."""
     time = imu.index.to_numpy()
-    first, last = np.searchsorted(time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left")
-    inside, time = imu.iloc[first:last], time[first:last]
+    first_row, last_axis = np.searchsorted(
+        time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left"
+    )
+    samples, time = imu.iloc[first_row:last_axis], time[first_row:last_axis]
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    integral = cumulative_integral(inside[columns].to_numpy(), time)
+    integral = cumulative_integral(samples[columns].to_numpy(), time)
     edges = np.arange(time[0], time[-1], STEP_S)
-    read = np.column_stack([np.interp(edges, time, one) for one in integral.T])
-    force, angle = read[:, :3], read[:, 3:]
-    turn = _integrate_gyros(edges, angle, attitude)
+    integrals_at_edges = np.column_stack([np.interp(edges, time, column) for column in integral.T])
+    force, angle = integrals_at_edges[:, :3], integrals_at_edges[:, 3:]
+    attitude_quaternion = _integrate_gyros(edges, angle, attitude)
     # of each step, in its middle
     mean = np.diff(force, axis=0) / STEP_S
-    body_to_ned = matrix(multiply(turn[:-1], from_vector(np.diff(angle, axis=0) / 2.0)))
-    specific = np.einsum("nij,nj->ni", body_to_ned, mean)
+    body_to_ned = matrix(
+        multiply(attitude_quaternion[:-1], from_vector(np.diff(angle, axis=0) / 2.0))
+    )
+    force_ned = np.einsum("nij,nj->ni", body_to_ned, mean)
     table = np.zeros((len(mean), 3, 3, len(CONSTANT_SIGMA)))
-    position, velocity, value = np.moveaxis(table, 1, 0)
-    value[:, :, 0] = specific
-    value[:, 2, 0] += constants.g
+    position, velocity, acceleration = np.moveaxis(table, 1, 0)
+    acceleration[:, :, 0] = force_ned
+    acceleration[:, 2, 0] += constants.g
     # a small rotation θ of the attitude adds θ × f; a gyro bias b turns it by -∫ R b dt
-    turned = -STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
+    gyro_bias_rotation = -STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
-        after, last = (axis + 1) % 3, (axis + 2) % 3
-        value[:, after, 1 + axis] = -specific[:, last]
-        value[:, last, 1 + axis] = specific[:, after]
-        value[:, axis, 4:7] = turned[:, after] * specific[:, [last]]
-        value[:, axis, 4:7] -= turned[:, last] * specific[:, [after]]
-    value[:, :, 7:10] = -body_to_ned
-    np.cumsum(value[:-1] * STEP_S, axis=0, out=velocity[1:])
-    step = velocity[:-1] + value[:-1] * (STEP_S / 2.0)
-    np.cumsum(step * STEP_S, axis=0, out=position[1:])
+        next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3
+        acceleration[:, next_axis, 1 + axis] = -force_ned[:, last_axis]
+        acceleration[:, last_axis, 1 + axis] = force_ned[:, next_axis]
+        acceleration[:, axis, 4:7] = gyro_bias_rotation[:, next_axis] * force_ned[:, [last_axis]]
+        acceleration[:, axis, 4:7] -= gyro_bias_rotation[:, last_axis] * force_ned[:, [next_axis]]
+    acceleration[:, :, 7:10] = -body_to_ned
+    np.cumsum(acceleration[:-1] * STEP_S, axis=0, out=velocity[1:])
+    mean_velocity = velocity[:-1] + acceleration[:-1] * (STEP_S / 2.0)
+    np.cumsum(mean_velocity * STEP_S, axis=0, out=position[1:])
     return Signals(edges[:-1], table)
 
 
 def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Array:
     """Attitude (body to NED, w first) from the logged one at the start and the gyros alone."""
-    known = attitude.index.to_numpy()
-    near = slice(*np.clip(np.searchsorted(known, edges[0]) + np.array([-2, 3]), 0, len(known)))
-    logged = attitude.iloc[near][Columns.QUATERNION].to_numpy(copy=True)
-    at_start = np.clip(edges[0], known[near][0], known[near][-1])
-    slerp = Slerp(known[near], Rotation.from_quat(logged, scalar_first=True))
+    attitude_s = attitude.index.to_numpy()
+    near_rows = slice(
+        *np.clip(np.searchsorted(attitude_s, edges[0]) + np.array([-2, 3]), 0, len(attitude_s))
+    )
+    logged = attitude.iloc[near_rows][Columns.QUATERNION].to_numpy(copy=True)
+    at_start = np.clip(edges[0], attitude_s[near_rows][0], attitude_s[near_rows][-1])
+    slerp = Slerp(attitude_s[near_rows], Rotation.from_quat(logged, scalar_first=True))
     start = slerp(at_start).as_quat(scalar_first=True)
-    turned = running_product(from_vector(np.diff(angle, axis=0)))
-    return np.vstack([start, multiply(start, turned)])
+    rotation_since_start = running_product(from_vector(np.diff(angle, axis=0)))
+    return np.vstack([start, multiply(start, rotation_since_start)])

@@ -3,10 +3,10 @@
 import numpy as np
 
 from px4fuse.filter.kalman import Replay, as_replay
-from px4fuse.filter.model import INITIAL_COVARIANCE, predict, update
+from px4fuse.filter.model import INITIAL_COVARIANCE, predict_step, update_step
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import timeline
+from px4fuse.filter.steps import make_timeline
 
 
 def quick_replay(axis: Axis, settings: Settings) -> Replay:
@@ -22,7 +22,7 @@ def quick_replay(axis: Axis, settings: Settings) -> Replay:
     SettingsError
         As of the replay.
     """
-    line = timeline(axis, settings)
+    line = make_timeline(axis, settings)
     measured_m, r = axis.measurement_m.tolist(), settings.sigma_z_m**2
     p, v, covariance = measured_m[0], 0.0, INITIAL_COVARIANCE
     states, updates = [(p, v, *covariance)], []
@@ -33,11 +33,11 @@ def quick_replay(axis: Axis, settings: Settings) -> Replay:
         line.measurement[1:].tolist(),
         strict=True,
     ):
-        p, v, covariance = predict(p, v, covariance, a, q, dt)
+        p, v, covariance = predict_step(p, v, covariance, a, q, dt)
         if measurement >= 0:
             z = measured_m[measurement]
-            told, after = update(p, v, covariance, z, r)
-            updates.append((z, *told, p, covariance[0], covariance[2]))
-            p, v, covariance = after
+            innovation_and_gains, updated = update_step(p, v, covariance, z, r)
+            updates.append((z, *innovation_and_gains, p, covariance[0], covariance[2]))
+            p, v, covariance = updated
         states.append((p, v, *covariance))
     return as_replay(axis, settings, line, states, updates)

@@ -14,14 +14,14 @@ from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, BoolArray, cumulative_integral
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 
 AISLE = "aisle"
 # A track that is so many times longer than wide was flown along an aisle
-ELONGATED = 3.0
+MIN_AISLE_ELONGATION = 3.0
 # An IMU interval is a gap when it is longer than this and than five median intervals.
 IMU_GAP_S = 0.1
 IMU_GAP_INTERVALS = 5.0
@@ -38,8 +38,8 @@ class Segment:
 
     def cut(self, spans: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
         """What lies inside of some spans (s)."""
-        parts = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans)
-        return tuple((start, end) for start, end in parts if end > start)
+        clipped_spans = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans)
+        return tuple((start, end) for start, end in clipped_spans if end > start)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Acceleration:
     gap_integral_s: Array
     rms_m_s2: float
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
     def value_m_s2(self) -> Array:
@@ -108,14 +108,14 @@ class Axis:
     acceleration: Acceleration | Unavailable
     elongation: float | None = None
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
     def called(self) -> str:
         """What the axis is in a sentence; an aisle is what was flown as one, or asked for."""
         if self.name != AISLE:
             return self.name
-        flown = self.elongation is None or self.elongation >= ELONGATED
+        flown = self.elongation is None or self.elongation >= MIN_AISLE_ELONGATION
         return "the aisle" if flown else "the longest direction"
 
 
@@ -129,12 +129,12 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     -------
     DataFrame, shape (n, 3), m/s², or Unavailable
     """
-    if flight not in _MADE:
-        _MADE[flight] = _ned_acceleration(flight)
-    return _MADE[flight]
+    if flight not in _ACCELERATION_CACHE:
+        _ACCELERATION_CACHE[flight] = _ned_acceleration(flight)
+    return _ACCELERATION_CACHE[flight]
 
 
-_MADE: WeakKeyDictionary[Flight, pd.DataFrame | Unavailable] = WeakKeyDictionary()
+_ACCELERATION_CACHE: WeakKeyDictionary[Flight, pd.DataFrame | Unavailable] = WeakKeyDictionary()
 
 
 def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
@@ -145,7 +145,7 @@ def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     known = flight.attitude.index.to_numpy()
     imu = flight.imu[(flight.imu.index >= known[0]) & (flight.imu.index <= known[-1])]
     if len(imu) < 2:
-        return lacking("no_overlap")
+        return missing_data("no_overlap")
     quaternions = flight.attitude[Columns.QUATERNION].to_numpy(copy=True)
     rotations = Rotation.from_quat(quaternions, scalar_first=True)
     body_to_ned = Slerp(known, rotations)(imu.index.to_numpy())
@@ -201,36 +201,38 @@ def make_axes(
     """
     acceleration = ned_acceleration(flight)
     known = (*AXIS_NAMES, AISLE)
-    asked = tuple(dict.fromkeys(known if names is None else names))
+    axis_names = tuple(dict.fromkeys(known if names is None else names))
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
-    if unknown := [name for name in asked if name not in known]:
+    if unknown := [name for name in axis_names if name not in known]:
         raise SettingsError.of("axis_unknown", axis=unknown[0], known=", ".join(known))
-    where = f"{flight.log.name}: {track.name}"
+    source_label = f"{flight.log.name}: {track.name}"
     axes = []
-    for name in asked:
+    for name in axis_names:
         direction, heading, note, elongation = _direction(name, track, segment, heading_deg)
         samples = track.samples
         if name == "down" and track.barometer is not None:
             samples = track.barometer.reindex(columns=Columns.POSITION)
         samples = within(samples, segment)
         projected = along(samples, Columns.POSITION, direction)
-        finite = np.isfinite(projected)
-        if np.count_nonzero(finite) < MIN_MEASUREMENTS:
+        is_finite = np.isfinite(projected)
+        if np.count_nonzero(is_finite) < MIN_MEASUREMENTS:
             if names is None:
                 continue
-            raise MissingDataError(f"{where} has no position along {name} in this segment.")
-        pushed = project_acceleration(acceleration, direction, segment)
-        measured = samples.index.to_numpy()[finite], projected[finite]
-        axes.append(Axis(name, direction, heading, note, *measured, pushed, elongation))
+            raise MissingDataError(f"{source_label} has no position along {name} in this segment.")
+        projected_acceleration = project_acceleration(acceleration, direction, segment)
+        measurements = samples.index.to_numpy()[is_finite], projected[is_finite]
+        axes.append(
+            Axis(name, direction, heading, note, *measurements, projected_acceleration, elongation)
+        )
     if not axes:
-        raise MissingDataError(f"{where} has no finite position in this segment.")
+        raise MissingDataError(f"{source_label} has no finite position in this segment.")
     return tuple(axes)
 
 
-def too_few(what: str, count: int, least: int) -> Unavailable:
+def too_few_measurements(what: str, count: int, least: int) -> Unavailable:
     """What stands in for an estimate from so few measurements."""
-    return lacking("measurements_few", what=what, count=count, least=least)
+    return missing_data("measurements_few", what=what, count=count, least=least)
 
 
 def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
@@ -247,8 +249,8 @@ def _direction(
 ) -> tuple[Array, float | None, str, float | None]:
     elongation = None
     if name != AISLE:
-        at = AXIS_NAMES.index(name)
-        return np.eye(3)[at], (None if name == "down" else 90.0 * at), "", None
+        axis_index = AXIS_NAMES.index(name)
+        return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), "", None
     if heading_deg is None:
         heading, elongation = aisle_heading(track, segment)
         note = f"horizontal principal direction, {elongation:.1f} times longer than wide"
@@ -277,7 +279,7 @@ def project_acceleration(
     value = ned @ direction
     inside = (time >= segment.start_s) & (time <= segment.end_s)
     if np.count_nonzero(inside) < 2:
-        return lacking("imu_outside_segment")
+        return missing_data("imu_outside_segment")
     is_gap = imu_gaps(time)
     gap, passed_s = np.flatnonzero(is_gap), np.cumsum(np.where(is_gap, np.diff(time), 0.0))
     ends = np.unique([0, *gap, *(gap + 1), len(time) - 1])

@@ -37,7 +37,7 @@ class Timeline:
     input_gap_s: float
 
 
-def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
+def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
     """Lay out the filter's steps.
 
     Raises
@@ -46,33 +46,33 @@ def timeline(axis: Axis, settings: Settings, initial: InitialState | None = None
         ``settings.input`` is "imu" and the axis has no acceleration, or no measurement follows
         the start.
     """
-    first = axis.measurement_time_s[0] if initial is None else initial.time_s
-    usable = axis.measurement_time_s > first + SAME_TIME_S
-    measured = axis.measurement_time_s[usable]
-    if not len(measured):
-        raise SettingsError(f"axis {axis.name}: no measurement after the start at {first:.2f} s.")
-    count = int(np.floor((measured[-1] - first) / settings.dt_s + 1e-9)) + 1
-    grid = first + settings.dt_s * np.arange(count)
+    start_s = axis.measurement_time_s[0] if initial is None else initial.time_s
+    is_usable = axis.measurement_time_s > start_s + SAME_TIME_S
+    measured_s = axis.measurement_time_s[is_usable]
+    if not len(measured_s):
+        raise SettingsError(f"axis {axis.name}: no measurement after the start at {start_s:.2f} s.")
+    count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
+    grid = start_s + settings.dt_s * np.arange(count)
     # a grid time that coincides with a measurement gives way to the measurement's own stamp
-    nearest = measured[np.clip(np.searchsorted(measured, grid), 0, len(measured) - 1)]
-    before = measured[np.clip(np.searchsorted(measured, grid) - 1, 0, len(measured) - 1)]
-    distance = np.minimum(np.abs(nearest - grid), np.abs(before - grid))
-    time = np.union1d(grid[distance > SAME_TIME_S], measured)
-    if time[0] > first + SAME_TIME_S:
-        time = np.concatenate([[first], time])
+    nearest = measured_s[np.clip(np.searchsorted(measured_s, grid), 0, len(measured_s) - 1)]
+    previous = measured_s[np.clip(np.searchsorted(measured_s, grid) - 1, 0, len(measured_s) - 1)]
+    distance = np.minimum(np.abs(nearest - grid), np.abs(previous - grid))
+    time = np.union1d(grid[distance > SAME_TIME_S], measured_s)
+    if time[0] > start_s + SAME_TIME_S:
+        time = np.concatenate([[start_s], time])
     measurement = np.full(len(time), -1, dtype=np.intp)
-    measurement[np.searchsorted(time, measured)] = np.flatnonzero(usable)
-    steps = len(time) - 1
+    measurement[np.searchsorted(time, measured_s)] = np.flatnonzero(is_usable)
+    step_count = len(time) - 1
     if settings.input == "zero":
-        return Timeline(time, measurement, np.zeros(steps), np.zeros(steps), 0.0)
+        return Timeline(time, measurement, np.zeros(step_count), np.zeros(step_count), 0.0)
     if isinstance(axis.acceleration, Unavailable):
         raise SettingsError("`input` imu needs an acceleration", f"{axis.acceleration}")
     mean, gap = step_means(axis.acceleration, time)
     gap_s = gap * np.diff(time)
     # Unknown acceleration persists through a gap: after T seconds it has moved the velocity by
     # rms·T, not by the rms·√(DT·T) of white noise, so its variance is scaled by T/DT.
-    leg = np.searchsorted(np.flatnonzero(measurement >= 0), np.arange(1, len(time)))
-    gap_of_leg = np.bincount(leg, weights=gap_s)[leg]
-    persistence = np.maximum(gap_of_leg / settings.dt_s, 1.0)
+    interval_index = np.searchsorted(np.flatnonzero(measurement >= 0), np.arange(1, len(time)))
+    gap_of_interval = np.bincount(interval_index, weights=gap_s)[interval_index]
+    persistence = np.maximum(gap_of_interval / settings.dt_s, 1.0)
     variance = gap * persistence * axis.acceleration.rms_m_s2**2
     return Timeline(time, measurement, mean, variance, float(np.sum(gap_s)))

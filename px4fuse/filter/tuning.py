@@ -17,40 +17,40 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
     SIGMA_Z_SEARCH_M,
     NoiseFit,
     Noises,
-    filter_part,
-    most_likely,
+    filter_positions,
+    maximise_likelihood,
 )
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
     preintegrate,
     profile_ends,
-    total_over_grid,
+    score_grid,
 )
-from px4fuse.filter.motion import SignalCache, motion
+from px4fuse.filter.motion import SignalCache, prepare_motion
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, too_few
+from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.record import Count, Maybe, NotNegative, Record, lacking
+from px4fuse.record import Count, NotNegative, OrUnavailable, Record, missing_data
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
-GRID = 40
+GRID_SIZE = 40
 # The map reaches as many standard deviations to either side
 MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
-FIRST_WALK_M = 0.02
+START_WALK_M = 0.02
 # A value this near to the end of its search lies there
-AT_END = 1.001
+SEARCH_END_RATIO = 1.001
 
 
 class Noise(Record, frozen=True):
@@ -71,14 +71,14 @@ class Noise(Record, frozen=True):
 
     @classmethod
     def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """As :class:`Tuned` writes it."""
+        """As :class:`NoiseEstimate` writes it."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
-    def named(self, name: str) -> dict[str, Any]:
-        """As :class:`Tuned` writes it: value and interval under a name."""
-        known = self.low is not None or self.high is not None
-        interval = (self.low or 0.0, self.high) if known else None
+    def as_fields(self, name: str) -> dict[str, Any]:
+        """As :class:`NoiseEstimate` writes it: value and interval under a name."""
+        is_bounded = self.low is not None or self.high is not None
+        interval = (self.low or 0.0, self.high) if is_bounded else None
         return {name: self.value, f"{name}_interval": interval}
 
 
@@ -90,10 +90,10 @@ class LikelihoodMap:
     sigma_z_m: Array
     drop: Array
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-class HeldOut(Record, frozen=True):
+class HeldOutCheck(Record, frozen=True):
     """Settings found on the first half, scored on the second.
 
     Attributes
@@ -113,7 +113,7 @@ class HeldOut(Record, frozen=True):
     gain_nats: float
 
 
-class Tuned(Record, frozen=True, kw_only=True):
+class NoiseEstimate(Record, frozen=True, kw_only=True):
     """The noises of one axis, or of the horizontal axes together, with 95 % intervals.
 
     A value is None where the likelihood has its maximum at an end of the search: then the interval
@@ -147,11 +147,11 @@ class Tuned(Record, frozen=True, kw_only=True):
     sigma_z_m: NotNegative | None = None
     sigma_z_m_interval: NoiseInterval | None = None
     gain_nats: float
-    before: Maybe[Consistency]
-    after: Maybe[Consistency]
+    before: OrUnavailable[Consistency]
+    after: OrUnavailable[Consistency]
     count: Count
     outliers: Count
-    held_out: Maybe[HeldOut]
+    held_out: OrUnavailable[HeldOutCheck]
     biases_fitted: bool
 
     @property
@@ -170,8 +170,8 @@ class Tuned(Record, frozen=True, kw_only=True):
         return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
 
 
-class AxisTuning(Tuned, frozen=True, kw_only=True, eq=False, dict=True):
-    """:class:`Tuned`, with what it was found from.
+class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
+    """:class:`NoiseEstimate`, with what it was found from.
 
     Attributes
     ----------
@@ -183,13 +183,13 @@ class AxisTuning(Tuned, frozen=True, kw_only=True, eq=False, dict=True):
         Makes :attr:`map`, which takes as long as a fit and is seldom looked at.
     """
 
-    written_as = Tuned
+    schema_type = NoiseEstimate
     name: str
     outlier_time_s: Array
     noises: Noises
     make_map: Callable[[], LikelihoodMap]
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @cached_property
     def map(self) -> LikelihoodMap:
@@ -230,9 +230,11 @@ def tune(
     """
     groups: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
     if {"north", "east"} <= groups.keys():
-        pair = (*groups["north"], *groups["east"])
-        if np.array_equal(pair[0].measurement_time_s, pair[1].measurement_time_s):
-            groups[HORIZONTAL] = pair
+        horizontal_axes = (*groups["north"], *groups["east"])
+        if np.array_equal(
+            horizontal_axes[0].measurement_time_s, horizontal_axes[1].measurement_time_s
+        ):
+            groups[HORIZONTAL] = horizontal_axes
     tuned = {}
     signals = {} if signals is None else signals
     for name, group in groups.items():
@@ -266,131 +268,161 @@ def tune_axes(
     signals : dict, optional
         As :func:`px4fuse.filter.motion.motion` has it.
     """
-    legs = [preintegrate(axis, settings) for axis in axes]
-    count = len(legs[0].measurement_m)
+    intervals = [preintegrate(axis, settings) for axis in axes]
+    count = len(intervals[0].measurement_m)
     if count < MIN_MEASUREMENTS:
-        return too_few(f"tuning, {name}", count, MIN_MEASUREMENTS)
-    parts = [filter_part(leg) for leg in legs]
-    chosen = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
-    alone = most_likely(parts, chosen, np.ones(count))
-    found = None  # with the IMU's constants and the clock offset taken out
+        return too_few_measurements(f"tuning, {name}", count, MIN_MEASUREMENTS)
+    axis_positions = [filter_positions(interval_input) for interval_input in intervals]
+    chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
+    two_state_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(count))
+    motion_fit = None  # with the IMU's constants and the clock offset taken out
     if flight is not None and settings.input == "imu":
-        measured = np.column_stack([axis.measurement_m for axis in axes])
+        measured_m = np.column_stack([axis.measurement_m for axis in axes])
         # the filter starts at the first measurement, which it does not weigh
-        weight = np.concatenate([np.ones(len(measured) - count), alone.weight])
-        along = np.array([axis.direction for axis in axes])
+        weight = np.concatenate([np.ones(len(measured_m) - count), two_state_fit.weight])
+        axis_directions = np.array([axis.direction for axis in axes])
         time_s, dt_s = axes[0].measurement_time_s, settings.dt_s
-        moved = motion(
-            flight, time_s, measured, directions=along, dt_s=dt_s, weight=weight, signals=signals
+        prepared_motion = prepare_motion(
+            flight,
+            time_s,
+            measured_m,
+            directions=axis_directions,
+            dt_s=dt_s,
+            weight=weight,
+            signals=signals,
         )
-        if not isinstance(moved, Unavailable):
-            start = replace(alone.noises, walk_m=FIRST_WALK_M if drifts else 0.0)
+        if not isinstance(prepared_motion, Unavailable):
+            start_noises = replace(two_state_fit.noises, walk_m=START_WALK_M if drifts else 0.0)
             # the clock offset is a nuisance here: a rough one is enough
-            offset, start = moved.search(start, SIGMA_A_FACTORS, scaled=False)
-            found = most_likely([moved.at(offset)], start, moved.weight)
-    best = alone if found is None else found
-    skip = alone.outlier > 0.5
+            offset_s, start_noises = prepared_motion.search(
+                start_noises, SIGMA_A_FACTORS, scaled=False
+            )
+            motion_fit = maximise_likelihood(
+                [prepared_motion.at(offset_s)], start_noises, prepared_motion.weight
+            )
+    best_fit = two_state_fit if motion_fit is None else motion_fit
+    skip = two_state_fit.outlier_probability > 0.5
     if np.mean(skip) > MAX_OUTLIER_SHARE:
-        return lacking("tuning_outliers", name=name, share=np.mean(skip))
-    sigma_a, sigma_z = (_noise(best, which) for which in (0, 1))
-    at_z = sigma_z.value or sigma_z.high or best.noises.sigma_z_m
-    needed = sigma_a if found is None else _needed(alone, at_z)
-    if found is None and flight is not None and settings.input == "imu":
+        return missing_data("tuning_outliers", name=name, share=np.mean(skip))
+    sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
+    final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noises.sigma_z_m
+    two_state_sigma_a = (
+        sigma_a if motion_fit is None else _two_state_sigma_a(two_state_fit, final_sigma_z_m)
+    )
+    if motion_fit is None and flight is not None and settings.input == "imu":
         # the noise alone is not told; with what else the filter has to cover it is this
-        sigma_a = Noise(None, None, needed.high)
-    after = Noises(needed.value or needed.high or alone.noises.sigma_a_m_s2, at_z)
-    gain = alone.score(chosen) - alone.score(after)
+        sigma_a = Noise(None, None, two_state_sigma_a.high)
+    after = Noises(
+        two_state_sigma_a.value or two_state_sigma_a.high or two_state_fit.noises.sigma_a_m_s2,
+        final_sigma_z_m,
+    )
+    gain = two_state_fit.score(chosen_noises) - two_state_fit.score(after)
     return AxisTuning(
         name=name,
-        **sigma_a.named("sigma_a_m_s2"),
-        **sigma_z.named("sigma_z_m"),
-        **needed.named("filter_sigma_a_m_s2"),
+        **sigma_a.as_fields("sigma_a_m_s2"),
+        **sigma_z.as_fields("sigma_z_m"),
+        **two_state_sigma_a.as_fields("filter_sigma_a_m_s2"),
         gain_nats=gain / count,
-        before=_assess(legs[0], chosen, skip),
-        after=_assess(legs[0], after, skip),
+        before=_assess_innovations(intervals[0], chosen_noises, skip),
+        after=_assess_innovations(intervals[0], after, skip),
         outlier_time_s=axes[0].measurement_time_s[-count:][skip],
         count=count,
         outliers=int(np.count_nonzero(skip)),
-        held_out=_hold_out(name, legs, chosen, alone),
-        noises=best.noises,
-        biases_fitted=found is not None,
-        make_map=partial(_map, legs, alone.weight, needed, sigma_z, after),
+        held_out=_hold_out(name, intervals, chosen_noises, two_state_fit),
+        noises=best_fit.noises,
+        biases_fitted=motion_fit is not None,
+        make_map=partial(
+            _make_map, intervals, two_state_fit.weight, two_state_sigma_a, sigma_z, after
+        ),
     )
 
 
-def _noise(best: NoiseFit, which: int) -> Noise:
+def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
     """Value and 95 % interval of SIGMA_A (0) or SIGMA_Z (1), the other one maximised out."""
-    values = best.noises.sigma_a_m_s2, best.noises.sigma_z_m
+    values = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
-        pair = (log_value, log_other) if which == 0 else (log_other, log_value)
+        pair = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
         sigma_a, sigma_z = np.exp(pair).tolist()
-        return best.score(Noises(sigma_a, sigma_z, best.noises.walk_m))
+        return fit.score(Noises(sigma_a, sigma_z, fit.noises.walk_m))
 
-    search = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[which]
-    widening = (1.0, best.widening)[which]
-    return _bounded(score, (np.log(values[which]), np.log(values[1 - which])), search, widening)
+    search = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[noise_index]
+    widening = (1.0, fit.widening)[noise_index]
+    return _noise_with_interval(
+        score, (np.log(values[noise_index]), np.log(values[1 - noise_index])), search, widening
+    )
 
 
-def _needed(found: NoiseFit, sigma_z: float) -> Noise:
+def _two_state_sigma_a(fit: NoiseFit, sigma_z: float) -> Noise:
     """SIGMA_A of the two-state filter at a SIGMA_Z, with its 95 % interval."""
 
     def score(log_a: float, _: float = 0.0) -> float:
-        return found.score(Noises(float(np.exp(log_a)), sigma_z))
+        return fit.score(Noises(float(np.exp(log_a)), sigma_z))
 
     low, high = np.log(SIGMA_A_SEARCH_M_S2)
-    at = float(minimize_scalar(score, bounds=(low, high), options={"xatol": 1e-3}).x)
-    return _bounded(score, (at, 0.0), SIGMA_A_SEARCH_M_S2)
+    best_log_a = float(minimize_scalar(score, bounds=(low, high), options={"xatol": 1e-3}).x)
+    return _noise_with_interval(score, (best_log_a, 0.0), SIGMA_A_SEARCH_M_S2)
 
 
-def _bounded(
+def _noise_with_interval(
     score: Callable[[float, float], float],
-    best: tuple[float, float],
+    best_logs: tuple[float, float],
     search: tuple[float, float],
     widening: float = 1.0,
 ) -> Noise:
     """A noise with its interval; without a value where that has its best at an end."""
-    value = float(np.exp(best[0]))
-    low, high = profile_ends(score, best, search, widening)
-    inside = search[0] * AT_END < value < search[1] / AT_END
-    closed = low is not None and high is not None
-    return Noise(value if inside and closed else None, low, high)
+    value = float(np.exp(best_logs[0]))
+    low, high = profile_ends(score, best_logs, search, widening)
+    is_inside = search[0] * SEARCH_END_RATIO < value < search[1] / SEARCH_END_RATIO
+    is_closed = low is not None and high is not None
+    return Noise(value if is_inside and is_closed else None, low, high)
 
 
-def _map(
-    legs: list[Preintegrated], weight: Array, sigma_a: Noise, sigma_z: Noise, best: Noises
+def _make_map(
+    intervals: list[Preintegrated],
+    weight: Array,
+    sigma_a: Noise,
+    sigma_z: Noise,
+    best_noises: Noises,
 ) -> LikelihoodMap:
     """Likelihood of the two-state filter all around its optimum."""
     grids = []
-    for noise, at, (low, high) in (
-        (sigma_a, best.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
-        (sigma_z, best.sigma_z_m, SIGMA_Z_SEARCH_M),
+    for noise, best_value, (low, high) in (
+        (sigma_a, best_noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
+        (sigma_z, best_noises.sigma_z_m, SIGMA_Z_SEARCH_M),
     ):
-        below, above = noise.low or low, noise.high or high
-        reach = MAP_SIGMAS / 1.96
-        ends = at * (below / at) ** reach, at * (above / at) ** reach
-        grids.append(np.geomspace(max(ends[0], low), min(ends[1], high), GRID))
-    a, z = grids
-    total = total_over_grid(legs, a[:, None], z[None, :], weight)
-    return LikelihoodMap(a, z, total - total.min())
+        lower, upper = noise.low or low, noise.high or high
+        width_factor = MAP_SIGMAS / 1.96
+        ends = (
+            best_value * (lower / best_value) ** width_factor,
+            best_value * (upper / best_value) ** width_factor,
+        )
+        grids.append(np.geomspace(max(ends[0], low), min(ends[1], high), GRID_SIZE))
+    sigma_a_grid, sigma_z_grid = grids
+    total = score_grid(intervals, sigma_a_grid[:, None], sigma_z_grid[None, :], weight)
+    return LikelihoodMap(sigma_a_grid, sigma_z_grid, total - total.min())
 
 
-def _assess(legs: Preintegrated, noises: Noises, skip: BoolArray) -> Consistency | Unavailable:
-    nu, s = innovations(legs, noises.sigma_a_m_s2, noises.sigma_z_m, skip)
+def _assess_innovations(
+    intervals: Preintegrated, noises: Noises, skip: BoolArray
+) -> Consistency | Unavailable:
+    nu, s = innovations(intervals, noises.sigma_a_m_s2, noises.sigma_z_m, skip)
     return assess(nu[~skip], s[~skip])
 
 
 def _hold_out(
-    name: str, legs: list[Preintegrated], chosen: Noises, found: NoiseFit
-) -> HeldOut | Unavailable:
+    name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
+) -> HeldOutCheck | Unavailable:
     """Tune on the first half, score on the second."""
-    half = len(found.weight) // 2
+    half = len(fit.weight) // 2
     if half < MIN_MEASUREMENTS:
-        return lacking("held_out_few", name=name, half=half, least=MIN_MEASUREMENTS)
-    part = [filter_part(leg.first(half)) for leg in legs]
-    first = most_likely(part, found.noises, found.weight[:half], outliers=False)
-    tuned = first.noises
+        return missing_data("held_out_few", name=name, half=half, least=MIN_MEASUREMENTS)
+    first_half = [filter_positions(interval_input.first(half)) for interval_input in intervals]
+    first = maximise_likelihood(first_half, fit.noises, fit.weight[:half], outliers=False)
+    tuned_noises = first.noises
     # of the second half given the first
-    scores = [found.score(noises) - first.score(noises) for noises in (chosen, tuned)]
-    count = len(found.weight) - half
-    return HeldOut(tuned.sigma_a_m_s2, tuned.sigma_z_m, count, (scores[0] - scores[1]) / count)
+    scores = [fit.score(noises) - first.score(noises) for noises in (chosen_noises, tuned_noises)]
+    count = len(fit.weight) - half
+    return HeldOutCheck(
+        tuned_noises.sigma_a_m_s2, tuned_noises.sigma_z_m, count, (scores[0] - scores[1]) / count
+    )

@@ -31,7 +31,7 @@ from px4fuse.findings import (
     source_positions,
     source_stamps,
 )
-from px4fuse.findings.causes import by_cause
+from px4fuse.findings.causes import group_by_cause
 from px4fuse.findings.model import NAMES, Finding, Found, Severity, by_root
 from px4fuse.loop.model import Loop
 
@@ -69,23 +69,23 @@ def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
         A comparison is explained first, which takes some seconds.
     """
     analysis = subject if isinstance(subject, Analysis) else explain(subject)
-    return by_cause(found for detect in DETECTORS for found in detect(analysis))
+    return group_by_cause(found for detect in DETECTORS for found in detect(analysis))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
     """All findings about a loop, most severe first."""
-    return by_cause(loops.find_in(loop))
+    return group_by_cause(loops.find_in(loop))
 
 
 def find_aids(results: Mapping[str, AidResult]) -> tuple[Finding, ...]:
     """All findings about EKF2's aids alone, most severe first."""
-    return by_cause(aids.find_in(results))
+    return group_by_cause(aids.find_in(results))
 
 
-def named(finding: str) -> str:
+def finding_title(finding: str) -> str:
     """A finding as part of a sentence; one that this version does not know by its id.
 
-    >>> named("source_gap"), named("of_a_later_version")
+    >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('a time without positions', 'of a later version')
     """
     return NAMES.get(finding, finding.replace("_", " "))

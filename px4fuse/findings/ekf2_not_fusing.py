@@ -3,7 +3,7 @@
 from typing import Any
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.findings.model import Found, error, share_on, spans_at, warning
+from px4fuse.findings.model import Found, error, fraction_on, spans_at, warning
 from px4fuse.flight import Ekf2, FusionRecord, Unavailable
 
 FUSING_SHARE_ERROR = 0.5  # of the segment: below, EKF2's track is mostly not the source's
@@ -19,21 +19,21 @@ def detect(analysis: Comparison) -> Found:
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
         return
     fusing = ekf2.fusing["horizontal"]
-    share = share_on(fusing, segment)
+    share = fraction_on(fusing, segment)
     evidence = {"fusing_share": share, "source_interval_s": 1.0 / source.rate_hz}
     if not source.origin.is_vision:
         if source.name == "vehicle_mocap_odometry" and share == 0.0:
             yield warning("ekf2_not_fusing", {"fusing_share": share}, case="mocap")
     elif share < FUSING_SHARE_ERROR:
-        why, facts = _cause(analysis, ekf2)
-        told = "seldom" if share else "never"
-        yield error("ekf2_not_fusing", evidence, case=why, headline=told, **facts)
+        case_name, facts = _find_cause(analysis, ekf2)
+        frequency = "seldom" if share else "never"
+        yield error("ekf2_not_fusing", evidence, case=case_name, headline=frequency, **facts)
     elif share < FUSING_SHARE_WARNING:
         spans = spans_at(0.0, fusing, segment)
         yield warning("ekf2_fusion_interrupted", evidence, spans, stop_s=EV_STOP_INTERVAL_S)
 
 
-def _cause(analysis: Comparison, ekf2: Ekf2) -> tuple[str, dict[str, Any]]:
+def _find_cause(analysis: Comparison, ekf2: Ekf2) -> tuple[str, dict[str, Any]]:
     """Why EKF2 does not fuse the source, in the word of its text and remedy, and their facts."""
     parameters, interval_s = analysis.flight.log.parameters, 1.0 / analysis.source.rate_hz
     control = parameters.get("EKF2_EV_CTRL")
@@ -42,8 +42,14 @@ def _cause(analysis: Comparison, ekf2: Ekf2) -> tuple[str, dict[str, Any]]:
         switch, bit, of = "EKF2_AID_MASK", 3, "vision position"
     value = parameters.get(switch)
     if value is not None and not int(value) >> bit & 1:
-        asked = int(value) | 1 << bit
-        return "off", {"switch": switch, "value": value, "bit": bit, "of": of, "asked": asked}
+        wanted_value = int(value) | 1 << bit
+        return "off", {
+            "switch": switch,
+            "value": value,
+            "bit": bit,
+            "of": of,
+            "asked": wanted_value,
+        }
     horizon_s, age_s = ekf2.horizon_s, _age_s(analysis, ekf2)
     if isinstance(horizon_s, float) and age_s > horizon_s + MAX_LATE_S:
         return "late", {"age_s": age_s, "horizon_s": horizon_s}

@@ -7,14 +7,14 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.interventions import cause_of
 from px4fuse.ekf2_parameters import GNSS_POS, Aid
 from px4fuse.findings.model import Finding, Found, finding, moments
-from px4fuse.findings.since import ekf2_cure_words
+from px4fuse.findings.since import format_remedy_of_ekf2
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # of the innovations; 5 σ rejects 6e-7 when consistent
 REJECTED_SHARE_ERROR = 0.20  # of the innovations: one in five, R or the clock is wrong
 
 
-def in_order(aid: Aid) -> str:
+def default_remedy(aid: Aid) -> str:
     """What to do where no replay tells what helps."""
     return (
         f"First make {aid.noise} the source's own noise, then remove outliers"
@@ -42,9 +42,10 @@ def _narrow_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Found:
                 rejections[0].severity,
                 "ekf2_gate_small",
                 {"gate": ekf2.gate, "rejected_by_gate": must},
-                name_of_gate=aid.gate, default=aid.default_gate,
+                name_of_gate=aid.gate,
+                default=aid.default_gate,
                 rejected=rejections[0].evidence["rejected_share"],
-            )  # fmt: skip
+            )
 
 
 def _rejections(analysis: Analysis) -> Found:
@@ -61,17 +62,19 @@ def _rejections(analysis: Analysis) -> Found:
                 "error" if share >= REJECTED_SHARE_ERROR else "warning",
                 "ekf2_rejecting",
                 {"rejected_share": share, "count": len(frame), "axis": name},
-                moments(known.index[known > 0.0]), down=name == "down", gate=ekf2.gate,
+                moments(known.index[known > 0.0]),
+                down=name == "down",
+                gate=ekf2.gate,
                 remedy=_remedy(analysis, name),
-            )  # fmt: skip
+            )
 
 
 def _remedy(analysis: Analysis, axis: str) -> str:
     """What puts the cause of the innovations right, which the gate is there for."""
-    order, model = in_order(remedy.aid_of(analysis, axis)), analysis.ekf2_model
+    order, model = default_remedy(remedy.aid_of(analysis, axis)), analysis.ekf2_model
     if axis == "down":
         return order
     if isinstance(model, Unavailable):
-        return f"{order} {remedy.not_replayed(model)}"
+        return f"{order} {remedy.format_not_replayed(model)}"
     cause = cause_of(analysis.causes, "ekf2", axis)
-    return order if cause is None else ekf2_cure_words(analysis, cause)
+    return order if cause is None else format_remedy_of_ekf2(analysis, cause)

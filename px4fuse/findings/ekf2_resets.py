@@ -4,7 +4,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.projection import continuous_state
-from px4fuse.findings.model import Found, finding, moments, times, warning
+from px4fuse.findings.model import Found, finding, format_count, moments, warning
 from px4fuse.flight import Ekf2
 
 
@@ -14,9 +14,10 @@ def detect(analysis: Analysis) -> Found:
     if not isinstance(ekf2, Ekf2):
         return
     inside = [
-        r for r in ekf2.resets
+        r
+        for r in ekf2.resets
         if segment.start_s < r.time_s <= segment.end_s and r.quantity == "position" and any(r.delta)
-    ]  # fmt: skip
+    ]
     if inside:
         sizes = [float(np.linalg.norm(r.delta)) for r in inside]
         at_s = inside[int(np.argmax(sizes))].time_s
@@ -26,12 +27,15 @@ def detect(analysis: Analysis) -> Found:
             "warning" if horizontal else "info",
             "ekf2_resets",
             {"count": len(inside), "largest_m": max(sizes), "at_s": at_s},
-            moments(r.time_s for r in inside), often=times(len(inside)), treated=treated,
-            horizontal=horizontal, part=0 < horizontal < len(inside),
+            moments(r.time_s for r in inside),
+            often=format_count(len(inside)),
+            treated=treated,
+            horizontal=horizontal,
+            part=0 < horizontal < len(inside),
             case=horizontal > 0,
-        )  # fmt: skip
+        )
     switches = [time for time, _ in ekf2.instances if segment.start_s < time <= segment.end_s]
     if switches:
         evidence = {"count": len(switches), "at_s": switches[0]}
-        often = times(len(switches))
+        often = format_count(len(switches))
         yield warning("ekf2_instance_switch", evidence, moments(switches), often=often)

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.causes import BIAS_M_S2, Explained
+from px4fuse.filter.causes import MIN_BIAS_M_S2, BiasScaleJumpFit
 from px4fuse.filter.signals import Segment, imu_gaps, within
 from px4fuse.findings.model import MOMENT_S, Found, finding, warning
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
@@ -16,7 +16,7 @@ IMU_GAP_TOTAL_S = 0.2  # two prediction steps
 MIN_IMU_RATE_HZ = 50.0  # 5 IMU samples per DT of 0.1 s, and 10 with margin for aliasing
 MIN_ATTITUDE_RATE_HZ = 10.0  # PX4's default is 20 Hz; slerp bridges 0.1 s of a tilt
 MAX_CLIPPED_S = 0.1  # a prediction step; a touch-down clips a sample or two
-CLIPPED_APART_S = 2.0  # clipped samples further apart are told as two times
+MIN_CLIPPING_PAUSE_S = 2.0  # clipped samples further apart are told as two times
 RATE_MARGIN = 0.98  # a stream set to a rate runs a little below it
 
 
@@ -36,20 +36,27 @@ def bias(analysis: Analysis) -> Found:
     innovations in a way that nothing else does. EKF2's stands in where there is none, and for the
     down axis.
     """
-    found, of_ekf2 = analysis.explained, _ekf2_bias(analysis)
-    if isinstance(found, Explained) and found.biased:
+    found, of_ekf2 = analysis.bias_scale_jump_fit, _ekf2_bias(analysis)
+    if isinstance(found, BiasScaleJumpFit) and found.has_bias:
         forward, right, size = found.forward_bias, found.right_bias, found.bias.value
         yield finding(
             "error" if size >= BIAS_ERROR_M_S2 else "warning",
             "accelerometer_bias",
             {"bias_m_s2": size, "sigma_m_s2": found.bias.sigma},
-            case=True, forward=forward.value, right=right.value, within=1.96 * forward.sigma,
-            tilt_deg=size * TILT_DEG_PER_M_S2, ekf2=of_ekf2, and_ekf2=of_ekf2 is not None,
-        )  # fmt: skip
+            case=True,
+            forward=forward.value,
+            right=right.value,
+            within=1.96 * forward.sigma,
+            tilt_deg=size * TILT_DEG_PER_M_S2,
+            ekf2=of_ekf2,
+            and_ekf2=of_ekf2 is not None,
+        )
     elif of_ekf2 is not None:
         # horizontally ours is the better estimate, where there is one
-        size = float(np.linalg.norm(of_ekf2[2:] if isinstance(found, Explained) else of_ekf2))
-        if size >= BIAS_M_S2:
+        size = float(
+            np.linalg.norm(of_ekf2[2:] if isinstance(found, BiasScaleJumpFit) else of_ekf2)
+        )
+        if size >= MIN_BIAS_M_S2:
             yield warning("accelerometer_bias", {"bias_m_s2": size}, case=False, ekf2=of_ekf2)
 
 
@@ -64,7 +71,7 @@ def _ekf2_bias(analysis: Analysis) -> list[float] | None:
 
 def tumbling(analysis: Analysis) -> Found:
     """PX4's failure detector found the attitude beyond its limits."""
-    if spans := analysis.segment.cut(analysis.flight.tumbled):
+    if spans := analysis.segment.cut(analysis.flight.tumble_spans):
         yield finding(
             "error",
             "vehicle_tumbled",
@@ -83,7 +90,7 @@ def clipping(analysis: Analysis) -> Found:
     time_s = inside.index[inside["clipped"] > 0.0].to_numpy()
     total_s = len(time_s) / sample_rate(imu)
     if total_s > MAX_CLIPPED_S:
-        bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > CLIPPED_APART_S) + 1)
+        bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1)
         yield warning(
             "accelerometer_clipped",
             {"count": len(time_s), "total_s": total_s},
@@ -99,12 +106,12 @@ def gaps(analysis: Analysis) -> Found:
         yield warning(
             "imu_gap",
             {"total_s": gap_s},
-            _spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else (),
+            _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else (),
             recorded=analysis.flight.log.format.startswith("MAVLink"),
         )
 
 
-def _spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
+def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
     """From when to when the IMU is missing, at the ends of the segment too."""
     time_s = imu.index.to_numpy()
     gap = imu_gaps(time_s)

@@ -5,7 +5,7 @@ from px4fuse.findings.model import Finding, Found, error, info, warning
 from px4fuse.loop.model import LANDING, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-MOST = 0.5  # of several closures more are true than false
+MAX_DROPPED_SHARE = 0.5  # of several closures more are true than false
 EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
 DOUBTFUL_WEIGHT = 0.5  # GNC ends at 0 or 1 (Yang et al. 2020)
 
@@ -26,12 +26,12 @@ def closures(loop: Loop) -> Found:
     """Closures that the drift cannot explain, or that the others contradict."""
     weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
     dropped = sum(weight < DOUBTFUL_WEIGHT for weight in weights)
-    most = dropped > MOST * len(weights)
+    most = dropped > MAX_DROPPED_SHARE * len(weights)
     if most:
         yield warning("loop_drift_understated", {"dropped": dropped, "closures": len(weights)})
     for closure, weight in zip(loop.closures, weights, strict=True):
         if not closure.accepted:
-            yield _false(closure, loop.end_assumed)
+            yield _false_closure(closure, loop.is_end_assumed)
         elif weight < DOUBTFUL_WEIGHT and not most:
             evidence = _evidence(closure) | {"gnc_weight": weight}
             yield warning("loop_closure_doubtful", evidence, closure=closure)
@@ -43,11 +43,11 @@ def assumptions(loop: Loop) -> Found:
     evidence = {} if gap_m is None else {"closure_error_m": gap_m}
     if loop.absolute:
         yield warning("loop_of_absolute_track", evidence)
-    if evidence and loop.end_assumed:
+    if evidence and loop.is_end_assumed:
         yield info("loop_end_assumed", evidence)
 
 
-def _false(closure: Closure, assumed: bool) -> Finding:
+def _false_closure(closure: Closure, assumed: bool) -> Finding:
     landing = closure.source == LANDING
     what = landing and assumed
     return error(

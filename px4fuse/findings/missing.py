@@ -11,7 +11,7 @@ from px4fuse.findings.model import Found, info, warning
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.origin import RECEIVED
 
-WANTED = "vehicle_visual_odometry"
+WANTED_TOPIC = "vehicle_visual_odometry"
 VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
 LOGGER_TOLERANCE = 0.25  # of the interval: jitter of PX4's logger seen in flights
 # Intervals (s) at which PX4's default profile thins these topics, logged_topics.cpp
@@ -38,10 +38,12 @@ def unavailable(analysis: Analysis) -> Found:
     if isinstance(acceleration, Unavailable):
         yield warning("input_unavailable", lacking=acceleration, remedy=acceleration.remedy)
     for result in analysis.axes.values():
-        ours = result.filters["kf"]
-        if isinstance(ours, Unavailable):
+        kf_summary = result.filters["kf"]
+        if isinstance(kf_summary, Unavailable):
             count = {"count": len(result.replay.updates)}
-            yield warning("too_few_innovations", count, lacking=ours, remedy=ours.remedy)
+            yield warning(
+                "too_few_innovations", count, lacking=kf_summary, remedy=kf_summary.remedy
+            )
             return
 
 
@@ -49,10 +51,10 @@ def source_as_sent(analysis: Comparison) -> Found:
     """The position as it arrived is not in the log: what stands in, and whether that is thinned."""
     source, received = analysis.source, RECEIVED.preference
     logged = any(track.origin.preference == received for track in analysis.flight.positions)
-    if source.origin.as_sent or logged:
+    if source.origin.has_all_samples or logged:
         return
     rate_hz, profile = source.rate_hz, int(analysis.flight.log.parameters.get("SDLOG_PROFILE", 1))
-    reasons = (part.reason for part in analysis.missing if part.source == WANTED)
+    reasons = (part.reason for part in analysis.missing if part.source == WANTED_TOPIC)
     facts: dict[str, Any] = {"source": source, "asked": profile | VISION_PROFILE_BIT}
     yield warning(
         "source_not_logged",
@@ -79,8 +81,8 @@ def innovations(analysis: Comparison) -> Found:
         return
     count = len(next(iter(axes)).replay.updates)
     if logged / count < MIN_INNOVATION_SHARE:
-        air = analysis.source.aid(axis) == BAROMETER
-        topic = (ekf2.aids[BAROMETER.name].topics if air else ekf2.innovation_topics)[0]
+        is_barometer = analysis.source.aid(axis) == BAROMETER
+        topic = (ekf2.aids[BAROMETER.name].topics if is_barometer else ekf2.innovation_topics)[0]
         evidence = {"logged": logged, "measurements": count}
         lost = 1 - logged / count
         yield info("ekf2_innovations_decimated", evidence, topic=topic, lost=lost)

@@ -17,7 +17,7 @@ SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
 WORDS: Mapping[str, Mapping[str, Any]] = table(__file__, "words.toml", dict[str, Any])
 NAMES: Mapping[str, str] = {name: words["called"] for name, words in WORDS.items()}
 # More times are not listed one by one
-MOST_SPANS = 3
+MAX_LISTED_SPANS = 3
 # Shorter is told as one moment
 MOMENT_S = 0.05
 
@@ -58,7 +58,7 @@ class Finding(Record, frozen=True, omit_defaults=False):
     @property
     def when(self) -> str:
         """When it shows, in words; empty where that is throughout."""
-        if len(self.spans_s) > MOST_SPANS:
+        if len(self.spans_s) > MAX_LISTED_SPANS:
             return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
         return ", ".join(
             f"{start:.1f} s to {end:.1f} s" if end - start > MOMENT_S else f"{start:.1f} s"
@@ -78,20 +78,26 @@ Found = Iterator[Finding]
 
 
 def finding(
-    severity: Severity, name: str, evidence: Mapping[str, int | float | str] = {},
-    spans_s: tuple[Span, ...] = (), **facts: Any,
-) -> Finding:  # fmt: skip
+    severity: Severity,
+    name: str,
+    evidence: Mapping[str, int | float | str] = {},
+    spans_s: tuple[Span, ...] = (),
+    **facts: Any,
+) -> Finding:
     """A finding in its words of ``words.toml``, filled with the evidence and more facts.
 
     Of several texts a fact of their name chooses one, and ``case`` where there is none of it.
     """
-    said: dict[str, Any] = {**evidence, **facts}
+    values: dict[str, Any] = {**evidence, **facts}
     for part, text in WORDS[name].items():
-        one = text if isinstance(text, str) else text[said[part if part in said else "case"]]
-        said[part] = one.format_map(said)
-    message = f"{said['headline']}{said['more']}"
-    return Finding(name, severity, message, said["remedy"], evidence, said["headline"],
-                   spans_s=spans_s)  # fmt: skip
+        template = (
+            text if isinstance(text, str) else text[values[part if part in values else "case"]]
+        )
+        values[part] = template.format_map(values)
+    message = f"{values['headline']}{values['more']}"
+    return Finding(
+        name, severity, message, values["remedy"], evidence, values["headline"], spans_s=spans_s
+    )
 
 
 error, warning, info = (partial(finding, severity) for severity in SEVERITIES)
@@ -112,12 +118,12 @@ def moments(times_s: Iterable[float]) -> tuple[Span, ...]:
     return tuple((float(time), float(time)) for time in times_s)
 
 
-def lowered(severity: Severity) -> Severity:
+def one_level_lower(severity: Severity) -> Severity:
     """One step less severe: what nobody chose is advice."""
     return "warning" if severity == "error" else "info"
 
 
-def times(count: int) -> str:
+def format_count(count: int) -> str:
     """How often, in words: "once", "2 times"."""
     return "once" if count == 1 else f"{count} times"
 
@@ -130,7 +136,7 @@ def spans_at(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ..
     return tuple(zip(edges[:-1][there].tolist(), edges[1:][there].tolist(), strict=True))
 
 
-def share_on(steps: pd.Series, segment: Segment) -> float:
+def fraction_on(steps: pd.Series, segment: Segment) -> float:
     """Share of a segment in which a 0/1 step function is 1."""
     on_s = sum(end - start for start, end in spans_at(1.0, steps, segment))
     return on_s / (segment.end_s - segment.start_s)

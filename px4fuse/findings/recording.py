@@ -5,9 +5,9 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
-from px4fuse.findings.model import Found, finding, info, times, warning
+from px4fuse.findings.model import Found, finding, format_count, info, warning
 from px4fuse.flight import Ekf2, Flight
-from px4fuse.plain import capital
+from px4fuse.plain import capitalise_first
 
 
 def detect(analysis: Analysis) -> Found:
@@ -22,32 +22,37 @@ def dropouts(analysis: Comparison) -> Found:
     """The logger stopped for a while."""
     segment = analysis.segment
     lost = [
-        each for each in analysis.flight.log.dropouts
+        each
+        for each in analysis.flight.log.dropouts
         if each.start_s <= segment.end_s and each.start_s + each.duration_s >= segment.start_s
-    ]  # fmt: skip
+    ]
     if lost:
         yield warning(
             "logger_dropouts",
             {"count": len(lost), "total_s": sum(each.duration_s for each in lost)},
             tuple((each.start_s, each.start_s + each.duration_s) for each in lost),
-            often=times(len(lost)), longest_s=max(each.duration_s for each in lost),
-        )  # fmt: skip
+            often=format_count(len(lost)),
+            longest_s=max(each.duration_s for each in lost),
+        )
 
 
 def loss(flight: Flight) -> Found:
     """Bytes that the reader had to pass over, a flight that goes on, single samples."""
     log = flight.log
     if log.damage or log.ends_in_flight:
-        first, *others = map(_sentence, log.damage or (
-            f"the log ends in flight, after {log.duration_s:.1f} s: the landing is not in it",
-        ))  # fmt: skip
+        first, *others = map(
+            _sentence,
+            log.damage
+            or (f"the log ends in flight, after {log.duration_s:.1f} s: the landing is not in it",),
+        )
         yield finding(
             "warning" if log.damage else "info",
             "log_damaged",
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
-            headline=first, others="".join(f". {other}" for other in others),
+            headline=first,
+            others="".join(f". {other}" for other in others),
             case="ends" if not log.damage else log.format.partition(" ")[0],
-        )  # fmt: skip
+        )
     for topic, count in list(log.dropped.items())[:1]:
         more = len(log.dropped) - 1
         facts = {"topic": topic, "count": count, "others": more, "also": more > 0}
@@ -58,9 +63,11 @@ def clocks_set_back(flight: Flight) -> Found:
     """The boot clock began again, or the recording computer's clock was set back."""
     log = flight.log
     if log.restarts:
-        yield warning("autopilot_restarted", {"count": log.restarts}, often=times(log.restarts))
+        yield warning(
+            "autopilot_restarted", {"count": log.restarts}, often=format_count(log.restarts)
+        )
     if back := log.receipt_went_back:
-        yield info("receipt_out_of_order", {"count": back}, often=times(back))
+        yield info("receipt_out_of_order", {"count": back}, often=format_count(back))
 
 
 def estimators(analysis: Analysis) -> Found:
@@ -79,4 +86,4 @@ def estimators(analysis: Analysis) -> Found:
 
 def _sentence(note: str) -> str:
     """A note with a capital letter, unless it begins with a file's name."""
-    return note if "." in note.split(" ", 1)[0] else capital(note)
+    return note if "." in note.split(" ", 1)[0] else capitalise_first(note)

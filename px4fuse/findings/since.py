@@ -10,11 +10,11 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.heading import HeadingError
 from px4fuse.findings import causes as kinds
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capital, length_words, number_words
+from px4fuse.plain import capitalise_first, format_length, format_number
 from px4fuse.request import OPTIONS
 
 # Findings that say the same as the first sentence does, by what is changed
-TOLD_BY: Mapping[str, frozenset[str]] = {
+FINDINGS_OF_CAUSE: Mapping[str, frozenset[str]] = {
     kinds.OUTLIERS: frozenset(("source_outliers",)),
     kinds.CLOCK: frozenset(("source_clock_offset", "ekf2_ev_delay_wrong")),
     kinds.FRAME: frozenset(("source_frame_turned", "ekf2_heading_wrong")),
@@ -22,7 +22,7 @@ TOLD_BY: Mapping[str, frozenset[str]] = {
     kinds.ACCELEROMETER: frozenset(("accelerometer_bias",)),
 }
 # What a change of a kind is there for; else to bring the mean NIS nearer to 1
-HELPS = {kinds.CLOCK: remedy.delay_helps, kinds.GATE: remedy.rejects_less}
+REMEDY_TESTS = {kinds.CLOCK: remedy.delay_helps, kinds.GATE: remedy.rejects_less}
 
 
 def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
@@ -31,30 +31,39 @@ def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
         return kinds.ELSEWHERE
     aid = remedy.aid_of(analysis)
     of = {
-        changed.OUTLIERS: kinds.OUTLIERS, changed.CLOCK: kinds.CLOCK, aid.delay: kinds.CLOCK,
-        changed.TURN: kinds.FRAME, changed.FORWARD: kinds.ACCELEROMETER,
-        changed.SIGMA_Z: kinds.NOISE, aid.noise: kinds.NOISE, aid.gate: kinds.GATE,
-    }  # fmt: skip
+        changed.OUTLIERS: kinds.OUTLIERS,
+        changed.CLOCK: kinds.CLOCK,
+        aid.delay: kinds.CLOCK,
+        changed.TURN: kinds.FRAME,
+        changed.FORWARD: kinds.ACCELEROMETER,
+        changed.SIGMA_Z: kinds.NOISE,
+        aid.noise: kinds.NOISE,
+        aid.gate: kinds.GATE,
+    }
     return next((kind for name, kind in of.items() if name in cause.change), kinds.PROCESS)
 
 
-def since_words(analysis: Analysis, cause: Intervention | None) -> str:
+def format_cause(analysis: Analysis, cause: Intervention | None) -> str:
     """What stands behind a verdict: its cause, and the replay that shows it; or nothing."""
-    return "" if cause is None else f", since {reason_words(analysis, cause)}"
+    return "" if cause is None else f", since {format_reason(analysis, cause)}"
 
 
-def reason_words(analysis: Analysis, cause: Intervention) -> str:
+def format_reason(analysis: Analysis, cause: Intervention) -> str:
     """A cause as a clause, and the replay that shows it."""
-    return f"{change_words(analysis, cause)} ({effect_words(cause)})"
+    return f"{format_change(analysis, cause)} ({format_effect(cause)})"
 
 
-def change_words(analysis: Analysis, cause: Intervention) -> str:
+def format_change(analysis: Analysis, cause: Intervention) -> str:
     """What is wrong, as a clause: what was changed to see what it does."""
-    said = [_one(analysis, cause, name) for name in cause.change if name not in changed.ALONG]
-    return " and ".join(said)
+    clauses = [
+        _format_one_change(analysis, cause, name)
+        for name in cause.change
+        if name not in changed.ACCOMPANYING_CHANGES
+    ]
+    return " and ".join(clauses)
 
 
-def share_words(cause: Intervention) -> str:
+def format_explained_share(cause: Intervention) -> str:
     """How much of a discrepancy a change explains."""
     if cause.denied_by_truth:
         return "denied by the truth"
@@ -65,55 +74,57 @@ def share_words(cause: Intervention) -> str:
     return f"{cause.explains:.0%}" if cause.explains > 0.0 else "nothing"
 
 
-def cure_words(analysis: Analysis, cause: Intervention) -> str:
+def format_remedy(analysis: Analysis, cause: Intervention) -> str:
     """What to do about a cause."""
-    parts, change = [], dict(cause.change)
+    actions, change = [], dict(cause.change)
     if change.pop(changed.OUTLIERS, None):
         gnss = analysis.source.origin.is_gnss
         where = "place of the antenna" if gnss else "line of sight, anchor survey"
-        parts.append(f"remove the outliers ({where}) rather than raise a noise for them")
+        actions.append(f"remove the outliers ({where}) rather than raise a noise for them")
     if change.pop(changed.FORWARD, None) is not None:
-        parts.append("calibrate the accelerometer and the level horizon")
+        actions.append("calibrate the accelerometer and the level horizon")
         change.pop(changed.RIGHT)
     if turn_deg := change.pop(changed.TURN, None):
         # GNSS knows north
-        parts.append(
+        actions.append(
             f"calibrate the magnetometer, away from metal and motors ({turn_deg:+.0f}°)"
             if analysis.source.origin.is_gnss
             else f"turn the positions by {turn_deg:+.0f}° before they are sent"
         )
     settings = (changed.SIGMA_Z, changed.SIGMA_A, changed.CLOCK)
-    typed = [f"{OPTIONS[name].name} {change.pop(name):g}" for name in settings if name in change]
+    options = [f"{OPTIONS[name].name} {change.pop(name):g}" for name in settings if name in change]
     if change:
-        parts.append(f"set {remedy.settings_words(change)}")
-    if typed:
-        parts.append(f"type {remedy.COMMAND} {' '.join(typed)}")
-    return f"{capital(', and '.join(parts))}."
+        actions.append(f"set {remedy.format_settings(change)}")
+    if options:
+        actions.append(f"type {remedy.COMMAND} {' '.join(options)}")
+    return f"{capitalise_first(', and '.join(actions))}."
 
 
-def effect_words(cause: Intervention) -> str:
+def format_effect(cause: Intervention) -> str:
     """What a change does to the number in question, by the replay."""
     if cause.of == "nis":
-        before, after = (number_words(nis, 2) for nis in (cause.before, cause.after))
+        before, after = (format_number(nis, 2) for nis in (cause.before, cause.after))
         return f"replayed: mean NIS {before} → {after}"
     if cause.of == "apart":
-        before, after = (length_words(metres) for metres in (cause.before, cause.after))
+        before, after = (format_length(metres) for metres in (cause.before, cause.after))
         return f"replayed: {before} → {after} apart"
-    before, after = (number_words(nees**0.5, 2) for nees in (cause.before, cause.after))
+    before, after = (format_number(nees**0.5, 2) for nees in (cause.before, cause.after))
     return f"replayed: errors of {before} → {after} σ"
 
 
-def ekf2_cure_words(analysis: Analysis, cause: Intervention) -> str:
+def format_remedy_of_ekf2(analysis: Analysis, cause: Intervention) -> str:
     """What to do about a cause of EKF2's, with what a parameter would do to all of the flight."""
     if not cause.change.keys() <= PARAMETERS.keys():
-        return cure_words(analysis, cause)
-    return remedy.remedy_words(
-        analysis.ekf2_model, cause.change, HELPS.get(kind_of(analysis, cause), remedy.noise_helps),
-        otherwise=f"{capital(reason_words(analysis, cause))}.",
-    )  # fmt: skip
+        return format_remedy(analysis, cause)
+    return remedy.format_ekf2_remedy(
+        analysis.ekf2_model,
+        cause.change,
+        REMEDY_TESTS.get(kind_of(analysis, cause), remedy.noise_helps),
+        fallback_remedy=f"{capitalise_first(format_reason(analysis, cause))}.",
+    )
 
 
-def _one(analysis: Analysis, cause: Intervention, name: str) -> str:
+def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> str:
     """What is wrong, for one of the things that were changed."""
     value, settings = cause.change[name], analysis.settings
     match name:

@@ -7,7 +7,7 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
-from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.filter.clock import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings.model import Found, error, finding, warning
 from px4fuse.findings.source_positions import low_pass
 from px4fuse.findings.source_stamps import until_synchronised
@@ -20,8 +20,8 @@ AT_THE_SENDER = "Correct the stamps at the sender:"
 
 def detect(analysis: Analysis) -> Found:
     """An offset that is known, of stamps that are the source's own and not EKF2's."""
-    clock, made = analysis.clock, analysis.source.origin.reconstructed
-    if isinstance(clock, ClockOffset) and clock.determinable and not made:
+    clock, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
+    if isinstance(clock, ClockOffset) and clock.determinable and not is_reconstructed:
         yield from offset(analysis, clock)
         yield from delay(analysis, clock)
 
@@ -33,20 +33,23 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
-    if clock.change_p is not None and clock.change_p < CHANGE_P:
+    if clock.change_p is not None and clock.change_p < MAX_CHANGE_P:
         yield error(
-            "source_clock_changes", {**evidence, "change_p": clock.change_p}, source=source.name,
-            first=clock.parts[0], last=clock.parts[-1],
-        )  # fmt: skip
+            "source_clock_changes",
+            {**evidence, "change_p": clock.change_p},
+            source=source.name,
+            first=clock.parts[0],
+            last=clock.parts[-1],
+        )
         return
     size = abs(clock.remaining_s)
     # one offset cannot hold for stamps that are of arrival in a part of the flight only
-    if size <= max(OFFSET_S, clock.chance_s) or until_synchronised(analysis) is not None:
+    if size <= max(OFFSET_S, clock.three_sigma_s) or until_synchronised(analysis) is not None:
         return
     typed = f"{remedy.COMMAND} --clock-offset {typed_offset_s(analysis, clock):.3f}"
     shifted = replace(analysis.settings, clock_offset_s=round(clock.offset_s, 3))
     if errors := remedy.filter_errors_m(analysis, shifted):
-        if errors[1] > remedy.WORSE_FILTER_ERROR * errors[0]:
+        if errors[1] > remedy.MAX_KF_ERROR_RATIO * errors[0]:
             return  # the truth knows better
         typed += f": position error {errors[0]:.3f} → {errors[1]:.3f} m (replayed)"
     ends, late = (low - clock.applied_s, high - clock.applied_s), clock.remaining_s < 0
@@ -54,9 +57,12 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
         "error" if size > OFFSET_ERROR_S else "warning",
         "source_clock_offset",
         evidence,
-        source=source.name, late=late, size_s=size, ends=(-ends[1], -ends[0]) if late else ends,
+        source=source.name,
+        late=late,
+        size_s=size,
+        ends=(-ends[1], -ends[0]) if late else ends,
         remedy=f"{typed}{_for_ekf2(analysis, clock)}.",
-    )  # fmt: skip
+    )
 
 
 def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
@@ -65,11 +71,11 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     parameters = analysis.flight.log.parameters
     known = [name for name in (*RECEIVER_DELAYS, GNSS_POS.delay) if name in parameters]
     of_receiver = bool(known) and known[0] in RECEIVER_DELAYS  # which the model does not have
-    if source.origin.by_gnss and known and (of_receiver or isinstance(model, Unavailable)):
-        ask_ms = parameters[known[0]] - 1e3 * clock.remaining_s
+    if source.origin.fused_as_gnss and known and (of_receiver or isinstance(model, Unavailable)):
+        ml_delay_ms = parameters[known[0]] - 1e3 * clock.remaining_s
         return (
             f"; for EKF2, which takes fixes to be {parameters[known[0]]:g} ms old ({known[0]}), "
-            f"that would be {max(ask_ms, 0.0):.0f} ms (not replayed)"
+            f"that would be {max(ml_delay_ms, 0.0):.0f} ms (not replayed)"
         )
     if isinstance(model, Unavailable) or source.name != model.inputs.received.source:
         return ""
@@ -77,8 +83,8 @@ def _for_ekf2(analysis: Analysis, clock: ClockOffset) -> str:
     found = what_if(model, [changes]) if changes else None
     if not isinstance(found, WhatIf) or not remedy.delay_helps(found.replayed, *found.whatif):
         return ""
-    effect = remedy.effect_words(found.replayed, *found.whatif)
-    return f"; for EKF2 set {remedy.settings_words(changes)}: {effect}"
+    effect = remedy.format_whatif_effect(found.replayed, *found.whatif)
+    return f"; for EKF2 set {remedy.format_settings(changes)}: {effect}"
 
 
 def typed_offset_s(comparison: Comparison, clock: ClockOffset) -> float:
@@ -94,21 +100,24 @@ def delay(analysis: Analysis, clock: ClockOffset) -> Found:
     """EKF2_EV_DELAY lies outside what the clock offset and EKF2's step leave open."""
     # of GNSS the offset itself is what EKF2's delay is wrong by
     delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
-    asked_ms = -1e3 * clock.offset_s
-    known_ms = max(1e3 * clock.chance_s + remedy.UPDATE_MS, 1e3 * OFFSET_S)
-    if delay_ms is None or abs(delay_ms - asked_ms) < known_ms:
+    ml_delay_ms = -1e3 * clock.offset_s
+    known_ms = max(1e3 * clock.three_sigma_s + remedy.UPDATE_MS, 1e3 * OFFSET_S)
+    if delay_ms is None or abs(delay_ms - ml_delay_ms) < known_ms:
         return
     low_ms, high_ms = (-1e3 * end for end in reversed(clock.interval_s))
     low, high = round(low_ms), round(high_ms)
-    case = "none" if low_ms <= 0.0 <= high_ms else "early" if asked_ms < 0.0 else "delay"
+    case = "none" if low_ms <= 0.0 <= high_ms else "early" if ml_delay_ms < 0.0 else "delay"
     if case == "early":
         low, high = -high, -low
     yield warning(
         "ekf2_ev_delay_wrong",
-        {"ekf2_ev_delay_ms": delay_ms, "asked_ms": asked_ms},
-        case=case, size=round(abs(asked_ms)), low=low, high=high,
-        remedy=delay_remedy(analysis, 0.0 if low_ms <= 0.0 else asked_ms, delay_ms),
-    )  # fmt: skip
+        {"ekf2_ev_delay_ms": delay_ms, "asked_ms": ml_delay_ms},
+        case=case,
+        size=round(abs(ml_delay_ms)),
+        low=low,
+        high=high,
+        remedy=delay_remedy(analysis, 0.0 if low_ms <= 0.0 else ml_delay_ms, delay_ms),
+    )
 
 
 def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
@@ -121,4 +130,6 @@ def delay_remedy(analysis: Analysis, delay_ms: float, flown_ms: float) -> str:
     changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
     if not isinstance(model, Unavailable):
         changes = remedy.delay_change(model.inputs, delay_ms) or changes
-    return remedy.remedy_words(model, changes, remedy.delay_helps, otherwise=AT_THE_SENDER)
+    return remedy.format_ekf2_remedy(
+        model, changes, remedy.delay_helps, fallback_remedy=AT_THE_SENDER
+    )

@@ -11,7 +11,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.events import longest_s, source_gaps
 from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
-from px4fuse.findings.model import Found, finding, info, times, warning
+from px4fuse.findings.model import Found, finding, format_count, info, warning
 from px4fuse.origin import ALIGNED
 
 LOST_SHARE = 0.02  # of the source's samples; seen: 0 to 0.3 %, and 8 to 9 % in v1.13
@@ -19,19 +19,19 @@ MIN_INTERVALS = 50
 THINNED_SHARE = 0.25  # of the source's samples: more than a link loses
 # What is thinned to a rate alternates between two neighbouring multiples; bursts have multiples
 # far apart
-NEIGHBOURS = 0.85  # of the intervals
-LEAST = 0.1  # of the intervals; single losses pass
+MIN_PAIR_SHARE = 0.85  # of the intervals
+MIN_SHARE = 0.1  # of the intervals; single losses pass
 # Root mean square distance from whole multiples, of the shorter interval: random ones have 0.29, a
 # source's own jitter is 0.03
-WHOLE = 0.06
-MOST_PARTS = 4
+MAX_MULTIPLE_RMS = 0.06
+MAX_DIVISOR = 4
 
 
 def detect(analysis: Analysis) -> Found:
     """All three."""
     yield from gaps(analysis)
     yield from losses(analysis)
-    yield from thinning(analysis)
+    yield from downsampling(analysis)
 
 
 def gaps(analysis: Analysis) -> Found:
@@ -43,9 +43,11 @@ def gaps(analysis: Analysis) -> Found:
         yield warning(
             "source_gap",
             {"count": len(silent), "longest_s": until - at, "at_s": at},
-            silent, often=times(len(silent)), usual_s=longest_s(1.0 / rate_hz),
+            silent,
+            often=format_count(len(silent)),
+            usual_s=longest_s(1.0 / rate_hz),
             gnss=analysis.source.origin.is_gnss,
-        )  # fmt: skip
+        )
 
 
 def losses(analysis: Analysis) -> Found:
@@ -60,18 +62,21 @@ def losses(analysis: Analysis) -> Found:
         yield info(
             "source_samples_lost",
             {"lost": lost, "lost_share": lost / sent},
-            source=source.name, sent=sent, typical_s=typical, in_ulog=analysis.flight.log.has_ulog,
-        )  # fmt: skip
+            source=source.name,
+            sent=sent,
+            typical_s=typical,
+            in_ulog=analysis.flight.log.has_ulog,
+        )
 
 
-def thinning(analysis: Analysis) -> Found:
+def downsampling(analysis: Analysis) -> Found:
     """Intervals are whole multiples of a shorter one: the source is faster than what arrived."""
     source = analysis.source
     # stamps that were made, or a rate that is the logger's (source_not_logged says so)
     if source.clock_map is not None or source.origin.preference >= ALIGNED.preference:
         return
     intervals, _ = _intervals(analysis)
-    found = _base(intervals) if len(intervals) >= MIN_INTERVALS else None
+    found = _base_interval(intervals) if len(intervals) >= MIN_INTERVALS else None
     if found is None:
         return
     base, multiples = found
@@ -79,7 +84,7 @@ def thinning(analysis: Analysis) -> Found:
     shares = np.bincount(multiples.astype(np.intp)) / len(multiples)
     pairs = shares[:-1] + shares[1:]
     at = int(np.argmax(pairs))
-    alternating = pairs[at] >= NEIGHBOURS and shares[at : at + 2].min() >= LEAST
+    alternating = pairs[at] >= MIN_PAIR_SHARE and shares[at : at + 2].min() >= MIN_SHARE
     if lost < THINNED_SHARE or not alternating:
         return
     interval_s = float(np.mean(intervals))
@@ -88,8 +93,11 @@ def thinning(analysis: Analysis) -> Found:
         "error" if slow else "warning",
         "source_thinned",
         {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base, "lost_share": lost},
-        source=source.name, base_s=base, starts=slow, least_s=EV_START_INTERVAL_S,
-    )  # fmt: skip
+        source=source.name,
+        base_s=base,
+        starts=slow,
+        least_s=EV_START_INTERVAL_S,
+    )
 
 
 def _intervals(analysis: Analysis) -> tuple[Array, float]:
@@ -99,15 +107,15 @@ def _intervals(analysis: Analysis) -> tuple[Array, float]:
     return intervals[intervals <= longest_s(typical)], typical
 
 
-def _base(intervals: Array) -> tuple[float, Array] | None:
+def _base_interval(intervals: Array) -> tuple[float, Array] | None:
     """Longest interval of which all are whole multiples, and these; None where there is none."""
     typical = float(np.sort(intervals)[len(intervals) // 2])  # one of them, no mean of two
-    for parts in range(1, MOST_PARTS + 1):
-        multiples = np.rint(intervals * parts / typical)
+    for divisor in range(1, MAX_DIVISOR + 1):
+        multiples = np.rint(intervals * divisor / typical)
         if np.any(multiples < 1.0):
             continue
         base = float(np.sum(intervals) / np.sum(multiples))
         # the first that fits is the longest: a single multiple says that nothing is missing
-        if float(np.sqrt(np.mean((intervals / base - multiples) ** 2))) <= WHOLE:
+        if float(np.sqrt(np.mean((intervals / base - multiples) ** 2))) <= MAX_MULTIPLE_RMS:
             return base, multiples
     return None

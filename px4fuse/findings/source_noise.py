@@ -10,7 +10,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.filter.coloured import Coloured
+from px4fuse.filter.coloured import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
@@ -19,7 +19,7 @@ from px4fuse.findings.model import Found, error, info, warning
 from px4fuse.findings.noises import NOISE_FITS, ekf2_noise_m
 from px4fuse.findings.source_positions import LAG_NATS, hardly_moved
 from px4fuse.flight import Columns, Unavailable
-from px4fuse.plain import number_words
+from px4fuse.plain import format_number
 
 COLOURED_NATS = 5.0  # a likelihood ratio of 150 for two more numbers; 1 of 400 clean flights
 REPEATS = 0.05  # of the positions
@@ -38,27 +38,29 @@ def detect(analysis: Analysis) -> Found:
     if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
         return
     yield from repeats(analysis)
-    yield from slow(analysis)
-    yield from unequal(analysis)
-    yield from levels(analysis)
+    yield from time_correlated_noise(analysis)
+    yield from unequal_noise(analysis)
+    yield from noise_variation(analysis)
 
 
-def slow(analysis: Analysis) -> Found:
+def time_correlated_noise(analysis: Analysis) -> Found:
     """Errors that hang together without a lag."""
     found = analysis.coloured
-    if not isinstance(found, Coloured) or found.gain_nats < COLOURED_NATS:
+    if not isinstance(found, TimeCorrelatedNoise) or found.gain_nats < COLOURED_NATS:
         return
     if found.lag_nats >= LAG_NATS:
         return  # smoothed
-    low, high = (number_words(end, 1) for end in (found.low_s, found.high_s))
+    low, high = (format_number(end, 1) for end in (found.low_s, found.high_s))
     over = f"{low} to {high} s" if np.isfinite(found.high_s) else f"at least {low} s"
     gnss, source = analysis.source.origin.is_gnss, analysis.source.name
     evidence = {name: value for name, value in asdict(found).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
     if (beyond := found.white_m / float(np.nanmin(assumed_m))) > NOISE_FITS:
         evidence[WHITE_BEYOND] = beyond
-    told = info if gnss else warning
-    yield told("source_coloured", evidence, found=found, source=source, over=over, gnss=gnss)
+    make_finding = info if gnss else warning
+    yield make_finding(
+        "source_coloured", evidence, found=found, source=source, over=over, gnss=gnss
+    )
 
 
 def repeats(analysis: Analysis) -> Found:
@@ -70,11 +72,14 @@ def repeats(analysis: Analysis) -> Found:
     count, share = int(again.sum()), float(again.mean()) if len(again) else 0.0
     if count < MIN_REPEATS or share < REPEATS:
         return
-    told, evidence = error if share >= REPEATS_ERROR else warning, {"count": count, "share": share}
-    yield told("source_repeats", evidence, source=analysis.source.name, of=len(again))
+    make_finding, evidence = (
+        error if share >= REPEATS_ERROR else warning,
+        {"count": count, "share": share},
+    )
+    yield make_finding("source_repeats", evidence, source=analysis.source.name, of=len(again))
 
 
-def unequal(analysis: Analysis) -> Found:
+def unequal_noise(analysis: Analysis) -> Found:
     """North and east with noises of different size."""
     if analysis.source.origin.is_gnss:
         return  # its white part says nothing of its errors
@@ -99,11 +104,15 @@ def unequal(analysis: Analysis) -> Found:
     yield warning(
         "source_axes_unequal",
         {f"{less}_sigma_z_m": small, f"{more}_sigma_z_m": large},
-        source=analysis.source.name, large=large, noisier=more, small=small, less=less,
-    )  # fmt: skip
+        source=analysis.source.name,
+        large=large,
+        noisier=more,
+        small=small,
+        less=less,
+    )
 
 
-def levels(analysis: Analysis) -> Found:
+def noise_variation(analysis: Analysis) -> Found:
     """A part of the flight in which the bulk of the innovations is larger."""
     tuned, chosen = analysis.tuning.get(HORIZONTAL), analysis.settings
     if tuned is None:
@@ -127,8 +136,8 @@ def levels(analysis: Analysis) -> Found:
 
     def sized(skip: BoolArray | None) -> Array:
         # with the noises that the data ask for: others would make the innovations grow and shrink
-        made = [innovations(each, sigma_a, sigma_z, skip) for each in legs]
-        normalised = np.abs([nu / np.sqrt(s) for nu, s in made])
+        axis_innovations = [innovations(each, sigma_a, sigma_z, skip) for each in legs]
+        normalised = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
         # each axis by its own size, so that unequal axes are no change
         return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
 
@@ -152,5 +161,7 @@ def levels(analysis: Analysis) -> Found:
     yield (error if ratio >= LEVELS_ERROR else warning)(
         "source_noise_changes",
         {"ratio": ratio, "first_s": start, "until_s": end},
-        ((start, end),), source=analysis.source.name, gnss=analysis.source.origin.is_gnss,
-    )  # fmt: skip
+        ((start, end),),
+        source=analysis.source.name,
+        gnss=analysis.source.origin.is_gnss,
+    )

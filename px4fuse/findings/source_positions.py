@@ -12,16 +12,16 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.causes import AFTER_STEP_S, BURST_S, Explained
+from px4fuse.filter.causes import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
 from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.coloured import Coloured, Smoothing
+from px4fuse.filter.coloured import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, too_slow
-from px4fuse.findings.model import Found, error, finding, moments, times, warning
+from px4fuse.findings.model import Found, error, finding, format_count, moments, warning
 from px4fuse.findings.source_stamps import arrivals
 from px4fuse.flight import Columns, Unavailable
-from px4fuse.plain import factor_words
+from px4fuse.plain import format_factor
 
 MOTION_RANGE_M = 0.5  # 5 to 95 %; a hovering drone with 0.1 m UWB stays below
 NOISE_RANGE = 1.25 * 3.29  # of white noise's σ from 5 to 95 %, with a quarter for chance
@@ -54,23 +54,23 @@ def detect(analysis: Analysis) -> Found:
         yield from stated_variance(analysis)
 
 
-def low_pass(analysis: Analysis) -> Smoothing | None:
+def low_pass(analysis: Analysis) -> SourceLowPass | None:
     """The low pass in the source, None where there is none or it cannot be told."""
     source, found = analysis.source, analysis.smoothing
     # the error of odometry drifts, which makes that of successive positions agree as well; what
     # was made of EKF2's own output has EKF2's filter in it
     if source.orientation is not None or source.origin.reconstructed:
         return None
-    if not _clock_known(analysis):
+    if not _is_clock_known(analysis):
         return None
-    if not isinstance(found, Smoothing) or found.gain_nats < GAIN_NATS or found.lag_s < LAG_S:
+    if not isinstance(found, SourceLowPass) or found.gain_nats < GAIN_NATS or found.lag_s < LAG_S:
         return None
     slow = analysis.coloured
     # errors that hang together without a lag are slow, not smoothed
-    return None if isinstance(slow, Coloured) and slow.lag_nats < LAG_NATS else found
+    return None if isinstance(slow, TimeCorrelatedNoise) and slow.lag_nats < LAG_NATS else found
 
 
-def _clock_known(analysis: Analysis) -> bool:
+def _is_clock_known(analysis: Analysis) -> bool:
     """Whether the stamps can be judged: late ones look like a lag, or like longer distances."""
     return isinstance(analysis.clock, ClockOffset) and not any(arrivals(analysis))
 
@@ -79,15 +79,17 @@ def smoothing(analysis: Analysis) -> Found:
     """A low pass makes errors agree and positions late."""
     found = low_pass(analysis)
     if found is not None:
-        told = error if found.lag_s >= LAG_ERROR_S else warning
-        yield told("source_smoothed", asdict(found), found=found, source=analysis.source.name)
+        make_finding = error if found.lag_s >= LAG_ERROR_S else warning
+        yield make_finding(
+            "source_smoothed", asdict(found), found=found, source=analysis.source.name
+        )
 
 
 def jumps(analysis: Analysis) -> Found:
     """Steps to another place that the IMU does not measure: a false match, a moved anchor."""
-    found = analysis.explained
+    found = analysis.bias_scale_jump_fit
     # a moving vehicle's positions jump where the stamps do
-    if not isinstance(found, Explained) or any(arrivals(analysis)):
+    if not isinstance(found, BiasScaleJumpFit) or any(arrivals(analysis)):
         return
     slow = analysis.coloured
     # a slow error wanders by some of its σ within seconds
@@ -100,23 +102,26 @@ def jumps(analysis: Analysis) -> Found:
             "error" if size >= JUMP_ERROR_M else "warning",
             "source_jumps",
             {"count": len(large), "size_m": size, "at_s": at_s, "sigma_m": sigma},
-            moments(jump.time_s for jump in large), source=analysis.source.name,
-            often=times(len(large)), within_m=1.96 * sigma, case=analysis.source.origin.is_gnss,
-        )  # fmt: skip
+            moments(jump.time_s for jump in large),
+            source=analysis.source.name,
+            often=format_count(len(large)),
+            within_m=1.96 * sigma,
+            case=analysis.source.origin.is_gnss,
+        )
 
 
 def scale(analysis: Analysis) -> Found:
     """Distances are too long or too short, by an IMU that misses no motion."""
-    imu, found = analysis.flight.imu, analysis.explained
+    imu, found = analysis.flight.imu, analysis.bias_scale_jump_fit
     # GNSS measures in metres: what looks like a scale is something else
     if not isinstance(imu, pd.DataFrame) or too_slow(imu, MIN_IMU_RATE_HZ):
         return
     if analysis.source.origin.is_gnss:
         return
     # a low pass takes from the motion as well, and a slow error moves with it by chance
-    if not isinstance(found, Explained) or low_pass(analysis) is not None:
+    if not isinstance(found, BiasScaleJumpFit) or low_pass(analysis) is not None:
         return
-    if not isinstance(analysis.coloured, Unavailable) or not _clock_known(analysis):
+    if not isinstance(analysis.coloured, Unavailable) or not _is_clock_known(analysis):
         return
     off, sigma = found.scale.value, found.scale.sigma
     if abs(off) >= max(SCALE, SCALE_SIGMAS * sigma):
@@ -124,8 +129,11 @@ def scale(analysis: Analysis) -> Found:
             "error" if abs(off) >= SCALE_ERROR else "warning",
             "source_scale_wrong",
             {"scale": 1.0 + off, "sigma": sigma},
-            source=analysis.source.name, off=abs(off), long=off > 0, within=1.96 * sigma,
-        )  # fmt: skip
+            source=analysis.source.name,
+            off=abs(off),
+            long=off > 0,
+            within=1.96 * sigma,
+        )
 
 
 def outliers(analysis: Analysis) -> Found:
@@ -133,12 +141,12 @@ def outliers(analysis: Analysis) -> Found:
     tuned = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(tuned, AxisTuning):
         return
-    found = analysis.explained
-    steps = [jump.time_s for jump in found.jumps] if isinstance(found, Explained) else []
+    found = analysis.bias_scale_jump_fit
+    steps = [jump.time_s for jump in found.jumps] if isinstance(found, BiasScaleJumpFit) else []
     times_s = [
         time
         for time in tuned.outlier_time_s.tolist()
-        if not any(at - BURST_S <= time < at + AFTER_STEP_S for at in steps)
+        if not any(at - OUTLIER_BURST_S <= time < at + OUTLIERS_AFTER_STEP_S for at in steps)
     ]
     count, share = len(times_s), len(times_s) / tuned.count
     if share < OUTLIERS or count < MIN_OUTLIERS:
@@ -148,9 +156,14 @@ def outliers(analysis: Analysis) -> Found:
         "error" if share >= OUTLIERS_ERROR else "warning",
         "source_outliers",
         {"count": count, "share": share, "first_s": times_s[0]},
-        moments(times_s), tuned=tuned, first=first, others=count > 3, case=origin.is_gnss,
-        aid=origin.aid, or_noise=origin.aid is not None,
-    )  # fmt: skip
+        moments(times_s),
+        tuned=tuned,
+        first=first,
+        others=count > 3,
+        case=origin.is_gnss,
+        aid=origin.aid,
+        or_noise=origin.aid is not None,
+    )
 
 
 def stated_variance(analysis: Analysis) -> Found:
@@ -176,9 +189,14 @@ def stated_variance(analysis: Analysis) -> Found:
             "error" if size >= REPORTED_ERROR else "warning",
             "source_variance_wrong",
             {"reported_sigma_m": sigma, "sigma_z_m": noise, "variance_factor": factor},
-            source=source.name, low=low, high=high, times=factor_words(size), small=factor < 1.0,
-            slow=factor > 1.0 and error_m is None, variance_m2=noise**2,
-        )  # fmt: skip
+            source=source.name,
+            low=low,
+            high=high,
+            times=format_factor(size),
+            small=factor < 1.0,
+            slow=factor > 1.0 and error_m is None,
+            variance_m2=noise**2,
+        )
 
 
 def _error_m(analysis: Analysis) -> float | None:

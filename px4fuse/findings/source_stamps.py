@@ -14,7 +14,7 @@ ARRIVAL_AGE_S = 0.001  # from receiving a message to publishing it
 LATENCY_S = 0.02  # at 1 m/s a fifth of a good UWB's noise
 LATENCY_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
 MIN_SAMPLES = 10
-PURE = 0.95  # of the samples of each part; a late message now and then passes
+MIN_PURE_SHARE = 0.95  # of the samples of each part; a late message now and then passes
 
 
 def detect(analysis: Analysis) -> Found:
@@ -28,8 +28,10 @@ def detect(analysis: Analysis) -> Found:
         yield warning(
             "companion_not_synchronised",
             {"jitter_s": clock.jitter_s},
-            source=analysis.source.name, method=clock.method, own=clock.method != "arrival time",
-        )  # fmt: skip
+            source=analysis.source.name,
+            method=clock.method,
+            own=clock.method != "arrival time",
+        )
 
 
 def constant(name: str, clock: ClockMap, distinct: int) -> Found:
@@ -56,10 +58,10 @@ def arrivals(analysis: Analysis) -> Found:
     cut = until_synchronised(analysis)
     if cut is not None:
         until, latency = cut
-        told = error if latency >= LATENCY_ERROR_S else warning
+        make_finding = error if latency >= LATENCY_ERROR_S else warning
         evidence, spans = {"until_s": until, "latency_s": latency}, ((float(age.index[0]), until),)
-        yield told("source_stamps_of_arrival", evidence, spans, source=name, case=True)
-    elif np.mean(age.abs() < ARRIVAL_AGE_S) >= PURE:
+        yield make_finding("source_stamps_of_arrival", evidence, spans, source=name, case=True)
+    elif np.mean(age.abs() < ARRIVAL_AGE_S) >= MIN_PURE_SHARE:
         evidence = {"until_s": float(age.index[-1])}
         yield warning("source_stamps_of_arrival", evidence, source=name, case=False)
 
@@ -75,10 +77,10 @@ def until_synchronised(analysis: Analysis) -> tuple[float, float] | None:
     arrival = (age.abs() < ARRIVAL_AGE_S).to_numpy()
     wrong: Array = np.cumsum(~arrival) + np.sum(arrival) - np.cumsum(arrival)
     cut = int(np.argmin(wrong)) + 1
-    if np.mean(arrival) >= PURE or min(cut, len(age) - cut) < MIN_SAMPLES:
+    if np.mean(arrival) >= MIN_PURE_SHARE or min(cut, len(age) - cut) < MIN_SAMPLES:
         return None
     latency = float(age.iloc[cut:].median())
-    pure = min(np.mean(arrival[:cut]), np.mean(~arrival[cut:])) >= PURE
+    pure = min(np.mean(arrival[:cut]), np.mean(~arrival[cut:])) >= MIN_PURE_SHARE
     return (float(age.index[cut]), latency) if pure and latency >= LATENCY_S else None
 
 

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from px4fuse.comparison.interventions import is_off
+from px4fuse.comparison.interventions import is_inconsistent
 from px4fuse.comparison.model import FilterSummary
 from px4fuse.fleet.inputs import DiffInput, Progress, Results, read_inputs
 from px4fuse.fleet.measures import (
@@ -15,7 +15,7 @@ from px4fuse.fleet.measures import (
     numbers,
 )
 from px4fuse.fleet.rows import at
-from px4fuse.plain import factor_words, number_words
+from px4fuse.plain import format_factor, format_number
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
@@ -116,9 +116,13 @@ def number_changes(
     """
     for path in {**first, **second}:
         a, b = first.get(path), second.get(path)
-        if a and b and math.isclose(
-            a.value, b.value, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE
-        ):  # fmt: skip
+        if (
+            a
+            and b
+            and math.isclose(
+                a.value, b.value, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE
+            )
+        ):
             continue
         known = a or b
         assert known is not None
@@ -151,11 +155,11 @@ def _worse(a: Results, b: Results, findings: Iterable[contract.FindingChange]) -
         value, consistent = after.get(what, (was, True))
         if was_consistent and not consistent:
             ratio = value**0.5
-            off = f"{factor_words(max(ratio, 1.0 / ratio))} times too"
+            off = f"{format_factor(max(ratio, 1.0 / ratio))} times too"
             said = (
                 f"overconfident, σ {off} small" if ratio > 1.0 else f"underconfident, σ {off} large"
             )
-            yield f"{what}: {number_words(was)} (consistent) → {number_words(value)} ({said})."
+            yield f"{what}: {format_number(was)} (consistent) → {format_number(value)} ({said})."
     errors = [one.id for one in findings if (one.only_in, one.severity) == ("B", "error")]
     for error in dict.fromkeys(errors):
         yield f"New finding of severity error: {error}."
@@ -168,7 +172,7 @@ def _verdicts(found: Results) -> dict[str, tuple[float, bool]]:
         for name, label in NAMES.items():
             one = result.filters[name]
             if isinstance(one, FilterSummary):
-                verdicts[f"Mean NIS of {label}, {axis}"] = one.nis_mean, not is_off(one)
+                verdicts[f"Mean NIS of {label}, {axis}"] = one.nis_mean, not is_inconsistent(one)
             if (nees := at(one, "truth.nees_position_mean")) is not None:
                 consistent = NEES_SIGMA_OFF**-2 <= nees <= NEES_SIGMA_OFF**2
                 verdicts[f"Mean NEES of {label}, {axis}"] = nees, consistent

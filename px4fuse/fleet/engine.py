@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Any
 
 from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.results.reading import one_line
-from px4fuse.workers import Failed, Job, Result
+from px4fuse.workers import Job, JobFailure, Result
 
 if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT_S = 15.0
 # Jobs that a cluster's worker takes at once: to import what they need takes a process 2 s
-TOGETHER = 4
+JOBS_PER_TASK = 4
 
 
 @contextmanager
-def connected(scheduler: str | None = None) -> Iterator[Client | None]:
+def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
     """A client of the cluster that does the work; None where this computer does it.
 
     Parameters
@@ -87,18 +87,18 @@ def _check(client: Client) -> None:
     except TimeoutError as error:
         raise SettingsError.of("no_workers", address=address) from error
     here = metadata.version("px4fuse")
-    for name, there in client.run(metadata.version, "px4fuse", on_error="return").items():
-        if there != here:
-            other = f"px4fuse {there}" if isinstance(there, str) else "no px4fuse"
+    for name, worker_version in client.run(metadata.version, "px4fuse", on_error="return").items():
+        if worker_version != here:
+            other = f"px4fuse {worker_version}" if isinstance(worker_version, str) else "no px4fuse"
             raise SettingsError.of("worker_of_another", name=name, other=other, here=here)
 
 
-def outcomes(
+def run_jobs(
     client: Client | None,
-    work: Callable[..., Iterator[tuple[int, Result | Failed]]],
+    work: Callable[..., Iterator[tuple[int, Result | JobFailure]]],
     jobs: Sequence[Job],
     processes: int | None = None,
-) -> Generator[tuple[Job, Result | Failed]]:
+) -> Generator[tuple[Job, Result | JobFailure]]:
     """What comes of every job, as it comes.
 
     Parameters
@@ -121,25 +121,27 @@ def outcomes(
         return
     from distributed import as_completed  # noqa: PLC0415
 
-    parts = [jobs[start : start + TOGETHER] for start in range(0, len(jobs), TOGETHER)]
-    futures = dict(zip(client.map(partial(_several, work), parts, pure=False), parts, strict=True))
+    chunks = [jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)]
+    futures = dict(
+        zip(client.map(partial(_run_several, work), chunks, pure=False), chunks, strict=True)
+    )
     try:
         for future in as_completed(list(futures)):
-            part = futures.pop(future)
+            chunk = futures.pop(future)
             if future.status not in ("finished", "error"):
                 raise Px4FuseError("the scheduler is gone.")
             error = future.exception()  # its worker ended several times, or cannot load the job
-            failed = Failed(one_line(f"{type(error).__name__}: {error}", 300))
-            found = [failed] * len(part) if error else future.result()
-            yield from zip(part, found, strict=True)
+            failed = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
+            results = [failed] * len(chunk) if error else future.result()
+            yield from zip(chunk, results, strict=True)
     finally:
         if futures and client.status == "running":
             client.cancel(list(futures))
 
 
-def _several(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
+def _run_several(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
     """What a cluster's worker does: some jobs, one by one in a process apart from its own."""
     # by Dask's default a worker's process is a daemon, which may have no children
     multiprocessing.current_process().daemon = False
-    found = dict(work(jobs, processes=1))
-    return [found[index] for index in range(len(jobs))]
+    results_by_index = dict(work(jobs, processes=1))
+    return [results_by_index[index] for index in range(len(jobs))]

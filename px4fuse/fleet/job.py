@@ -8,7 +8,7 @@ import msgspec
 
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError
 from px4fuse.fleet.logs import local_file
-from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, log_columns, rows_of, what_was_found
+from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, axis_rows, finding_columns, log_columns
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.request import ComparisonRequest, with_options
 
@@ -73,48 +73,50 @@ def analyse(job: Job) -> Outcome:
             sha256 = _sha256(path)
             if sha256 in job.known:
                 return Outcome(sha256)
-            outcome = _compared(job, path, sha256)
+            outcome = _compare_log(job, path, sha256)
             if _sha256(path) != sha256:
                 again = "Run the same command again when it is complete."
                 raise LogError("it changed while it was read", again)
             return outcome
     except Px4FuseError as error:
-        return Outcome(sha256, (refused(error, FAILED) | {"log_sha256": sha256},))
+        return Outcome(sha256, (refused_row(error, FAILED) | {"log_sha256": sha256},))
 
 
-def refused(error: Px4FuseError, status: str, name: str = "") -> Row:
+def refused_row(error: Px4FuseError, status: str, name: str = "") -> Row:
     """The row of a log that could not be compared: what is wrong, and what to do."""
     reason = with_options(error.reason).removeprefix(f"{name}: ")
     return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
 
 
-def _compared(job: Job, path: Path, sha256: str) -> Outcome:
+def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
     # only workers need all of it
-    from px4fuse.analysis import AidsAlone, read_flight, run_or_judge_aids  # noqa: PLC0415
+    from px4fuse.analysis import AidsOnlyAnalysis, read_flight, run_or_evaluate_aids  # noqa: PLC0415
     from px4fuse.findings import find_aids  # noqa: PLC0415
-    from px4fuse.results.build import log_part, results  # noqa: PLC0415
+    from px4fuse.results.build import log_record, results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     request = msgspec.structs.replace(job.request, log=str(path))
-    known: Row = {"name": path.name, "log_sha256": sha256}
+    common: Row = {"name": path.name, "log_sha256": sha256}
     try:
         flight = read_flight(request)
-        known |= log_columns(log_part(flight))
-        analysis = run_or_judge_aids(request, flight=flight)
-        if isinstance(analysis, AidsAlone):
-            known |= what_was_found(find_aids(analysis.aids), analysis.aids)
-            lacking = MissingDataError(analysis.lacking.reason, analysis.lacking.remedy)
-            return Outcome(sha256, (known | refused(lacking, NOT_JUDGED, path.name),))
-        found = results(request, analysis)
-        text, report = to_json(found), b""
+        common |= log_columns(log_record(flight))
+        analysis = run_or_evaluate_aids(request, flight=flight)
+        if isinstance(analysis, AidsOnlyAnalysis):
+            common |= finding_columns(find_aids(analysis.aids), analysis.aids)
+            missing_data = MissingDataError(
+                analysis.missing_data.reason, analysis.missing_data.remedy
+            )
+            return Outcome(sha256, (common | refused_row(missing_data, NOT_JUDGED, path.name),))
+        contract_results = results(request, analysis)
+        text, report = to_json(contract_results), b""
         if job.reports:
             from px4fuse.report.pdf import render  # noqa: PLC0415
 
-            report = render(analysis, found, text)
+            report = render(analysis, contract_results, text)
     except Px4FuseError as error:
         status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
-        return Outcome(sha256, (known | refused(error, status, path.name),))
-    return Outcome(sha256, tuple(rows_of(found)), text.encode(), report)
+        return Outcome(sha256, (common | refused_row(error, status, path.name),))
+    return Outcome(sha256, tuple(axis_rows(contract_results)), text.encode(), report)
 
 
 def _sha256(path: Path) -> str:

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from px4fuse.errors import LogError, SettingsError
+from px4fuse.input_files import add_input
 from px4fuse.reading import max_log_bytes
 from px4fuse.results.reading import one_line
 
@@ -43,12 +44,12 @@ class FoundLog:
     size_bytes: int | None
 
 
-def find_logs(given: Iterable[str]) -> list[FoundLog]:
+def find_logs(patterns: Iterable[str]) -> list[FoundLog]:
     """Logs by what a person gave, each once, in the order of their names.
 
     Parameters
     ----------
-    given : iterable of str
+    patterns : iterable of str
         Files, folders (all logs in them, by their suffixes), globs and URLs.
 
     Raises
@@ -56,42 +57,47 @@ def find_logs(given: Iterable[str]) -> list[FoundLog]:
     SettingsError
         There is no log in one of them, or a package is missing that its kind of URL requires.
     """
-    found = {log.address: log for one in given for log in _logs_in(one)}
-    if not found:
+    logs_by_address = {log.address: log for pattern in patterns for log in _logs_in(pattern)}
+    if not logs_by_address:
         raise SettingsError("no logs: give files, folders, globs or URLs.")
-    return sorted(found.values())
+    return sorted(logs_by_address.values())
 
 
-def _logs_in(given: str) -> list[FoundLog]:
-    if not given:
+def _logs_in(pattern: str) -> list[FoundLog]:
+    if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders or URLs.")
-    files, root = _file_system(given)
+    files, root = _file_system(pattern)
     try:
         if files.isdir(root):
-            every = files.find(root, detail=True)
+            all_files = files.find(root, detail=True)
             infos = {
-                path: info for path, info in every.items()
+                path: info
+                for path, info in all_files.items()
                 if PurePosixPath(path).suffix.lower() in SUFFIXES
-            }  # fmt: skip
+            }
         elif files.exists(root):  # of a device or pipe its worker says that it is none
             infos = {root: files.info(root) if files.isfile(root) else {}}
         else:
-            every = files.glob(root, detail=True) if any(sign in given for sign in "*?[") else {}
-            infos = {path: info for path, info in every.items() if info["type"] == "file"}
+            all_files = (
+                files.glob(root, detail=True) if any(sign in pattern for sign in "*?[") else {}
+            )
+            infos = {path: info for path, info in all_files.items() if info["type"] == "file"}
     # OSError, and what the package of each kind of URL defines: no account, no such bucket
     except Exception as error:
         raise SettingsError(
-            f"{given}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
+            f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
         ) from error
     if not infos:
-        raise SettingsError.of("no_logs", given=given, suffixes=", ".join(SUFFIXES))
-    found = []
+        raise SettingsError.of("no_logs", given=pattern, suffixes=", ".join(SUFFIXES))
+    found_logs = []
     for path, info in infos.items():
         address = path if _is_local(files) else files.unstrip_protocol(path)
-        is_relative = _is_local(files) and not Path(given).is_absolute()
+        is_relative = _is_local(files) and not Path(pattern).is_absolute()
         log = os.path.relpath(path) if is_relative else address
-        found.append(FoundLog(_name(path), log, address, info.get("size")))
-    return found
+        found_logs.append(FoundLog(_name(path), log, address, info.get("size")))
+        if _is_local(files):
+            add_input(Path(path))
+    return found_logs
 
 
 @contextmanager

@@ -7,22 +7,33 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.findings import named
-from px4fuse.fleet.rows import BETWEEN_FINDINGS, DONE, FAILED, PLACES
-from px4fuse.plain import factor_words, few_words, number_words
+from px4fuse.findings import finding_title
+from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, PLACES
+from px4fuse.plain import format_factor, format_number, join_first
 from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Part, Row
 from px4fuse.webpage.safe import clean, local_link
 
-LOOKS = {"done": "good", "not judged": "open", "failed": "bad"}
-FILES = (("The report (PDF)", "report"), ("The results (JSON)", "results"))
+STATUS_STYLES = {"done": "good", "not judged": "open", "failed": "bad"}
+FILE_LINKS = (("The report (PDF)", "report"), ("The results (JSON)", "results"))
 # Unfolded, the table's columns stand under their own names: those of each axis, and the others
-BY_AXIS = [name for name, place in PLACES.items() if "{" in place]
-OF_LOG = [
-    name for name, place in PLACES.items()
-    if name not in (*BY_AXIS, "axis", "status", "reason", "remedy", "story", "findings", "results",
-                    "report")
-]  # fmt: skip
+AXIS_COLUMNS = [name for name, place in PLACES.items() if "{" in place]
+LOG_COLUMNS = [
+    name
+    for name, place in PLACES.items()
+    if name
+    not in (
+        *AXIS_COLUMNS,
+        "axis",
+        "status",
+        "reason",
+        "remedy",
+        "story",
+        "findings",
+        "results",
+        "report",
+    )
+]
 FILTERS = (
     ("Status", "status", "Every status"),
     ("Vehicle", "vehicle", "Every vehicle"),
@@ -31,7 +42,7 @@ FILTERS = (
     ("To set", "remedy", "Whatever is missing"),
 )
 # What speaks for a log: along the aisle where that is known, else both horizontal axes
-MAIN = (("aisle",), ("north", "east"), ("down",))
+MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
 #: One log: every column that its rows have something in, from the main axes first, and
 #: ``factors`` ("kf" and "ekf2": how many times √S is overstated, by the mean NIS of all updates
@@ -61,89 +72,101 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     names = short_names(logs)
     rows = []
     for log in logs:
-        said = [named(finding) for finding in log["findings"]]
+        finding_titles = [finding_title(finding) for finding in log["findings"]]
         vehicle = log.get("vehicle", "")
         cells = (
             Cell(log["name"], log["name"], log["log"].rpartition("/")[0]),
-            frame.words(log.get("date", "")[:10]),
-            frame.words(names.get(vehicle, str(vehicle))),
-            frame.words(log.get("firmware", "")),
-            Cell(log["status"], log["status"], look=LOOKS[log["status"]]),
-            *(_figure(log["factors"].get(whose), overstated_words) for whose in ("kf", "ekf2")),
-            *(_figure(log.get(name), number_words)
-              for name in ("sigma_z_m", "clock_offset_s", "position_rmse_m")),
-            Cell() if log["status"] == FAILED else
-            frame.figure(float(len(said)), below=few_words(said, 2)),
-        )  # fmt: skip
-        rows.append(Row(cells, tuple(log["tags"]), _details(log), _beside(log)))
+            frame.text_cell(log.get("date", "")[:10]),
+            frame.text_cell(names.get(vehicle, str(vehicle))),
+            frame.text_cell(log.get("firmware", "")),
+            Cell(log["status"], log["status"], style_class=STATUS_STYLES[log["status"]]),
+            *(
+                _figure(log["factors"].get(filter_name), describe_sigma_ratio)
+                for filter_name in ("kf", "ekf2")
+            ),
+            *(
+                _figure(log.get(name), format_number)
+                for name in ("sigma_z_m", "clock_offset_s", "position_rmse_m")
+            ),
+            Cell()
+            if log["status"] == FAILED
+            else frame.number_cell(float(len(finding_titles)), below=join_first(finding_titles, 2)),
+        )
+        rows.append(Row(cells, tuple(log["tags"]), _details(log), _side_parts(log)))
     return frame.page(
         title=title,
         subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}, compared with {made_with}",
         noun=("log", "logs"),
         columns=(
             Column("Log"),
-            Column("Date (UTC)", "line", narrow="tablet"),
-            Column("Vehicle", "line", narrow="desk"),
-            Column("Firmware", "line", narrow="desk"),
+            Column("Date (UTC)", "line", visible_from="tablet"),
+            Column("Vehicle", "line", visible_from="desk"),
+            Column("Firmware", "line", visible_from="desk"),
             Column("Status"),
             Column("Variance S, ours", "number"),
-            Column("Variance S, EKF2", "number", narrow="tablet"),
-            Column("SIGMA_Z (m)", "number", narrow="tablet"),
-            Column("Clock offset (s)", "number", narrow="desk"),
-            Column("RMSE between (m)", "number", narrow="desk"),
-            Column("Findings", "rank", narrow="desk"),
+            Column("Variance S, EKF2", "number", visible_from="tablet"),
+            Column("SIGMA_Z (m)", "number", visible_from="tablet"),
+            Column("Clock offset (s)", "number", visible_from="desk"),
+            Column("RMSE between (m)", "number", visible_from="desk"),
+            Column("Findings", "rank", visible_from="desk"),
         ),
         rows=rows,
         filters=_filters(logs),
         placeholder="name, vehicle, firmware, finding",
-        otherwise="All rows are in fleet.csv.",
+        full_table_note="All rows are in fleet.csv.",
     )
 
 
 def _figure(value: float | None, words: Callable[[float], str]) -> Cell:
-    return Cell() if value is None else frame.figure(value, words(value))
+    return Cell() if value is None else frame.number_cell(value, words(value))
 
 
 def _details(log: Log) -> tuple[Part, ...]:
     axes = [
-        [name, *(_said(axis.get(name, "")) for axis in log["axes"])]
-        for name in BY_AXIS
+        [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
+        for name in AXIS_COLUMNS
         if any(name in axis for axis in log["axes"])
     ]
     heads = ["", *(axis["axis"] for axis in log["axes"])]
     return (
-        frame.listed("Not judged", [reason for reason, _ in log["lacking"] if reason], warn=True),
-        frame.listed("What to set", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
-        frame.listed("What happened", list(filter(None, log.get("story", "").splitlines()))),
-        frame.listed("Findings", [f"{named(one)} ({one})" for one in log["findings"]]),
-        frame.tabled("Axes", heads if axes else (), axes, range(1, len(heads))),
+        frame.list_part(
+            "Not judged", [reason for reason, _ in log["lacking"] if reason], warn=True
+        ),
+        frame.list_part("What to set", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
+        frame.list_part("What happened", list(filter(None, log.get("story", "").splitlines()))),
+        frame.list_part("Findings", [f"{finding_title(one)} ({one})" for one in log["findings"]]),
+        frame.table_part("Axes", heads if axes else (), axes, range(1, len(heads))),
     )
 
 
-def _beside(log: Log) -> tuple[Part, ...]:
+def _side_parts(log: Log) -> tuple[Part, ...]:
     return (
-        frame.links("Files", [(said, local_link(log.get(name, ""))) for said, name in FILES]),
-        frame.pairs("Flight", [(name, _said(log.get(name, ""))) for name in OF_LOG]),
+        frame.links_part(
+            "Files", [(label, local_link(log.get(name, ""))) for label, name in FILE_LINKS]
+        ),
+        frame.pairs_part(
+            "Flight", [(name, _format_value(log.get(name, ""))) for name in LOG_COLUMNS]
+        ),
     )
 
 
-def _said(value: str | float) -> str:
-    return value if isinstance(value, str) else number_words(float(value))
+def _format_value(value: str | float) -> str:
+    return value if isinstance(value, str) else format_number(float(value))
 
 
 def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
     """What the logs have, most frequent first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
-    words_of: Mapping[str, str] = {tag: said for log in logs for tag, said in log["tags"].items()}
+    words_of: Mapping[str, str] = {tag: words for log in logs for tag, words in log["tags"].items()}
     filters = []
-    for label, kind, every in FILTERS:
+    for label, kind, all_label in FILTERS:
         options = [
             (tag, f"{clean(words_of[tag], 60)} ({count})")
             for tag, count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]
         if options:
-            filters.append((label, [("", every), *options]))
+            filters.append((label, [("", all_label), *options]))
     return filters
 
 
@@ -154,62 +177,70 @@ def logs_of(table: pd.DataFrame) -> list[Log]:
     """One per log, in the order of the table."""
     rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
     present = (table.notna() & (table != "")).to_numpy()
-    for row, there in zip(table.to_dict("records"), present, strict=True):
-        kept = {str(n): value for (n, value), is_there in zip(row.items(), there, strict=True)
-                if is_there}  # fmt: skip
-        rows[str(row["log"])].append(kept)
-    return [_log(axes) for axes in rows.values()]
+    for row, is_present in zip(table.to_dict("records"), present, strict=True):
+        row_values = {
+            str(n): value
+            for (n, value), is_value_present in zip(row.items(), is_present, strict=True)
+            if is_value_present
+        }
+        rows[str(row["log"])].append(row_values)
+    return [_log_summary(axes) for axes in rows.values()]
 
 
-def _log(rows: Sequence[Mapping[str, Any]]) -> Log:
+def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
     axes = [row for row in rows if "axis" in row]
-    main = next((m for names in MAIN if (m := [a for a in axes if a["axis"] in names])), rows)
+    main = next((m for names in MAIN_AXES if (m := [a for a in axes if a["axis"] in names])), rows)
     log: dict[str, Any] = {}
     for row in reversed((*main, *rows)):
         log |= row
-    lacking = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
+    reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     log |= {
         "name": log.get("name") or PurePosixPath(log["log"]).name or "nameless",
         "factors": {
-            whose: factor for whose in ("kf", "ekf2")
-            if (factor := _overstated(main, f"{whose}_nis_mean")) is not None
+            filter_name: factor
+            for filter_name in ("kf", "ekf2")
+            if (factor := _mean_sigma_ratio(main, f"{filter_name}_nis_mean")) is not None
         },
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
-        "lacking": tuple(dict.fromkeys(one for one in lacking if any(one))),
+        "lacking": tuple(dict.fromkeys(one for one in reasons_and_remedies if any(one))),
         "axes": axes,
-        "findings": [part for part in log.get("findings", "").split(BETWEEN_FINDINGS) if part],
-    }  # fmt: skip
+        "findings": [part for part in log.get("findings", "").split(FINDING_SEPARATOR) if part],
+    }
     return log | {"tags": _tags(log)}
 
 
-def _overstated(axes: Sequence[Mapping[str, Any]], name: str) -> float | None:
-    judged = [(row[name], row.get("updates", 1)) for row in axes if name in row]
-    total = sum(nis * updates for nis, updates in judged)
-    return float(sum(updates for _, updates in judged) / total) ** 0.5 if total > 0.0 else None
+def _mean_sigma_ratio(axes: Sequence[Mapping[str, Any]], name: str) -> float | None:
+    nis_and_updates = [(row[name], row.get("updates", 1)) for row in axes if name in row]
+    total = sum(nis * updates for nis, updates in nis_and_updates)
+    return (
+        float(sum(updates for _, updates in nis_and_updates) / total) ** 0.5
+        if total > 0.0
+        else None
+    )
 
 
 def _tags(log: Log) -> dict[str, str]:
     tags = {f"status:{log['status']}": log["status"]}
     for name in ("vehicle", "firmware"):
         tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"no {name} named")
-    tags |= {f"finding:{finding}": named(finding) for finding in log["findings"]}
+    tags |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
     return tags | {f"remedy:{remedy}": remedy or "no advice" for _, remedy in log["lacking"]}
 
 
 def short_names(logs: Sequence[Log]) -> dict[str, str]:
     """Long ids of flight controllers by their last digits, where these tell them apart."""
-    long = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
-    short = {vehicle: f"…{vehicle[-8:]}" for vehicle in long}
-    return short if len(set(short.values())) == len(short) else {}
+    long_ids = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
+    short_ids = {vehicle: f"…{vehicle[-8:]}" for vehicle in long_ids}
+    return short_ids if len(set(short_ids.values())) == len(short_ids) else {}
 
 
-def overstated_words(factor: float) -> str:
+def describe_sigma_ratio(factor: float) -> str:
     """By how much a filter's √S is off.
 
-    >>> [overstated_words(factor) for factor in (1.004, 3.2, 0.25)]
+    >>> [describe_sigma_ratio(factor) for factor in (1.004, 3.2, 0.25)]
     ['right', '3.2 × too large', '4 × too small']
     """
-    off = max(factor, 1.0 / factor)
-    if off < 1.01:
+    ratio = max(factor, 1.0 / factor)
+    if ratio < 1.01:
         return "right"
-    return f"{factor_words(off)} × too {'large' if factor > 1.0 else 'small'}"
+    return f"{format_factor(ratio)} × too {'large' if factor > 1.0 else 'small'}"

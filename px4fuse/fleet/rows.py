@@ -13,12 +13,12 @@ from px4fuse.findings import Finding
 from px4fuse.plain import utc_time
 from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, Log
-from px4fuse.spreadsheet import neutral
+from px4fuse.spreadsheet import neutralise_formulas
 
 DONE, NOT_JUDGED, FAILED = "done", "not judged", "failed"
-BETWEEN_FINDINGS = ";"
+FINDING_SEPARATOR = ";"
 # Which tuning speaks for an axis
-_TUNED_AS = {"north": "horizontal", "east": "horizontal"}
+_TUNING_OF_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
 def read_rows(name: str) -> list[dict[str, str]]:
@@ -47,62 +47,62 @@ def at(found: object, path: str) -> Any:
     return reduce(below, path.split("."), found)
 
 
-def rows_of(found: ComparisonResults) -> list[Row]:
+def axis_rows(results: ComparisonResults) -> list[Row]:
     """Rows of one log, an axis each; columns that are not in them are absent.
 
     A factor says how many times √S is overstated (above 1) or understated (below 1), as
     ``sigma_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
     east together. The clock offset is there where it is determinable.
     """
-    common = log_columns(found.log) | what_was_found(found.findings, found.aids)
-    common["story"] = "\n".join(found.story)
-    clock = bool(at(found, "clock.determinable"))
+    common = log_columns(results.log) | finding_columns(results.findings, results.aids)
+    common["story"] = "\n".join(results.story)
+    clock = bool(at(results, "clock.determinable"))
     rows = []
-    for name, axis in found.axes.items():
-        lacking = next((f for f in axis.filters.values() if isinstance(f, Unavailable)), None)
+    for name, axis in results.axes.items():
+        unavailable = next((f for f in axis.filters.values() if isinstance(f, Unavailable)), None)
         row = common | {
             "axis": name,
             "status": NOT_JUDGED if isinstance(axis.filters["kf"], Unavailable) else DONE,
-            "reason": f"{lacking.what}: {lacking.reason}" if lacking else "",
-            "remedy": lacking.remedy if lacking else "",
+            "reason": f"{unavailable.what}: {unavailable.reason}" if unavailable else "",
+            "remedy": unavailable.remedy if unavailable else "",
         }
         for column, place in PLACES.items():
             if column not in row and place and (clock or not place.startswith("clock.")):
-                tuned = _TUNED_AS.get(name, name)
-                row[column] = at(found, place.format(axis=name, tuned=tuned))
+                tuned = _TUNING_OF_AXIS.get(name, name)
+                row[column] = at(results, place.format(axis=name, tuned=tuned))
         rows.append(row)
     return rows
 
 
-def what_was_found(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
+def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
     """Causes among the findings, and the verdict on each aid that EKF2 fused."""
     causes = [one for one in findings if one.caused_by is None]
     fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "idle"]
     return {
-        "aids": BETWEEN_FINDINGS.join(fused),
-        "findings": BETWEEN_FINDINGS.join(one.id for one in causes),
+        "aids": FINDING_SEPARATOR.join(fused),
+        "findings": FINDING_SEPARATOR.join(one.id for one in causes),
         "severities": sorted({one.severity for one in causes}),
     }
 
 
 def log_columns(log: Log) -> Row:
     """What is known of a log once it is read."""
-    start, found = utc_time(log.start_unix_s), {"log": log}
+    start, values = utc_time(log.start_unix_s), {"log": log}
     places = {name: place for name, place in PLACES.items() if place.startswith("log.")}
-    return {name: at(found, place) for name, place in places.items()} | {
+    return {name: at(values, place) for name, place in places.items()} | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
         "date": f"{start[:19]}Z" if start else "",
     }
 
 
-def table_of(rows: Iterable[Row]) -> pd.DataFrame:
+def fleet_table(rows: Iterable[Row]) -> pd.DataFrame:
     """The fleet's table: all columns in their order, with their types."""
     texts = dict.fromkeys((name for name, kind in COLUMNS.items() if kind == "str"), "")
-    known = [texts | writable(row) for row in rows]
+    known = [texts | clean_row(row) for row in rows]
     return pd.DataFrame(known, columns=list(COLUMNS)).astype(COLUMNS)
 
 
-def writable(row: Row) -> Row:
+def clean_row(row: Row) -> Row:
     """A row without what is absent, and what is not UTF-8 in a file's name replaced."""
     return {
         name: value.encode(errors="replace").decode() if isinstance(value, str) else value
@@ -113,6 +113,10 @@ def writable(row: Row) -> Row:
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
     """The table for Excel and LibreOffice, in which no text of a log acts as a formula."""
-    texts = {name: table[name].map(neutral) for name, kind in COLUMNS.items() if kind == "str"}
+    texts = {
+        name: table[name].map(neutralise_formulas)
+        for name, kind in COLUMNS.items()
+        if kind == "str"
+    }
     text = table.assign(**texts).to_csv(index=False, lineterminator="\r\n", float_format="%.10g")
     return ("\ufeff" + text).encode()

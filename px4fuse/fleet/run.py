@@ -18,19 +18,20 @@ import pandas as pd
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.fleet import TIMEOUT_S
-from px4fuse.fleet.engine import connected, outcomes
-from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, refused
+from px4fuse.fleet.engine import connect_cluster, run_jobs
+from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, refused_row
 from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
-from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, csv_bytes, table_of, writable
+from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, clean_row, csv_bytes, fleet_table
+from px4fuse.input_files import check_output_folder
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
-from px4fuse.workers import MEMORY_BYTES, Failed, run_bounded
+from px4fuse.workers import MEMORY_BYTES, JobFailure, run_bounded
 from px4fuse.writing import write_all
 
 # Columns of the files of a log, relative to the folder
 FILES = ("results", "report")
-_GOES_ON = "What is done is kept: the same command goes on from there."
+_RESUME_NOTE = "What is done is kept: the same command goes on from there."
 
 Progress = Callable[[str, int, int], None]
 
@@ -55,7 +56,7 @@ class Fleet:
     written: tuple[Path, ...]
 
 
-class Kept(msgspec.Struct, frozen=True):
+class CachedRows(msgspec.Struct, frozen=True):
     """The rows of a log, of one px4fuse and one set of settings."""
 
     sha256: str
@@ -79,15 +80,19 @@ class _Run:
     settings: str
     hash_of: dict[str, str] = field(default_factory=dict)  # by address, of those that have rows
     first_of: dict[str, FoundLog] = field(default_factory=dict)  # by hash, whose rows stand for all
-    lost: dict[str, Row] = field(default_factory=dict)  # by address, rows of those that failed
+    failed_rows: dict[str, Row] = field(
+        default_factory=dict
+    )  # by address, rows of those that failed
     reused: set[str] = field(default_factory=set)
 
 
 def batch(
     paths: str | Path | Iterable[str | Path],
     output: str | Path | None = None,
-    *, reports: bool = False, **how: Any,
-) -> pd.DataFrame:  # fmt: skip
+    *,
+    reports: bool = False,
+    **how: Any,
+) -> pd.DataFrame:
     """Compare many logs, on this computer or a Dask cluster.
 
     In a session with a Dask client of its own (``distributed.Client``), that one's cluster does
@@ -127,10 +132,10 @@ def batch(
     OutputError
         A result cannot be written.
     """
-    given = (paths,) if isinstance(paths, str | Path) else paths
+    sources = (paths,) if isinstance(paths, str | Path) else paths
     with TemporaryDirectory(prefix="px4fuse-") as scratch:
         folder = Path(scratch if output is None else output)
-        fleet = run(map(str, given), folder, reports=reports and output is not None, **how)
+        fleet = run(map(str, sources), folder, reports=reports and output is not None, **how)
     return fleet.table if output is not None else fleet.table.assign(results="", report="")
 
 
@@ -163,6 +168,7 @@ def run(
     if find_spec("fsspec") is None or find_spec("pyarrow") is None:
         raise SettingsError("many logs require more", 'Run pip install "px4fuse[batch]".')
     logs = find_logs(paths)
+    check_output_folder(output)
     try:
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
@@ -171,91 +177,103 @@ def run(
         raise SettingsError("`mavlink` and `position` belong to one flight, not to many.")
     sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
     Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)  # refuses what is out of range
-    now = _Run(output, metadata.version("px4fuse"), command_line(request))
-    known = _known(now, reports)
+    state = _Run(output, metadata.version("px4fuse"), command_line(request))
+    hashes_by_size = _cached_hashes(state, reports)
     of_address = {log.address: log for log in logs}
     jobs = [
-        Job(log.address, request, reports, max_log_bytes.get(), frozenset(known[log.size_bytes]))
+        Job(
+            log.address,
+            request,
+            reports,
+            max_log_bytes.get(),
+            frozenset(hashes_by_size[log.size_bytes]),
+        )
         for log in logs
     ]
     bounded = partial(run_bounded, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9))
     with (
-        connected(scheduler) as client,
-        closing(outcomes(client, bounded, jobs, workers)) as work,
+        connect_cluster(scheduler) as client,
+        closing(run_jobs(client, bounded, jobs, workers)) as work,
     ):
         progress("comparing", 0, len(jobs))
         try:
             try:
                 for number, (job, outcome) in enumerate(work, 1):
-                    _keep(now, of_address[job.address], outcome)
-                    progress(f"comparing, {len(now.lost)} failed", number, len(jobs))
+                    _cache_outcome(state, of_address[job.address], outcome)
+                    progress(f"comparing, {len(state.failed_rows)} failed", number, len(jobs))
             finally:
-                fleet = _written(now, logs)
+                fleet = _write_fleet(state, logs)
         except Px4FuseError as error:
-            raise type(error)(f"{error} {_GOES_ON}") from error
+            raise type(error)(f"{error} {_RESUME_NOTE}") from error
     return fleet
 
 
-def _known(now: _Run, reports: bool) -> dict[int | None, set[str]]:
+def _cached_hashes(state: _Run, reports: bool) -> dict[int | None, set[str]]:
     """Hashes of the logs of which everything is there, by their size."""
-    known: dict[int | None, set[str]] = defaultdict(set)
-    for kept in kept_in(now.output, now.px4fuse, now.settings):
-        first = kept.rows[0]
-        files = [now.output / first.get(kind, "") for kind in FILES[: 1 + reports]]
+    hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
+    for cached in load_cached_rows(state.output, state.px4fuse, state.settings):
+        first = cached.rows[0]
+        files = [state.output / first.get(kind, "") for kind in FILES[: 1 + reports]]
         if "axis" not in first or all(file.is_file() for file in files):
-            known[kept.size_bytes].add(kept.sha256)
-    return known
+            hashes_by_size[cached.size_bytes].add(cached.sha256)
+    return hashes_by_size
 
 
-def kept_in(folder: Path, px4fuse: str, settings: str) -> Iterator[Kept]:
+def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[CachedRows]:
     """What a folder keeps of this px4fuse and these settings."""
     for file in sorted((folder / "rows").glob("*.json")):
         try:
-            kept = msgspec.json.decode(file.read_bytes(), type=Kept)
+            cached = msgspec.json.decode(file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
             continue  # not ours, or of another px4fuse: the log is done again
-        if (kept.px4fuse, kept.settings) == (px4fuse, settings):
-            yield kept
+        if (cached.px4fuse, cached.settings) == (px4fuse, settings):
+            yield cached
 
 
-def _keep(now: _Run, log: FoundLog, outcome: Outcome | Failed) -> None:
+def _cache_outcome(state: _Run, log: FoundLog, outcome: Outcome | JobFailure) -> None:
     """Keep what came of a log."""
-    if isinstance(outcome, Failed):
+    if isinstance(outcome, JobFailure):
         remedy = "Allow more with --timeout or --memory, or look at it with px4fuse compare."
-        outcome = Outcome("", (refused(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
+        outcome = Outcome("", (refused_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
     if outcome.rows and outcome.rows[0]["status"] == FAILED:
-        now.lost[log.address] = outcome.rows[0]
+        state.failed_rows[log.address] = outcome.rows[0]
         return
-    first = min(log, now.first_of.get(outcome.sha256, log))
+    first = min(log, state.first_of.get(outcome.sha256, log))
     if not outcome.rows:
-        now.reused.add(outcome.sha256)
+        state.reused.add(outcome.sha256)
     elif first is log:
-        _write(now, log, outcome)
-    now.hash_of[log.address] = outcome.sha256
-    now.first_of[outcome.sha256] = first
+        _write_log(state, log, outcome)
+    state.hash_of[log.address] = outcome.sha256
+    state.first_of[outcome.sha256] = first
 
 
-def _write(now: _Run, log: FoundLog, outcome: Outcome) -> None:
+def _write_log(state: _Run, log: FoundLog, outcome: Outcome) -> None:
     """Write a log's files and its rows together."""
     stem = f"results/{file_stem(log.name, outcome.sha256)}"
-    made = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
-    files = {kind: name if made[name] else "" for kind, name in zip(FILES, made, strict=True)}
-    rows = [writable(row) | files for row in outcome.rows]
-    kept = Kept(outcome.sha256, now.px4fuse, now.settings, log.size_bytes, rows)
-    contents = made | {kept.file: msgspec.json.encode(kept)}
-    write_all({now.output / name: content for name, content in contents.items() if content})
+    named_contents = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
+    files = {
+        kind: name if named_contents[name] else ""
+        for kind, name in zip(FILES, named_contents, strict=True)
+    }
+    rows = [clean_row(row) | files for row in outcome.rows]
+    cached = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
+    contents = named_contents | {cached.file: msgspec.json.encode(cached)}
+    write_all({state.output / name: content for name, content in contents.items() if content})
 
 
-def _written(now: _Run, logs: Iterable[FoundLog]) -> Fleet:
+def _write_fleet(state: _Run, logs: Iterable[FoundLog]) -> Fleet:
     """Make the table of all that is known by now, and write it."""
     severities: set[str] = set()
-    rows_of = {kept.sha256: kept.rows for kept in kept_in(now.output, now.px4fuse, now.settings)}
+    rows_of = {
+        cached.sha256: cached.rows
+        for cached in load_cached_rows(state.output, state.px4fuse, state.settings)
+    }
 
     def rows_of_log(log: FoundLog) -> Iterable[Row]:
-        if log.address not in now.hash_of:
-            return [now.lost[log.address]] if log.address in now.lost else []
-        sha256 = now.hash_of[log.address]
-        first = now.first_of[sha256]
+        if log.address not in state.hash_of:
+            return [state.failed_rows[log.address]] if log.address in state.failed_rows else []
+        sha256 = state.hash_of[log.address]
+        first = state.first_of[sha256]
         if first is log and sha256 in rows_of:
             return rows_of[sha256]
         status, reason = NOT_JUDGED, f"the same file as {first.log}, whose rows stand for both"
@@ -266,19 +284,19 @@ def _written(now: _Run, logs: Iterable[FoundLog]) -> Fleet:
     def rows() -> Iterator[Row]:
         for log in logs:
             common = {"log": log.log, "name": log.name}
-            common |= {"px4fuse": now.px4fuse, "settings": now.settings}
+            common |= {"px4fuse": state.px4fuse, "settings": state.settings}
             for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
                 yield row | common
 
-    table = table_of(rows())
-    page = html_text(table, now.output.resolve().name, f"px4fuse {now.px4fuse}")
+    table = fleet_table(rows())
+    page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")
     parquet = io.BytesIO()
     table.to_parquet(parquet, index=False)
     contents = {
-        now.output / "fleet.parquet": parquet.getvalue(),
-        now.output / "fleet.csv": csv_bytes(table),
-        now.output / "fleet.html": page.encode(),
+        state.output / "fleet.parquet": parquet.getvalue(),
+        state.output / "fleet.csv": csv_bytes(table),
+        state.output / "fleet.html": page.encode(),
     }
     write_all(contents)
-    return Fleet(table, len(now.reused), frozenset(severities), tuple(contents))
+    return Fleet(table, len(state.reused), frozenset(severities), tuple(contents))

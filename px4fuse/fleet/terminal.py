@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from px4fuse.findings import named
+from px4fuse.findings import finding_title
 from px4fuse.fleet.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
-from px4fuse.fleet.rows import BETWEEN_FINDINGS, FAILED
-from px4fuse.plain import factor_words, number_words
+from px4fuse.fleet.rows import FAILED, FINDING_SEPARATOR
+from px4fuse.plain import format_factor, format_number
 from px4fuse.report.page import Page, words
-from px4fuse.report.style import MUTED, SEVERITY_COLOURS
+from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval
 
 if TYPE_CHECKING:
     from px4fuse.fleet.run import Fleet
 
 # Reasons why logs are not compared, and findings
-SHOWN = 8
+MAX_SHOWN = 8
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
 
@@ -24,33 +24,35 @@ NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
 def summary(fleet: Fleet) -> Page:
     """What could not be compared, both filters by axis, and findings."""
     page, logs = Page(), fleet.table.drop_duplicates("log")
-    alone = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
-    causes = alone.agg(["count", "first"]).reset_index()
-    most = causes.sort_values("count", ascending=False, kind="stable")
-    for cause in most.head(SHOWN).to_dict("records"):
-        one = "" if cause["count"] == 1 else f"{cause['count']} logs, one is "
+    uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
+    causes = uncompared.agg(["count", "first"]).reset_index()
+    sorted_causes = causes.sort_values("count", ascending=False, kind="stable")
+    for cause in sorted_causes.head(MAX_SHOWN).to_dict("records"):
+        prefix = "" if cause["count"] == 1 else f"{cause['count']} logs, one is "
         text = "{first}: {status}: {reason}. {remedy}".format_map(cause).rstrip()
-        page.write(one + text, colour=RED if cause["status"] == FAILED else YELLOW)
-    if len(most) > SHOWN:
-        page.write(f"{len(most) - SHOWN} more reasons are in fleet.html.")
-    heads = [f"{whose}\n{what}" for whose in ("ours", "EKF2") for what in ("logs", "factor")]
+        page.write(prefix + text, colour=RED if cause["status"] == FAILED else YELLOW)
+    if len(sorted_causes) > MAX_SHOWN:
+        page.write(f"{len(sorted_causes) - MAX_SHOWN} more reasons are in fleet.html.")
+    heads = [
+        f"{filter_name}\n{what}" for filter_name in ("ours", "EKF2") for what in ("logs", "factor")
+    ]
     lines = []
     for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
         cells = []
         for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
-            cells += [f"{len(factors)}", factor_words(factors.median()) if len(factors) else "–"]
+            cells += [f"{len(factors)}", format_factor(factors.median()) if len(factors) else "–"]
         lines.append((str(axis), *cells))
     if lines:
         page.table(("axis", *heads), lines, right=(1, 2, 3, 4))
-        told = "factor: median of how many times √S is overstated (above 1)"
-        page.write(told, colour=MUTED)
-    found = logs["findings"].str.split(BETWEEN_FINDINGS).explode()
-    for finding, count in found[found != ""].value_counts().head(SHOWN).items():
-        page.write(f"{count} × {named(str(finding))}")
+        factor_note = "factor: median of how many times √S is overstated (above 1)"
+        page.write(factor_note, colour=MUTED_COLOUR)
+    finding_ids = logs["findings"].str.split(FINDING_SEPARATOR).explode()
+    for finding, count in finding_ids[finding_ids != ""].value_counts().head(MAX_SHOWN).items():
+        page.write(f"{count} × {finding_title(str(finding))}")
     counts = logs["status"].value_counts()
-    said = ", ".join(f"{count} {status}" for status, count in counts.items())
+    status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
     again = " The same command tries those that failed again." if FAILED in counts else ""
-    page.write(f"{len(logs)} logs: {said}; {fleet.reused} as before.{again}")
+    page.write(f"{len(logs)} logs: {status_counts}; {fleet.reused} as before.{again}")
     return page
 
 
@@ -76,7 +78,7 @@ def differences(results: ChangeResults) -> Page:
     if rows:
         page.table(NUMBER_HEADS, rows, right=(1, 2, 3, 4))
     least = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
-    page.write(f"Numbers that differ by less than {least} are not listed.", colour=MUTED)
+    page.write(f"Numbers that differ by less than {least} are not listed.", colour=MUTED_COLOUR)
     for found in results.findings:
         label = "New" if found.only_in == "B" else "Gone"
         colour = SEVERITY_COLOURS[found.severity]
@@ -95,7 +97,7 @@ def _plain(value: float | str | None) -> str:
 
 
 def _value(value: float | None, factor: float) -> str:
-    return "" if value is None else number_words(factor * value)
+    return "" if value is None else format_number(factor * value)
 
 
 def _range(interval: Interval | None) -> str:
@@ -103,7 +105,7 @@ def _range(interval: Interval | None) -> str:
         return ""
     low, high = interval
     return (
-        f"above {number_words(low)}"
+        f"above {format_number(low)}"
         if high is None
-        else f"{number_words(low)} to {number_words(high)}"
+        else f"{format_number(low)} to {format_number(high)}"
     )

@@ -9,34 +9,38 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
-from scipy.stats import chi2
 
 from px4fuse.answers import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.comparison.model import AgainstTruth
 from px4fuse.filter.clock import Clock
-from px4fuse.filter.consistency import SIGMA_OFF, HorizontalNis
+from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, HorizontalNis
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
-from px4fuse.loop.model import Closure, Correction, LoopPart, Way
-from px4fuse.plain import capital, factor_words, length_words, p_words
-from px4fuse.record import Maybe, Share
-from px4fuse.results.contract import ASKED, ComparisonResults, LoopResults, Reported, to_plain
+from px4fuse.loop.model import Correction, LoopResult, Way
+from px4fuse.plain import capitalise_first, format_factor, format_length
+from px4fuse.record import OrUnavailable, Share
+from px4fuse.results.contract import (
+    TUNED_FIELDS,
+    ComparisonResults,
+    LoopResults,
+    Reported,
+    to_plain,
+)
 from px4fuse.results.reading import one_line
 from px4fuse.trajectory.evaluation import Score
-from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.verification import flattened, is_number, log_sha256
+from px4fuse.verification.verification import flatten, is_number, log_sha256
 
 MAX_QUOTE = 160
-NOT_BOTH = " (it needs the axes north and east: leave --axis out)"
+NEEDS_BOTH_AXES = " (it needs the axes north and east: leave --axis out)"
 # What stands on one line
 _PLAIN = r"[^\x00-\x1f\x7f]"
 Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*$")]
@@ -78,10 +82,10 @@ class RubricItem(
         return self.report in ("any", kind) and (key is not None or not self.needs_key)
 
 
-def falling(off: float, factor: float) -> float:
+def falling_share(off: float, factor: float) -> float:
     """Share for what is off by a factor: 1 where it is not, 0 from ``factor`` on, by logarithms.
 
-    >>> [round(falling(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
+    >>> [round(falling_share(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
     """
     if off <= 1.0:
@@ -109,7 +113,7 @@ class Evidence:
     @cached_property
     def values(self) -> dict[str, Any]:
         """What the results hold, for paths that a rubric names."""
-        return dict(flattened(to_plain(self.results)))
+        return dict(flatten(to_plain(self.results)))
 
     @cached_property
     def answer(self) -> Answer | None:
@@ -117,7 +121,7 @@ class Evidence:
         return None if self.key is None else self.key.of_log(log_sha256(self.results))
 
     @cached_property
-    def given(self) -> Answer | None:
+    def assigned_answer(self) -> Answer | None:
         """What the answer key gave to this student; the platform knows better who that is."""
         if self.key is None:
             return None
@@ -125,10 +129,12 @@ class Evidence:
         return self.key.of_student(self.owner_id) or claimed
 
     @cached_property
-    def own(self) -> bool:
+    def is_own_log(self) -> bool:
         """Whether the answer key gave this log to this student; without a key nobody knows."""
-        given = self.given
-        return self.key is None or (given is not None and given.sha256 == log_sha256(self.results))
+        assigned_answer = self.assigned_answer
+        return self.key is None or (
+            assigned_answer is not None and assigned_answer.sha256 == log_sha256(self.results)
+        )
 
     @cached_property
     def form(self) -> Answers | str:
@@ -147,33 +153,39 @@ class Evidence:
     @cached_property
     def form_points(self) -> FormPoints | str:
         """What the form is worth, or why nothing."""
-        if self.answer is None or (self.given and not self.own):
-            given = f" ({text_of(self.given.file)})" if self.given else ""
+        if self.answer is None or (self.assigned_answer and not self.is_own_log):
+            assigned_answer = (
+                f" ({text_of(self.assigned_answer.file)})" if self.assigned_answer else ""
+            )
             return (
-                f"this report is not about the log that you were given{given}: make it of that "
+                f"this report is not about the log that you were given{assigned_answer}: make it of that "
                 "log, with your --id"
             )
         if isinstance(self.form, str):
             return self.form
-        truth = self.answer.form
-        return "the answer key has no answers" if truth is None else form_points(self.form, truth)
+        answer_key_form = self.answer.form
+        return (
+            "the answer key has no answers"
+            if answer_key_form is None
+            else form_points(self.form, answer_key_form)
+        )
 
-    def claims(self, *kinds: str) -> bool:
+    def names_mistake(self, *kinds: str) -> bool:
         """Whether the form names one of these mistakes."""
         form = self.form
         return isinstance(form, Answers) and any(one.kind in kinds for one in form.mistakes)
 
-    def has(self, finding: str) -> bool:
+    def has_finding(self, finding: str) -> bool:
         """Whether the report lists a finding."""
         return any(one.id == finding for one in self.results.findings)
 
-    def why_absent(self, path: str) -> str:
+    def missing_reason(self, path: str) -> str:
         """Why there is nothing at a path, in brackets, as far as the results say it."""
         steps = path.split(".")
         for end in range(len(steps), 0, -1):
             for _, reason in values_at(self.values, ".".join((*steps[:end], "reason"))):
-                return bracketed(reason)
-        return NOT_BOTH if HORIZONTAL in path else ""
+                return in_brackets(reason)
+        return NEEDS_BOTH_AXES if HORIZONTAL in path else ""
 
 
 def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
@@ -191,10 +203,10 @@ def text_of(value: str) -> str:
     return one_line(value, MAX_QUOTE)
 
 
-def bracketed(reason: str) -> str:
+def in_brackets(reason: str) -> str:
     """A reason behind what it is the reason of."""
-    said = text_of(reason).rstrip(".")
-    return f" ({said})" if said else ""
+    text = text_of(reason).rstrip(".")
+    return f" ({text})" if text else ""
 
 
 # ------------------------------------------------------------------ the report
@@ -209,7 +221,7 @@ class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
     def score(self, evidence: Evidence) -> Scored:
         """All or nothing."""
         verdict = evidence.verdict
-        why = bracketed("".join(verdict.reasons[:1]))
+        why = in_brackets("".join(verdict.reasons[:1]))
         return float(verdict.status == "verified"), f"Verification says: {verdict.status}{why}."
 
 
@@ -238,25 +250,28 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
         return 0.0 if zero is None else max(self.at_least - zero, zero - self.at_most)
 
     def _share(self, number: float) -> float:
-        off = max(self.at_least - number, number - self.at_most, 0.0)
-        if off == 0.0:
+        excess = max(self.at_least - number, number - self.at_most, 0.0)
+        if excess == 0.0:
             return 1.0
-        return max(1.0 - off / self._width(), 0.0) if self._width() > 0.0 else 0.0
+        return max(1.0 - excess / self._width(), 0.0) if self._width() > 0.0 else 0.0
 
     def score(self, evidence: Evidence) -> Scored:
         """1 within the bounds, falling to 0 at ``zero_at``."""
         values = values_at(evidence.values, self.path)
-        found = {name: float(one) for name, one in values if is_number(one)}
-        if not found:
-            what = self.name or f"the number {self.path}"
-            return 0.0, f"Your report has no number for {what}{evidence.why_absent(self.path)}."
-        name, number = min(found.items(), key=lambda pair: self._share(pair[1]))
-        share, what = self._share(number), self.name or f"the number {text_of(name)}"
+        values_by_path = {name: float(one) for name, one in values if is_number(one)}
+        if not values_by_path:
+            label = self.name or f"the number {self.path}"
+            return (
+                0.0,
+                f"Your report has no number for {label}{evidence.missing_reason(self.path)}.",
+            )
+        name, number = min(values_by_path.items(), key=lambda pair: self._share(pair[1]))
+        share, label = self._share(number), self.name or f"the number {text_of(name)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
         limits = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
-        said = f"{capital(what)} is {f'{number:.4g} {self.unit}'.strip()}"
+        statement = f"{capitalise_first(label)} is {f'{number:.4g} {self.unit}'.strip()}"
         advice = f" {self.advice}" if share < 1.0 and self.advice else ""
-        return share, f"{said}; {' and '.join(limits)} was asked for.{advice}"
+        return share, f"{statement}; {' and '.join(limits)} was asked for.{advice}"
 
 
 class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
@@ -266,15 +281,18 @@ class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
 
     def score(self, evidence: Evidence) -> Scored:
         """Share of the points of :mod:`px4fuse.grading.form_points`."""
-        found = evidence.form_points
-        if isinstance(found, str):
-            return 0.0, f"{capital(found)}."
-        parts = [
-            f"{name} {points:.3g} of {found.of[name]:g}"
-            for name, points in found.parts.items()
-            if found.of[name]
+        form_result = evidence.form_points
+        if isinstance(form_result, str):
+            return 0.0, f"{capitalise_first(form_result)}."
+        points_by_part = [
+            f"{name} {points:.3g} of {form_result.of[name]:g}"
+            for name, points in form_result.points_by_part.items()
+            if form_result.of[name]
         ]
-        return found.share, f"Of 100: {', '.join(parts)}. {capital('; '.join(found.said))}."
+        return (
+            form_result.share,
+            f"Of 100: {', '.join(points_by_part)}. {capitalise_first('; '.join(form_result.feedback))}.",
+        )
 
 
 class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):
@@ -294,10 +312,10 @@ class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):
 
 
 # Findings about stamps for which no single offset is right
-CHANGING = ("source_clock_changes", "source_stamps_of_arrival")
+CHANGING_CLOCK_FINDINGS = ("source_clock_changes", "source_stamps_of_arrival")
 Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
 # How each noise is called, its unit, and its option
-SIGMAS: dict[Sigma, tuple[str, str, str]] = {
+NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
     "sigma_z_m": ("SIGMA_Z", "m", "--sigma-z"),
     "sigma_a_m_s2": ("SIGMA_A", "m/s²", "--sigma-a"),
 }
@@ -313,63 +331,65 @@ class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
         """1 in the interval, falling to 0 at ``factor`` from its end."""
         if evidence.comparison is None:
             return NO_COMPARISON
-        return _tuned(evidence, evidence.comparison, self.setting, self.factor)
+        return _score_tuning(evidence, evidence.comparison, self.setting, self.factor)
 
 
-def _tuned(
+def _score_tuning(
     evidence: Evidence, comparison: ComparisonResults, name: Sigma, factor: float = 2.0
 ) -> Scored:
-    label, unit, option = SIGMAS[name]
-    chosen: float = getattr(comparison.settings, name)
+    label, unit, option = NOISE_SETTINGS[name]
+    chosen_value: float = getattr(comparison.settings, name)
     tuned = comparison.tuning.get(HORIZONTAL)
-    interval = getattr(tuned, f"{ASKED[name]}_interval", None)
+    interval = getattr(tuned, f"{TUNED_FIELDS[name]}_interval", None)
     if interval is None or interval[1] is None:
-        why = evidence.why_absent(f"tuning.{HORIZONTAL}")
+        why = evidence.missing_reason(f"tuning.{HORIZONTAL}")
         return 0.0, f"Your report has no interval for {label}{why}."
     low, high = interval
-    if name == "sigma_z_m" and evidence.has("source_may_drift"):
+    if name == "sigma_z_m" and evidence.has_finding("source_may_drift"):
         # small innovations do not make a drifting source trustworthy: up to its error is right
         high = max(high, _error_m(comparison))
-    off = max(chosen / high if high > 0.0 else math.inf, low / chosen, 1.0)
-    side = "within" if off == 1.0 else "above" if chosen > high else "below"
-    said = f"Your {label} {chosen:.3g} {unit} is {side} what the data ask for"
-    advice = f", by a factor of {factor_words(off)}: try a value between with {option}"
-    wanted = f"({low:.3g} to {high:.3g} {unit})"
-    return falling(off, factor), f"{said} {wanted}{advice * (off != 1.0)}."
+    factor_off = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
+    side = "within" if factor_off == 1.0 else "above" if chosen_value > high else "below"
+    statement = f"Your {label} {chosen_value:.3g} {unit} is {side} what the data ask for"
+    advice = f", by a factor of {format_factor(factor_off)}: try a value between with {option}"
+    ml_interval_text = f"({low:.3g} to {high:.3g} {unit})"
+    return falling_share(
+        factor_off, factor
+    ), f"{statement} {ml_interval_text}{advice * (factor_off != 1.0)}."
 
 
 def _error_m(comparison: ComparisonResults) -> float:
     """How wrong a source that drifts is, as far as a loop or the truth tells; 0 where neither."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
-    found = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
-    if isinstance(comparison.loop, LoopPart):
-        found.append(comparison.loop.closure_error_m or 0.0)
-    return max(found, default=0.0)
+    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
+    if isinstance(comparison.loop, LoopResult):
+        errors_m.append(comparison.loop.closure_error_m or 0.0)
+    return max(errors_m, default=0.0)
 
 
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
     """The filter is consistent, or no setting makes it so; no points from ``factor`` in σ on."""
 
-    factor: Factor = SIGMA_OFF
+    factor: Factor = SIGMA_FACTOR_FINDING
 
     def score(self, evidence: Evidence) -> Scored:
         """By the verdict on both horizontal axes together."""
         comparison = evidence.comparison
         if comparison is None:
             return NO_COMPARISON
-        judged = comparison.horizontal.get("kf")
-        if not isinstance(judged, HorizontalNis):
-            why = evidence.why_absent(f"{HORIZONTAL}.kf")
+        nis_result = comparison.horizontal.get("kf")
+        if not isinstance(nis_result, HorizontalNis):
+            why = evidence.missing_reason(f"{HORIZONTAL}.kf")
             return 0.0, f"There is no verdict on your filter{why}."
-        if judged.verdict == "consistent":
+        if nis_result.verdict == "consistent":
             return 1.0, "Your filter is consistent."
-        said = f"{capital(judged.verdict)} {factor_words(judged.times_off)} times in σ"
-        if all(_tuned(evidence, comparison, name)[0] == 1.0 for name in SIGMAS):
+        statement = f"{capitalise_first(nis_result.verdict)} {format_factor(nis_result.sigma_error_factor)} times in σ"
+        if all(_score_tuning(evidence, comparison, name)[0] == 1.0 for name in NOISE_SETTINGS):
             return 1.0, (
-                f"{said}, with the noises that the data ask for: what is left no setting fixes."
+                f"{statement}, with the noises that the data ask for: what is left no setting fixes."
             )
-        return falling(judged.times_off, self.factor), (
-            f"{said}: look at what the tuning page asks for, and for what the model does not "
+        return falling_share(nis_result.sigma_error_factor, self.factor), (
+            f"{statement}: look at what the tuning page asks for, and for what the model does not "
             "explain."
         )
 
@@ -391,172 +411,88 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
         clock = evidence.comparison.clock
         if not isinstance(clock, Clock) or not clock.determinable:
             share = self.undeterminable if isinstance(clock, Clock) else 0.0
-            why = bracketed(clock.reason or "")
-            said = f"Your flight does not determine the clock offset{why}."
-            return 1.0 if evidence.answer is not None else share, said
+            why = in_brackets(clock.reason or "")
+            statement = f"Your flight does not determine the clock offset{why}."
+            return 1.0 if evidence.answer is not None else share, statement
         (low, high), applied = clock.interval_s, clock.applied_s
-        said = f"You applied a clock offset of {applied:.3f} s"
+        statement = f"You applied a clock offset of {applied:.3f} s"
         if low - self.margin_s <= applied <= high + self.margin_s:
-            return 1.0, f"{said}, which is what the data ask for ({low:.3f} to {high:.3f} s)."
-        if any(map(evidence.has, CHANGING)):
-            said = "The offset of the position stamps changes in your flight"
-            known = evidence.claims("clock-jump", "clock-drift")
+            return 1.0, f"{statement}, which is what the data ask for ({low:.3f} to {high:.3f} s)."
+        if any(map(evidence.has_finding, CHANGING_CLOCK_FINDINGS)):
+            statement = "The offset of the position stamps changes in your flight"
+            known = evidence.names_mistake("clock-jump", "clock-drift")
             advice = ", as your form says" if known else "; say in your form from when on it holds"
-            return 1.0 if known else self.undeterminable, f"{said}{advice}."
-        return 0.0, f"{said} where the data ask for {low:.3f} to {high:.3f} s: --clock-offset auto."
+            return 1.0 if known else self.undeterminable, f"{statement}{advice}."
+        return (
+            0.0,
+            f"{statement} where the data ask for {low:.3f} to {high:.3f} s: --clock-offset auto.",
+        )
 
 
 # ------------------------------------------------------------------ a loop
 
 
-OPEN = "open-end"
-# A tape and a pilot's feet are not better, and an open end is not smaller
-TAPE_M = 0.5
-# A drift stated so many times larger or smaller than it is
-FAR_OFF = 4.0
-# What odometry indoors reaches, the defaults of px4fuse loop: after 100 m
-USUAL_DRIFT_M, USUAL_HEADING_DEG = 1.0, 3.0
-# Chance of an end that fits this well or better, and from which on an error is as usual
-TOO_GOOD, USUAL_P = 0.001, 0.05
-# Of an end left open where no key says where it landed, and of a correction without a reference
-OPEN_UNKNOWN, WITHOUT_REFERENCE = 0.8, 0.5
-
-
-def contradictions(evidence: Evidence, closed: bool = False) -> Iterator[str]:
-    """Options of a loop that its log or the answer key contradict: sentences.
-
-    ``closed``: also that it is taken for closed, where it truly landed elsewhere.
-    """
-    results = evidence.results
-    if not isinstance(results, LoopResults):
-        return
-    request, landed = results.request, _landed_m(evidence)
-    at = request.landed_at
-    said = math.hypot(at.forward_m, at.right_m) if at else 0.0
-    if at and landed is not None and abs(said - landed) > TAPE_M:
-        yield (
-            f"--landed-at says {length_words(said)} from the place of take-off; it landed "
-            f"{length_words(landed)} from it."
-        )
-    if landed is not None and landed <= TAPE_M and not request.came_back:
-        yield "--open says that it did not come back, but it landed where it took off."
-    stated = _stated_drift(results)
-    true = 0.0 if evidence.answer is None else evidence.answer.scenario.get("vio_drift") or 0.0
-    off = stated
-    if isinstance(true, float) and true > 0.0:  # stated too small, too, makes a closure false
-        off = request.position_drift_m / (100.0 * true)
-        off = max(off, 1.0 / off, request.heading_drift_deg / USUAL_HEADING_DEG)
-    if off > FAR_OFF:
-        yield "--drift and --heading-drift are far from how the odometry drifts."
-    chosen = at is not None or stated != 1.0
-    if chosen and any(one.accepted and 1.0 - one.p < TOO_GOOD for one in results.loop.closures):
-        yield (
-            "The loop closes far better than the stated drift lets any loop close: "
-            "--landed-at, --drift or --heading-drift may have been chosen for that."
-        )
-    if closed and landed is not None and landed > TAPE_M and request.came_back and at is None:
-        yield (
-            "It did not land at the place of take-off: say where it did (--landed-at) or leave the "
-            "end open (--open)."
-        )
-
-
-def _stated_drift(results: LoopResults) -> float:
-    """How many times the usual drift was stated, at most."""
-    request = results.request
-    position = request.position_drift_m / USUAL_DRIFT_M
-    return max(position, request.heading_drift_deg / USUAL_HEADING_DEG)
-
-
-def _landed_m(evidence: Evidence) -> float | None:
-    """How far from the place of take-off it landed; None where only the vehicle knows."""
-    return None if evidence.answer is None else evidence.answer.truth.get("closure_error_m")
+# Distance of landing and take-off up to which a loop is closed (m): the accuracy of a tape
+CLOSED_M = 0.5
+# Share of the last quarter for a corrected path without a reference, which has no ATE
+NO_REFERENCE_SHARE = 0.5
 
 
 class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
-    """The loop was measured, its end is taken for what it is, and the path corrected if it closes.
+    """Quarters: closure error measured, closure accepted, path corrected, ATE reduced.
 
-    A quarter for measuring, one for a closure error that the odometry's usual drift explains, one
-    for correcting, one for a path that became better by it; where the end is rightly open the last
-    three for saying so.
+    A flight that by the answer key ended elsewhere has all of them for a path without an accepted
+    closure.
     """
 
     def score(self, evidence: Evidence) -> Scored:
-        """Quarters; the first alone where an option contradicts the log or the key."""
-        results, loop = evidence.results, evidence.results.loop
-        opened = isinstance(results, LoopResults) and not results.request.came_back
-        if not isinstance(loop, LoopPart) or (loop.closure_error_m is None and not opened):
-            missing = loop.known_end if isinstance(loop, LoopPart) else loop
-            why = bracketed(getattr(missing, "reason", ""))
+        """Return the quarters, and a sentence with closure error and ATE."""
+        loop = evidence.results.loop
+        accepted = isinstance(loop, LoopResult) and any(one.accepted for one in loop.closures)
+        landed_m = evidence.answer.truth.get("closure_error_m") if evidence.answer else None
+        if landed_m is not None and landed_m > CLOSED_M and not accepted:
+            landed = format_length(landed_m)
+            return 1.0, f"Your vehicle landed {landed} from the take-off: the path stays as it is."
+        if not isinstance(loop, LoopResult) or loop.closure_error_m is None:
+            missing = loop.known_end if isinstance(loop, LoopResult) else loop
+            why = in_brackets(getattr(missing, "reason", ""))
             return 0.0, f"Your report measures no loop{why}."
         if loop.absolute:
             return 0.0, "Your loop is on a track that does not drift; measure it on odometry."
-        off, path = length_words(loop.closure_error_m or 0.0), length_words(loop.path_length_m)
-        said = f"You measured a closure error of {off} in {path}"
-        if opened:
-            said = "You left the end open (--open)"
-        accepted = [one for one in loop.closures if one.accepted]
-        wrong = next(contradictions(evidence, bool(accepted)), "")
-        if wrong and loop.closures:
-            return 0.25, f"{said}. {wrong}"
+        error_text, path = format_length(loop.closure_error_m), format_length(loop.path_length_m)
+        statement = f"You measured a closure error of {error_text} in {path}"
         if not accepted:
-            share, why = _open_end(evidence, loop)
-            false = "; the closure was rejected as false" if loop.closures else ""
-            worth = (1.0 + 3.0 * share) / 4.0 if share or loop.closures else 0.0
-            return worth, f"{said}{false}, {why}."
-        closed, usual = _closed(evidence, accepted)
-        corrected, comment = _corrected(loop.corrections)
-        return (1.0 + closed + corrected) / 4.0, f"{said}, {usual}{comment}"
+            return 0.25, f"{statement}; no closure was accepted."
+        corrected, comment = _score_corrections(loop.corrections)
+        return (2.0 + corrected) / 4.0, f"{statement}; the closure was accepted{comment}"
 
 
-def _open_end(evidence: Evidence, loop: LoopPart) -> Scored:
-    """What the words "it did not come back" are worth, and why."""
-    landed = _landed_m(evidence)
-    if landed is not None and landed <= TAPE_M:
-        return 0.0, "but your vehicle landed where it took off"
-    if evidence.claims(OPEN):
-        known = landed is not None or loop.closures
-        return 1.0 if known else OPEN_UNKNOWN, "as your form says"
-    return 0.5, "but your form does not say that it landed elsewhere"
-
-
-def _closed(evidence: Evidence, accepted: Sequence[Closure]) -> Scored:
-    """By the chance of such an error, which a larger drift that was stated does not make usual."""
-    results = evidence.results
-    scale = max(_stated_drift(results), 1.0) ** 2 if isinstance(results, LoopResults) else 1.0
-    p = min(float(chi2.sf(one.d2 * scale, one.degrees_of_freedom)) for one in accepted)
-    if p >= USUAL_P:
-        return 1.0, f"as odometry that drifts as usual may have ({p_words(p)})"
-    share = falling(USUAL_P / p, USUAL_P / GATE_ALPHA) if p > 0.0 else 0.0
-    return share, (
-        f"more than the odometry's usual drift explains ({p_words(p)}; look for what made it "
-        "drift, or whether it landed elsewhere)"
-    )
-
-
-def _corrected(corrections: Mapping[Way, Maybe[Correction]]) -> Scored:
+def _score_corrections(corrections: Mapping[Way, OrUnavailable[Correction]]) -> Scored:
     """One for a corrected path and one for an ATE below the uncorrected one."""
     ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
-    done = [one for one in map(corrections.get, ways) if isinstance(one, Correction)]
-    if not done:
+    corrected_paths = [one for one in map(corrections.get, ways) if isinstance(one, Correction)]
+    if not corrected_paths:
         return 0.0, ", but the path is not corrected."
-    before = _ates(corrections.get("uncorrected"))
+    before = _ate_by_reference(corrections.get("uncorrected"))
     pairs = [
-        (before[name], now) for one in done for name, now in _ates(one).items() if before.get(name)
-    ]  # fmt: skip
+        (before[name], after_m)
+        for one in corrected_paths
+        for name, after_m in _ate_by_reference(one).items()
+        if before.get(name)
+    ]
     if not pairs:
-        return 1.0 + WITHOUT_REFERENCE, (
+        return 1.0 + NO_REFERENCE_SHARE, (
             ", and corrected the path, but not against a reference: with --reference its error "
             "would show."
         )
-    was, now = min(pairs, key=lambda pair: pair[1] / pair[0])
-    changed = f", and corrected the path, whose ATE went from {was:.3g} m to {now:.3g} m"
-    if now < was:
+    before_m, after_m = min(pairs, key=lambda pair: pair[1] / pair[0])
+    changed = f", and corrected the path, whose ATE went from {before_m:.3g} m to {after_m:.3g} m"
+    if after_m < before_m:
         return 2.0, f"{changed}."
     return 1.0, f"{changed}: explain why the correction makes it worse."
 
 
-def _ates(correction: object) -> dict[str, float]:
+def _ate_by_reference(correction: object) -> dict[str, float]:
     """ATE (m) of a correction by the reference that it was scored against."""
     scores = correction.scores if isinstance(correction, Correction) else {}
     return {

@@ -1,7 +1,7 @@
 """A class as one web page: a student per row, and on top what an instructor asks.
 
-Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. Pictures of pages
-and PDFs stand in folders beside the page and are loaded as they are unfolded.
+Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. The redrawn PDFs stand in a
+folder beside the page.
 """
 
 import math
@@ -14,8 +14,8 @@ import numpy as np
 
 from px4fuse.answers import form_rows
 from px4fuse.assignment.sheet import number
-from px4fuse.grading.model import TOTAL, Entry, Graded, Item, Override, columns
-from px4fuse.plain import number_words
+from px4fuse.grading.model import TOTAL, Entry, GradedReport, Item, Override, columns
+from px4fuse.plain import format_number
 from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Part, Row
 from px4fuse.webpage.safe import local_link, template
@@ -23,7 +23,7 @@ from px4fuse.webpage.safe import local_link, template
 BINS = 10
 MISSING = "nothing handed in"
 # How each status looks, and its sign, from the best to what says nothing
-LOOKS: dict[str, tuple[str, str]] = {
+STATUS_STYLES: dict[str, tuple[str, str]] = {
     "verified": ("good", "✓"),
     "numbers differ": ("bad", "≠"),
     "other log": ("odd", "⇄"),
@@ -31,8 +31,8 @@ LOOKS: dict[str, tuple[str, str]] = {
     "page differs": ("odd", "≠"),
     MISSING: ("open", "–"),
 }
-STATUSES = tuple(LOOKS)
-SHOWN = (*STATUSES, "pending", "to read", "flagged", "late", "said by you")
+STATUSES = tuple(STATUS_STYLES)
+FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "said by you")
 
 
 def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
@@ -52,21 +52,21 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     """
     items, numbers = columns(entries)
     counts = Counter(tag for entry in entries for tag in _tags(entry))
-    tags = (*SHOWN, *sorted(tag for tag in counts if tag not in SHOWN))
+    tags = (*FILTER_TAGS, *sorted(tag for tag in counts if tag not in FILTER_TAGS))
     options = [(tag, f"{tag} ({counts[tag]})") for tag in tags if counts[tag]]
     return frame.page(
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        above=_above(entries, counts),
+        above=_above_html(entries, counts),
         noun=("student", "students"),
         columns=(
             Column("Student"),
-            Column("Id", "line", narrow="tablet"),
+            Column("Id", "line", visible_from="tablet"),
             Column("Status", "rank"),
             Column("Points", "number"),
-            Column("Handed in", "line", narrow="desk"),
-            Column("Flags", "rank", narrow="desk"),
+            Column("Handed in", "line", visible_from="desk"),
+            Column("Flags", "rank", visible_from="desk"),
             *(Column(name, "number", "items") for name in items),
             *(Column(name, "number", "numbers") for name in numbers),
         ),
@@ -74,11 +74,11 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
         groups=(("items", "Points of each item"), ("numbers", "Numbers")),
         placeholder="name, id, file, flag",
-        otherwise="All rows are in class.csv.",
+        full_table_note="All rows are in class.csv.",
     )
 
 
-def _above(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
+def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
     """What stands above the table: counts, the points of all, and those of each item."""
     totals = [entry.total for entry in entries if entry.total is not None]
     most = max((entry.of for entry in entries if entry.of > 0.0), default=1.0)
@@ -88,24 +88,24 @@ def _above(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
         counts=counts,
         averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
         totals=tenths(totals, most) if totals else (),
-        most=(number(most), number_words(most)),
+        most=(number(most), format_number(most)),
         pending=[one.points for one in graded if one.pending],
         number=number,
         items=list(_items(graded)),
     )
 
 
-def _items(graded: Sequence[Graded]) -> Iterator[tuple[Any, ...]]:
+def _items(graded: Sequence[GradedReport]) -> Iterator[tuple[Any, ...]]:
     """Distribution of points per item, as they count: a row of the table each."""
-    found: dict[str, list[Item]] = defaultdict(list)
+    items_by_title: dict[str, list[Item]] = defaultdict(list)
     for one in graded:
         for item in () if one.pending else one.items:
-            found[item.title].append(item)
-    for title, items in found.items():
+            items_by_title[item.title].append(item)
+    for title, items in items_by_title.items():
         shares = [item.points / item.of if item.of else 0.0 for item in items]
-        mean, most = statistics.fmean(i.points for i in items), max(i.of for i in items)
+        mean, max_points = statistics.fmean(i.points for i in items), max(i.of for i in items)
         none, full = sum(share <= 0.0 for share in shares), sum(share >= 1.0 for share in shares)
-        yield title, tenths(shares, 1.0), mean, number(most), none, full
+        yield title, tenths(shares, 1.0), mean, number(max_points), none, full
 
 
 def tenths(values: Sequence[float], most: float) -> list[tuple[int, str]]:
@@ -115,8 +115,8 @@ def tenths(values: Sequence[float], most: float) -> list[tuple[int, str]]:
     (2, '5')
     """
     counts, edges = np.histogram(np.clip(values, 0.0, most), BINS, (0.0, most))
-    words = (number_words(round(edge, 2)) for edge in edges.tolist())
-    return list(zip(counts.tolist(), words, strict=False))
+    lower_edges = (format_number(round(edge, 2)) for edge in edges.tolist())
+    return list(zip(counts.tolist(), lower_edges, strict=False))
 
 
 def _tags(entry: Entry) -> list[str]:
@@ -124,8 +124,8 @@ def _tags(entry: Entry) -> list[str]:
     tags = [one.status if one else MISSING]
     tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if one:
-        tags += ["pending"] * bool(one.pending) + ["to read"] * one.waits
-        tags += [f"missed: {mistake}" for mistake, named in one.mistakes.items() if not named]
+        tags += ["pending"] * bool(one.pending) + ["to read"] * one.awaits_points
+        tags += [f"missed: {mistake}" for mistake, is_named in one.mistakes.items() if not is_named]
     return tags + ["said by you"] * bool(entry.overrides or entry.comment)
 
 
@@ -133,70 +133,78 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     """One student."""
     one = entry.counting
     status = one.status if one else MISSING
-    look, sign = LOOKS[status]
+    style, sign = STATUS_STYLES[status]
     count = len(entry.flags)
-    few = f"{count} flag{'s' if count > 1 else ''}" if count else ""
+    flag_count_text = f"{count} flag{'s' if count > 1 else ''}" if count else ""
     file = one.submission if one else ""
     late_s = entry.late_s or 0.0
     minutes = f"{math.ceil(late_s / 60.0)} min late" * bool(late_s)
     late = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else minutes
     points = {item.title: item.points for item in one.items} if one else {}
-    held = one.numbers if one else {}
+    number_values = one.numbers if one else {}
     cells = (
-        Cell(entry.called, entry.student or None, file),
-        frame.words(entry.student_id),
-        Cell(f"{sign} {status}", float(STATUSES.index(status)), few, look),
-        _points(entry),
-        frame.words(entry.handed_in, late),
+        Cell(entry.display_name, entry.student or None, file),
+        frame.text_cell(entry.student_id),
+        Cell(f"{sign} {status}", float(STATUSES.index(status)), flag_count_text, style),
+        _points_cell(entry),
+        frame.text_cell(entry.handed_in, late),
         Cell("\n".join(entry.flags), float(count), "", "flags"),
-        *(frame.figure(points.get(name)) for name in items),
-        *(frame.figure(held.get(name)) for name in numbers),
+        *(frame.number_cell(points.get(name)) for name in items),
+        *(frame.number_cell(number_values.get(name)) for name in numbers),
     )
     # who has neither id nor file cannot be named in overrides.csv
-    boxes = (_boxes(entry),) if entry.student_id or file else ()
-    beside = _beside(entry, one) if one else ()
-    return Row(cells, tuple(_tags(entry)), (*_details(entry), *boxes), beside)
+    box_parts = (_point_boxes(entry),) if entry.student_id or file else ()
+    # the name of the file may name its student
+    report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))] if one else []
+    report_parts = (frame.links_part("The report", report),)
+    return Row(cells, tuple(_tags(entry)), (*_details(entry), *box_parts), report_parts)
 
 
 def _details(entry: Entry) -> Iterator[Part]:
     """What a row unfolds to, as long as nobody is to be hidden."""
-    one, comment = entry.counting, frame.prose("Your comment", entry.comment)
+    one, comment = entry.counting, frame.prose_part("Your comment", entry.comment)
     if one is None:
-        yield frame.listed("Missing", ["Nothing was handed in."])
+        yield frame.list_part("Missing", ["Nothing was handed in."])
         yield comment
         return
     verdict = one.verdict
     differ = [(each.path, each.recorded, each.recomputed) for each in verdict.differences]
     items = [(item.title, number(item.points), number(item.of), item.comment) for item in one.items]
-    named = [f"{name}: {'' if found else 'not '}named" for name, found in one.mistakes.items()]
+    named_texts = [
+        f"{name}: {'' if is_named else 'not '}named" for name, is_named in one.mistakes.items()
+    ]
     attempts = [f"{other.submission}: {other.status}" for other in entry.others]
-    yield frame.listed("Flags", entry.flags, warn=True)
-    yield frame.listed("Pending: what you can do", [one.pending] if one.pending else [], warn=True)
-    yield frame.listed("Verification", verdict.reasons)
+    yield frame.list_part("Flags", entry.flags, warn=True)
+    yield frame.list_part(
+        "Pending: what you can do", [one.pending] if one.pending else [], warn=True
+    )
+    yield frame.list_part("Verification", verdict.reasons)
     heads = ("Where", "Report", "New run") if differ else ()
-    yield frame.tabled("The first numbers that differ", heads, differ)
+    yield frame.table_part("The first numbers that differ", heads, differ)
     title = "Points (proposed)" if one.pending else "Points"
-    yield frame.tabled(title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2))
+    yield frame.table_part(
+        title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2)
+    )
     yield comment
-    yield frame.listed("Mistakes of this flight", named)
-    yield frame.pairs("The form", [*form_rows(one.form)] if one.form else [])
-    yield frame.prose("The student's own words", one.notes)
-    yield frame.listed("Other attempts", attempts)
+    yield frame.list_part("Mistakes of this flight", named_texts)
+    yield frame.pairs_part("The form", [*form_rows(one.form)] if one.form else [])
+    yield frame.prose_part("The student's own words", one.notes)
+    yield frame.list_part("Other attempts", attempts)
 
 
-def _points(entry: Entry) -> Cell:
+def _points_cell(entry: Entry) -> Cell:
     one = entry.counting
     if entry.total is None:
         proposed = f"{number(one.points)} proposed" if one and one.counted is None else ""
         return Cell("pending" if proposed else "–", None, proposed)
     share = min(max(entry.total / entry.of, 0.0), 1.0) if entry.of > 0.0 else None
-    said = [f"{number(entry.deduction)} off for being late"] * bool(entry.deduction)
-    said += ["said by you"] * any(each.points is not None for each in entry.overrides.values())
+    notes = [f"{number(entry.deduction)} off for being late"] * bool(entry.deduction)
+    notes += ["said by you"] * any(each.points is not None for each in entry.overrides.values())
     text = f"{number(entry.total)} / {number(entry.of)}"
-    return Cell(text, entry.total, ", ".join(said), "", share)
+    return Cell(text, entry.total, ", ".join(notes), "", share)
 
 
-def _boxes(entry: Entry) -> Part:
+def _point_boxes(entry: Entry) -> Part:
     """Points and a comment for what only the instructor scores, and for the whole.
 
     With all else that overrides.csv says, since the download takes its place.
@@ -204,32 +212,14 @@ def _boxes(entry: Entry) -> Part:
     one = entry.counting
     by_hand = {item.title: item.of for item in (one.items if one else ()) if item.by_hand}
     by_hand[TOTAL] = entry.of
-    said = {title: entry.overrides.get(title, Override()) for title in by_hand}
-    rows = [(title, by_hand[title], own.points, own.comment) for title, own in said.items()]
-    kept = [
+    own_overrides = {title: entry.overrides.get(title, Override()) for title in by_hand}
+    rows = [
+        (title, by_hand[title], own.points, own.comment) for title, own in own_overrides.items()
+    ]
+    other_rows = [
         (title, own.points, own.comment)
         for title, own in entry.overrides.items()
         if title not in by_hand
     ]
     owner = entry.student_id or (one.submission if one else "")
-    return frame.boxes("Your points and words", owner, rows, kept)
-
-
-def _beside(entry: Entry, one: Graded) -> tuple[Part, ...]:
-    """The report's pages and links to it, which may name its student."""
-    whose = f"of the report of {entry.called}"
-    drawn = [
-        (f"Page {at} of {len(one.sheets)}", f"Page {at} {whose}, drawn again from the log", link)
-        for at, name in enumerate(one.sheets, start=1)
-        if (link := local_link(name))
-    ]
-    every = frame.pictures("Every page, drawn again from the log", drawn)
-    handed_in = []
-    if source := local_link(one.handed_in):
-        said = f"Page {one.verdict.page}, as handed in: not verified"
-        # the redrawn one stands beside it
-        handed_in = drawn[one.verdict.page - 1 : one.verdict.page]
-        handed_in += [(said, f"Page {one.verdict.page} {whose}, as handed in", source)]
-    report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))]
-    title = "The page that differs" if drawn else "As handed in"
-    return frame.links("The report", report), frame.pictures(title, handed_in), every
+    return frame.boxes_part("Your points and words", owner, rows, other_rows)

@@ -20,21 +20,21 @@ from typing import Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.roster import Person, Register, folded, people_of_sheet
+from px4fuse.assignment.roster import Person, Register, normalise_text, read_people
 from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.flags import class_flags
-from px4fuse.grading.model import TOTAL, Entry, Graded, Item, Override, Submission
+from px4fuse.grading.model import TOTAL, Entry, GradedReport, Item, Override, Submission
 from px4fuse.grading.rubric import Rubric
-from px4fuse.results.reading import cleaned, one_line
+from px4fuse.results.reading import clean_text, one_line
 
-SHOWN = "%Y-%m-%d %H:%M"
+TIME_FORMAT = "%Y-%m-%d %H:%M"
 # What the instructor says instead of the rules: a table that is read and never written over
-NAME = "overrides.csv"
-TITLES = ("id", "item", "points", "comment")
-TEMPLATE = "\ufeff" + ",".join(TITLES) + "\r\n"
-MOST = 1e6
-MAX_COMMENT = 10_000
+OVERRIDES_NAME = "overrides.csv"
+OVERRIDE_TITLES = ("id", "item", "points", "comment")
+OVERRIDES_TEMPLATE = "\ufeff" + ",".join(OVERRIDE_TITLES) + "\r\n"
+MAX_OVERRIDE_POINTS = 1e6
+MAX_COMMENT_LENGTH = 10_000
 
 # Id as it was typed, to item as it was typed ("" for all of it), to what is said
 Overrides = Mapping[str, Mapping[str, Override]]
@@ -55,7 +55,7 @@ class LateRule:
     ----------
     share : float
         Of the most points, for every started unit.
-    most : float
+    max_share : float
         Share that is never exceeded.
     text : str
         As it was given.
@@ -63,7 +63,7 @@ class LateRule:
 
     share: float
     unit_s: float
-    most: float
+    max_share: float
     text: str
 
     def deduction(self, late_s: float, of: float) -> float:
@@ -75,7 +75,7 @@ class LateRule:
         15.0
         """
         units = math.ceil(max(late_s, 0.0) / self.unit_s)
-        return round(of * min(units * self.share, self.most), 2)
+        return round(of * min(units * self.share, self.max_share), 2)
 
 
 @dataclass(frozen=True)
@@ -123,19 +123,24 @@ class Course:
     @cached_property
     def register(self) -> Register:
         """Who is in the class, with what all worksheets know of them."""
-        listed = [people_of_sheet(sheet) for sheet in self.worksheets]
-        given = self.key.answers if self.key else ()
-        handed_out = tuple(Person(one.student_id, one.name) for one in given)
-        return Register(self.roster or handed_out or next(iter(listed), ()), *listed)
+        people_by_sheet = [read_people(sheet) for sheet in self.worksheets]
+        handed_out_flights = self.key.answers if self.key else ()
+        handed_out = tuple(Person(one.student_id, one.name) for one in handed_out_flights)
+        return Register(
+            self.roster or handed_out or next(iter(people_by_sheet), ()), *people_by_sheet
+        )
 
 
 # When it came and when it was packed, by which attempts are ordered; the file; and the row that it
 # would make alone
-Attempt = tuple[tuple[float, float], Graded, Entry]
+Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
 def class_entries(
-    graded: Sequence[Graded], submissions: Sequence[Submission], course: Course, said: Overrides
+    graded: Sequence[GradedReport],
+    submissions: Sequence[Submission],
+    course: Course,
+    overrides: Overrides,
 ) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
     """Lay out a class: everyone in the register, then what belongs to nobody in it.
 
@@ -154,36 +159,40 @@ def class_entries(
     notes : tuple of str
         On overrides that fit nobody.
     """
-    everyone = course.register if course.register.people else _named(graded, submissions)
+    everyone = course.register if course.register.people else _people_named(graded, submissions)
     attempts: dict[int | None, list[Attempt]] = defaultdict(list)
     for one, submission in zip(graded, submissions, strict=True):
-        place = everyone.place(submission.origin.person)
-        if place is None:
-            place = everyone.place(Person(one.student_id, one.student))
-        attempts[place].append(_attempt(one, submission, course, place, everyone))
-    most = max((one.of for one in graded), default=0.0)
-    made = [
-        _chosen(attempts[at], course) if attempts[at]
-        else Entry(person.name, person.student_id, None, of=most)
+        student_index = everyone.student_index(submission.origin.person)
+        if student_index is None:
+            student_index = everyone.student_index(Person(one.student_id, one.student))
+        attempts[student_index].append(_attempt(one, submission, course, student_index, everyone))
+    max_points = max((one.of for one in graded), default=0.0)
+    class_rows = [
+        _choose_attempt(attempts[at], course)
+        if attempts[at]
+        else Entry(person.name, person.student_id, None, of=max_points)
         for at, person in enumerate(everyone.people)
-    ]  # fmt: skip
+    ]
     nobody = "Neither the report nor the platform names anyone."
     note = "Not in the roster." if course.register.people else nobody
-    made += [replace(entry, flags=(note, *entry.flags)) for *_, entry in attempts[None]]
-    told, notes = matched(said, made)
-    alike = class_flags([entry.counting for entry in made if entry.counting])
-    settled = (_settled(*each, alike, course) for each in zip(made, told, strict=True))
+    class_rows += [replace(entry, flags=(note, *entry.flags)) for *_, entry in attempts[None]]
+    overrides_by_entry, notes = match_overrides(overrides, class_rows)
+    common_flags = class_flags([entry.counting for entry in class_rows if entry.counting])
+    settled = (
+        _apply_overrides(*each, common_flags, course)
+        for each in zip(class_rows, overrides_by_entry, strict=True)
+    )
     return tuple(settled), notes
 
 
-def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> Register:
+def _people_named(graded: Sequence[GradedReport], submissions: Sequence[Submission]) -> Register:
     """Without a roster: everyone whom a platform, else a report, names; each once."""
     register = Register()
     for one, submission in zip(graded, submissions, strict=True):
         person = submission.origin.person
-        claimed = register.place(Person(one.student_id)) if one.student_id else None
+        claimed = register.student_index(Person(one.student_id)) if one.student_id else None
         if person.numbers or person.login:
-            if register.place(person) is not None:
+            if register.student_index(person) is not None:
                 continue
             # two students may not hand in under one id: the second is known by the platform alone
             student_id = person.student_id or ("" if claimed is not None else one.student_id)
@@ -196,14 +205,18 @@ def _named(graded: Sequence[Graded], submissions: Sequence[Submission]) -> Regis
 
 
 def _attempt(
-    graded: Graded, submission: Submission, course: Course, place: int | None, register: Register
+    graded: GradedReport,
+    submission: Submission,
+    course: Course,
+    student_index: int | None,
+    register: Register,
 ) -> Attempt:
     """One file as if it were the only one of its student."""
     origin, due = submission.origin, course.due
     platform = origin.platform.capitalize()
-    person = Person(graded.student_id) if place is None else register.people[place]
-    said = origin.time or moodle_time(person.submitted)
-    time, packed = (one and in_zone_of(one, due) for one in (said, submission.time))
+    person = Person(graded.student_id) if student_index is None else register.people[student_index]
+    stated_time = origin.time or moodle_time(person.submitted)
+    time, packed = (one and in_zone_of(one, due) for one in (stated_time, submission.time))
     late_s = None
     flags = []
     if due is not None and time is not None:
@@ -213,13 +226,13 @@ def _attempt(
         flags.append(f"{platform} marks it as late and not by how much: nothing was taken off.")
     elif course.late and due and packed and packed.timestamp() > due.timestamp():
         flags.append(
-            f"The zip file dates it {packed.strftime(SHOWN)}, after the due time; that may be when "
+            f"The zip file dates it {packed.strftime(TIME_FORMAT)}, after the due time; that may be when "
             "it was downloaded, so nothing was taken off."
         )
-    if origin.imitated:
+    if origin.is_imitated:
         flags.append(f"Its name has more of a platform's than {platform or 'none'} writes.")
-    claimed = register.place(Person(graded.student_id)) if origin.platform else None
-    if claimed is not None and place is not None and claimed != place:
+    claimed = register.student_index(Person(graded.student_id)) if origin.platform else None
+    if claimed is not None and student_index is not None and claimed != student_index:
         other = register.people[claimed]
         flags.append(
             f"The report gives the id of {other.student_id} ({other.name or 'no name'}), but "
@@ -230,7 +243,7 @@ def _attempt(
         person.student_id,
         graded,
         (),
-        "" if time is None else time.strftime(SHOWN),
+        "" if time is None else time.strftime(TIME_FORMAT),
         late_s,
         course.late.deduction(late_s, graded.of) if course.late and late_s else 0.0,
         of=graded.of,
@@ -240,35 +253,37 @@ def _attempt(
     return stamps, graded, entry
 
 
-def _worth(attempt: Attempt) -> float:
+def _points_after_deduction(attempt: Attempt) -> float:
     """For the best of several: what it gives without what the instructor has still to say."""
     _, one, entry = attempt
     return max(one.points - entry.deduction, 0.0)
 
 
-def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
+def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     """The attempt that counts, with the others and what that needs said."""
     # by time, of one submission the better file later
-    ordered = sorted(attempts, key=lambda one: (one[0], _worth(one), one[1].submission))
+    ordered = sorted(
+        attempts, key=lambda one: (one[0], _points_after_deduction(one), one[1].submission)
+    )
     # what is pending, such as another's report under this id, or no report counts only where there
     # is nothing else
     reports = [one for one in ordered if one[1].version]
-    able = [one for one in reports if not one[1].pending] or reports or ordered
-    found = {
-        "latest": able[-1],
+    eligible = [one for one in reports if not one[1].pending] or reports or ordered
+    attempts_by_rule = {
+        "latest": eligible[-1],
         # several files of one submission: the best
-        "first": [one for one in able if one[0] == able[0][0]][-1],
-        "best": max(reversed(able), key=_worth),
+        "first": [one for one in eligible if one[0] == eligible[0][0]][-1],
+        "best": max(reversed(eligible), key=_points_after_deduction),
     }[course.attempt]
-    stamps, graded, entry = found
+    stamps, graded, entry = attempts_by_rule
     flags = list(entry.flags)
     others = tuple(one for _, one, _ in ordered if one is not graded)
-    beside = [one for stamp, one, _ in able if stamp == stamps]
-    if course.attempt != "best" and len({one.form for one in beside}) > 1:  # a guess in each
-        asked = f"Ask which of {len(beside)} reports is meant: their forms differ."
-        graded = replace(graded, pending=asked)
-    elif len(beside) > 1 and any(stamps):
-        flags.append(f"{len(beside)} reports came at the same time; the best of them counts.")
+    simultaneous = [one for stamp, one, _ in eligible if stamp == stamps]
+    if course.attempt != "best" and len({one.form for one in simultaneous}) > 1:  # a guess in each
+        question = f"Ask which of {len(simultaneous)} reports is meant: their forms differ."
+        graded = replace(graded, pending=question)
+    elif len(simultaneous) > 1 and any(stamps):
+        flags.append(f"{len(simultaneous)} reports came at the same time; the best of them counts.")
     for stamp, one, _ in ordered:
         if one in others and stamp >= stamps and (one.pending or not one.version):
             why = "is pending" if one.version else "cannot be read as a report"
@@ -276,38 +291,43 @@ def _chosen(attempts: Sequence[Attempt], course: Course) -> Entry:
     return replace(entry, counting=graded, others=others, flags=tuple(flags))
 
 
-def _settled(
-    entry: Entry, said: Mapping[str, Override], alike: Mapping[str, Sequence[str]], course: Course
+def _apply_overrides(
+    entry: Entry,
+    own_overrides: Mapping[str, Override],
+    common_flags: Mapping[str, Sequence[str]],
+    course: Course,
 ) -> Entry:
     """With the instructor's word on items and on all of it, the total that follows, and flags."""
     one, total, flags = entry.counting, None, entry.flags
     if one is not None:
-        items = (_overruled(item, said.get(item.title)) for item in one.items)
+        items = (_override_item(item, own_overrides.get(item.title)) for item in one.items)
         one = replace(one, items=tuple(items))
-        flags = (*flags, *one.flags, *alike.get(one.submission, ()))
+        flags = (*flags, *one.flags, *common_flags.get(one.submission, ()))
         if one.counted is not None or course.include_pending:
             total = round(max(one.points - entry.deduction, 0.0), 2)
-    final = said.get(TOTAL, Override())
+    final = own_overrides.get(TOTAL, Override())
     return replace(
         entry,
         counting=one,
-        overrides=said,
-        comment="\n".join(filter(None, (said.get("", Override()).comment, final.comment))),
+        overrides=own_overrides,
+        comment="\n".join(filter(None, (own_overrides.get("", Override()).comment, final.comment))),
         total=total if final.points is None else final.points,
         flags=flags,
     )
 
 
-def _overruled(item: Item, said: Override | None) -> Item:
+def _override_item(item: Item, override: Override | None) -> Item:
     """An item with the instructor's points and comment in place of, or behind, the rules'."""
-    if said is None:
+    if override is None:
         return item
-    comment = f"{item.comment} Your instructor: {said.comment}" if said.comment else item.comment
-    if said.points is None:
+    comment = (
+        f"{item.comment} Your instructor: {override.comment}" if override.comment else item.comment
+    )
+    if override.points is None:
         return replace(item, comment=comment)
-    if said.points != item.points:
-        comment = f"{comment} (Your instructor gave {number(said.points)} points.)"
-    return replace(item, points=said.points, comment=comment, waits=False)
+    if override.points != item.points:
+        comment = f"{comment} (Your instructor gave {number(override.points)} points.)"
+    return replace(item, points=override.points, comment=comment, awaits_points=False)
 
 
 # ------------------------------------------------------------------ the instructor's word
@@ -327,42 +347,45 @@ def read_overrides(path: Path) -> Overrides:
     if not path.exists():
         return {}
     sheet = read_sheet(path)
-    missing = [title for title in TITLES if sheet.column((title,)) is None]
+    missing = [title for title in OVERRIDE_TITLES if sheet.column((title,)) is None]
     if missing:
         raise SettingsError(
-            f"{path}: no column {', '.join(missing)}", f"Its columns are {', '.join(TITLES)}."
+            f"{path}: no column {', '.join(missing)}",
+            f"Its columns are {', '.join(OVERRIDE_TITLES)}.",
         )
-    found: dict[str, dict[str, Override]] = defaultdict(dict)
+    overrides: dict[str, dict[str, Override]] = defaultdict(dict)
     for at, row in enumerate(sheet.rows, start=2):
         student, item, points, comment = (
-            sheet.cell(row, (title,)).removeprefix("'") for title in TITLES
+            sheet.cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
         )
         value = decimal(points)
-        wrong = ""
-        if item in found[student]:
-            wrong = f"{one_line(student, 40)}, {one_line(item, 40) or 'all'} stands there twice"
-        elif points and (value is None or not 0.0 <= value <= MOST or not item):
-            given = one_line(points, 20)
-            wrong = f"points {given!r}: give a number from 0 up, and an item or total"
-        if wrong:
-            raise SettingsError(f"{path}: row {at}: {wrong}.")
-        found[student][item] = Override(value, cleaned(comment[:MAX_COMMENT]))
-    return found
+        problem = ""
+        if item in overrides[student]:
+            problem = f"{one_line(student, 40)}, {one_line(item, 40) or 'all'} stands there twice"
+        elif points and (value is None or not 0.0 <= value <= MAX_OVERRIDE_POINTS or not item):
+            points_text = one_line(points, 20)
+            problem = f"points {points_text!r}: give a number from 0 up, and an item or total"
+        if problem:
+            raise SettingsError(f"{path}: row {at}: {problem}.")
+        overrides[student][item] = Override(value, clean_text(comment[:MAX_COMMENT_LENGTH]))
+    return overrides
 
 
-def matched(
+def match_overrides(
     overrides: Overrides, entries: Sequence[Entry]
 ) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
     """What is said of whom, and a sentence for every row that fits nobody, or no item.
 
     Returns
     -------
-    said : list of dict
+    matched_overrides : list of dict
         For each entry, by the title of an item, "total", or "" for all of it.
     notes : tuple of str
     """
-    said: list[dict[str, Override]] = [{} for _ in entries]
-    whole = max((one.of for entry in entries for one in entry.files), default=MOST)
+    matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
+    max_total = max(
+        (one.of for entry in entries for one in entry.files), default=MAX_OVERRIDE_POINTS
+    )
     files = (entry.counting.submission if entry.counting else "" for entry in entries)
     people = Register(
         Person(entry.student_id, login=file) for entry, file in zip(entries, files, strict=True)
@@ -370,26 +393,28 @@ def matched(
     notes = []
     for student, rows in overrides.items():
         # by the very id, the id but for leading zeros, or the file's name
-        place = people.place(Person(student, login=student))
-        if place is None:
-            notes.append(f"{NAME}: nobody has the id {one_line(student, 40) or '(empty)'}.")
+        student_index = people.student_index(Person(student, login=student))
+        if student_index is None:
+            notes.append(
+                f"{OVERRIDES_NAME}: nobody has the id {one_line(student, 40) or '(empty)'}."
+            )
             continue
-        one = entries[place].counting
-        most = {item.title: item.of for item in one.items} if one else {}
-        most |= {TOTAL: one.of if one else whole, "": MOST}
-        titles = {folded(title): title for title in most}
+        one = entries[student_index].counting
+        max_by_title = {item.title: item.of for item in one.items} if one else {}
+        max_by_title |= {TOTAL: one.of if one else max_total, "": MAX_OVERRIDE_POINTS}
+        titles = {normalise_text(title): title for title in max_by_title}
         for item, override in rows.items():
-            title, wrong = titles.get(folded(item)), ""
+            title, problem = titles.get(normalise_text(item)), ""
             if title is None:
-                wrong = f"has no item {one_line(item, 60)!r}"
-            elif title in said[place]:
-                wrong = f"has {title or 'a comment on all'!r} from another row already"
-            elif (override.points or 0.0) > most[title]:
-                wrong = f"cannot have more than {most[title]:g} points of {one_line(title, 60)!r}"
+                problem = f"has no item {one_line(item, 60)!r}"
+            elif title in matched_overrides[student_index]:
+                problem = f"has {title or 'a comment on all'!r} from another row already"
+            elif (override.points or 0.0) > max_by_title[title]:
+                problem = f"cannot have more than {max_by_title[title]:g} points of {one_line(title, 60)!r}"
             else:
-                said[place][title] = override
-            notes += [f"{NAME}: {one_line(student, 40)} {wrong}."] if wrong else []
-    return said, tuple(notes)
+                matched_overrides[student_index][title] = override
+            notes += [f"{OVERRIDES_NAME}: {one_line(student, 40)} {problem}."] if problem else []
+    return matched_overrides, tuple(notes)
 
 
 # ------------------------------------------------------------------ when it was due
@@ -407,8 +432,8 @@ def late_rule(text: str) -> LateRule:
     if match is None or not 0.0 <= float(match["rate"]) <= 100.0:
         raise SettingsError(f"--late {text!r}: give a rule such as 10%/day or 10%/day up to 50%.")
     unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
-    most = min(float(match["most"] or 100.0) / 100.0, 1.0)
-    return LateRule(float(match["rate"]) / 100.0, unit_s, most, text.strip())
+    max_share = min(float(match["most"] or 100.0) / 100.0, 1.0)
+    return LateRule(float(match["rate"]) / 100.0, unit_s, max_share, text.strip())
 
 
 def due_time(text: str) -> datetime:
@@ -425,15 +450,15 @@ def due_time(text: str) -> datetime:
     words = text.split()
     try:
         zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else None
-        found = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
+        time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError.of("due_wrong", text=text) from error
     clock = re.search(r"\d\d:\d\d(:\d\d)?", text)
     if clock is None:
-        found = found.replace(hour=23, minute=59)
+        time = time.replace(hour=23, minute=59)
     if clock is None or clock[1] is None:
-        found = found.replace(second=59)
-    return found.replace(tzinfo=zone) if zone else found if found.tzinfo else found.astimezone()
+        time = time.replace(second=59)
+    return time.replace(tzinfo=zone) if zone else time if time.tzinfo else time.astimezone()
 
 
 def in_zone_of(time: datetime, due: datetime | None) -> datetime:

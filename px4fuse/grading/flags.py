@@ -4,86 +4,60 @@ A flag is not a proof. Two students may fly one flight together, and advice that
 leads everyone to the same number.
 """
 
-import json
-import re
-import unicodedata
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from itertools import combinations
 from operator import attrgetter
 from typing import Any
 
-from px4fuse.assignment.roster import folded
-from px4fuse.filter.tuning import Tuned
-from px4fuse.grading.model import Graded
-from px4fuse.plain import few_words
-from px4fuse.results.contract import LoopResults, Reported, to_plain
+from px4fuse.assignment.roster import normalise_text
+from px4fuse.filter.tuning import NoiseEstimate
+from px4fuse.grading.model import GradedReport
+from px4fuse.plain import capitalise_first, join_first
+from px4fuse.request import LoopRequest
+from px4fuse.results.contract import LoopResults, Reported
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
 from px4fuse.verification.model import Verdict
 
 # Numbers of a form that two students do not have in common by chance, also where one of them has
 # changed each a little
-SAME_NUMBERS, NEARLY = 3, 0.02
+SAME_NUMBERS, MAX_NUMBER_DIFFERENCE = 3, 0.02
 # A hand-picked part of the flight below this share leaves most of it out
-HAND_PICKED = 0.5
+MIN_CHOSEN_SHARE = 0.5
 # A setting so many times larger or smaller than what the data ask for has another reason
-NO_REASON = 30.0
-SHOWN = 4
-# Words in a row by which two texts are compared: of two written apart a few per cent are the same,
-# of a copy with an error in every fifth word two in five
-RUN, SMALL = 3, 4
-COPIED = 0.25
-# Shorter texts are the same by chance
-MIN_RUNS = 36
-# Letters of other alphabets that look like Latin ones
-LOOK_ALIKE = str.maketrans("\u0430\u0435\u043e\u0440\u0441\u0443\u0445\u0456\u03bf\u03b1\u03bd",
-                           "aeopcyxioav")  # fmt: skip
-# Of longer texts only the beginning is compared
-MAX_CHARACTERS = 36_000
-# What more than half of the class has is the instructor's template, from a class of this size on
-TEMPLATE_SHARE, TEMPLATE_CLASS = 0.5, 5
-# From this share on a text is the report's own words, or has too few of the course's language
-QUOTED, OF_THE_LANGUAGE = 0.5, 0.10
-JUDGED_FROM = 40
-# What a text says to who, or what, grades it
-TO_A_GRADER = re.compile(
-    r"full points|ignore (the|all|any|previous)|rubric|language model|system prompt|grader",
-    re.IGNORECASE,
-)
-
-# Two reports that have something in common, and how much where that is not all of it
-Pairs = Iterator[tuple[Graded, Graded, str]]
+MAX_SETTING_FACTOR = 30.0
+# Factor on the usual drift (px4fuse loop's defaults) from which on a stated drift is flagged
+FAR_OFF = 4.0
+MAX_SHOWN = 4
+# Two reports with something in common
+Pairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
 def page_flags(verdict: Verdict) -> Iterator[str]:
-    """Which pages are not as px4fuse draws them, or that nobody could see them."""
+    """Flag a PDF that is not what px4fuse draws from the log, with the first difference."""
     if verdict.pages:
         first, *others = verdict.pages
-        more = f" Also: page {', '.join(str(one.page) for one in others)}." if others else ""
+        more_text = f" {len(others)} more differences." if others else ""
         yield (
-            f"Page {first.page} of the PDF that was handed in is not what px4fuse draws from the "
-            f"log: {first.what}.{more} Read the redrawn report."
-        )
-    elif verdict.with_log and verdict.page_status == "not compared":
-        yield (
-            "The pages that were handed in could not be drawn: do not open them, read the redrawn "
-            "report."
+            "The PDF that was handed in is not what px4fuse draws from the log. "
+            f"{capitalise_first(first.sentence)}.{more_text} Read the redrawn report."
         )
 
 
 def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
-    """What stands out in one report by itself; nothing in one of a loop alone.
+    """What stands out in one report by itself.
 
     ``handed_out``: there is an answer key, so that logs are simulated for a reason.
     """
     if isinstance(results, LoopResults):
+        yield from _drift_flags(results.request)
         return
     settings, whole_s = results.settings, results.log.duration_s
     share = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
     chosen = (results.request.start_s, results.request.end_s) != (None, None)
-    if chosen and share < HAND_PICKED:
+    if chosen and share < MIN_CHOSEN_SHARE:
         yield (
             f"The analysed part was chosen by hand and is {share:.0%} of the log "
             f"({settings.start_s:.1f} to {settings.end_s:.1f} s of {whole_s:.1f} s): ask why the "
@@ -95,169 +69,142 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
     if settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
     source = results.source
-    arrived = [one.name for one in source.available if one.passage == "as it arrived"]
-    if arrived and source.passage != "as it arrived":
+    tracks_as_received = [one.name for one in source.available if one.passage == "as it arrived"]
+    if tracks_as_received and source.passage != "as it arrived":
         yield (
-            f"The positions are not those that arrived ({arrived[0]}) but {source.name} "
+            f"The positions are not those that arrived ({tracks_as_received[0]}) but {source.name} "
             f"({source.passage})."
         )
     for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
         chosen = getattr(settings, name)
-        tuned = (one for one in results.tuning.values() if isinstance(one, Tuned))
-        wanted = [asked for one in tuned if (asked := getattr(one, name))]
-        if wanted and not min(wanted) / NO_REASON < chosen < NO_REASON * max(wanted):
-            yield f"{label} {chosen:g} is far from what the data ask for ({wanted[0]:.3g})."
+        tuned = (one for one in results.tuning.values() if isinstance(one, NoiseEstimate))
+        ml_values = [ml_value for one in tuned if (ml_value := getattr(one, name))]
+        if ml_values and not min(
+            ml_values
+        ) / MAX_SETTING_FACTOR < chosen < MAX_SETTING_FACTOR * max(ml_values):
+            yield f"{label} {chosen:g} is far from what the data ask for ({ml_values[0]:.3g})."
     if results.log.hardware == flights.HARDWARE and not handed_out:
         yield "The log was made by px4fuse simulate: no vehicle flew."
 
 
-def _form_numbers(one: Graded) -> dict[tuple[str, str], float]:
+def _drift_flags(request: LoopRequest) -> Iterator[str]:
+    """Flag a stated drift that is more than FAR_OFF times the usual one, or less than 1/FAR_OFF.
+
+    The closure is accepted or rejected by the stated drift.
+    """
+    usual = LoopRequest(source="")
+    for option, unit, stated, default in (
+        ("--drift", "m", request.position_drift_m, usual.position_drift_m),
+        ("--heading-drift", "°", request.heading_drift_deg, usual.heading_drift_deg),
+    ):
+        if not default / FAR_OFF <= stated <= default * FAR_OFF:
+            yield (
+                f"{option} is {stated:g} {unit} per 100 m; usual is {default:g} {unit}. Ask for "
+                "the reason: the closure is accepted or rejected by it."
+            )
+
+
+def _form_numbers(one: GradedReport) -> dict[tuple[str, str], float]:
     """Sizes, values and quantities of a form by where they stand."""
     if one.form is None:
         return {}
-    given: dict[tuple[str, str], object] = {
+    values_by_place: dict[tuple[str, str], object] = {
         (each.kind, name): getattr(each, name)
         for each in one.form.mistakes
         for name in ("size", "value")
     }
-    given |= {("", f"q{at}"): number for at, number in enumerate(one.form.quantities)}
-    return {key: float(n) for key, n in given.items() if isinstance(n, float | int)}
+    values_by_place |= {("", f"q{at}"): number for at, number in enumerate(one.form.quantities)}
+    return {key: float(n) for key, n in values_by_place.items() if isinstance(n, float | int)}
 
 
 def _same_numbers(one: Mapping[Any, float], other: Mapping[Any, float]) -> int:
     """How many numbers nearly agree that nobody types by chance; a value follows from its size."""
     return sum(
         _digits(number) > 1
-        and abs(number - other[key]) <= (key[1] != "value") * NEARLY * abs(number)
+        and abs(number - other[key]) <= (key[1] != "value") * MAX_NUMBER_DIFFERENCE * abs(number)
         for key, number in one.items()
         if key in other
     )
 
 
-def _who(one: Graded) -> str:
-    return folded(one.student_id) or folded(one.student) or one.submission
+def _student_key(one: GradedReport) -> str:
+    return normalise_text(one.student_id) or normalise_text(one.student) or one.submission
 
 
 # What no two reports should have in common: the sentence, what it is (empty for nothing to
 # compare), and whose it has to be to count: two reports of one student may be on one log
-COMMON: tuple[tuple[str, Callable[[Graded], object], Callable[[Graded], str]], ...] = (
+COMMON_CHECKS: tuple[
+    tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
+] = (
     ("The same file as {}.", attrgetter("sha256"), attrgetter("submission")),
-    ("The same student id as in {}.", lambda one: folded(one.student_id), attrgetter("submission")),
-    ("The same log as {}.", attrgetter("log_sha256"), _who),
-    ("The same numbers to the last digit, from a log of another hash, as {}: a copy of the log.",
-     lambda one: one.verdict.status == "verified" and len(one.numbers) >= SAME_NUMBERS
-     and tuple(one.numbers.values()), attrgetter("log_sha256")),
-)  # fmt: skip
+    (
+        "The same student id as in {}.",
+        lambda one: normalise_text(one.student_id),
+        attrgetter("submission"),
+    ),
+    ("The same log as {}.", attrgetter("log_sha256"), _student_key),
+    (
+        "The same numbers to the last digit, from a log of another hash, as {}: a copy of the log.",
+        lambda one: (
+            one.verdict.status == "verified"
+            and len(one.numbers) >= SAME_NUMBERS
+            and tuple(one.numbers.values())
+        ),
+        attrgetter("log_sha256"),
+    ),
+)
 
 
-def class_flags(graded: Sequence[Graded]) -> Mapping[str, Sequence[str]]:
+def class_flags(graded: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
     """What stands out between the reports of a class: sentences, by names of submissions."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for said, pairs in (
-        *((said, _same(graded, what, whose)) for said, what, whose in COMMON),
+    flags_by_submission: dict[str, list[str]] = defaultdict(list)
+    for sentence, pairs in (
+        *(
+            (sentence, _same_pairs(graded, key_of, owner_of))
+            for sentence, key_of, owner_of in COMMON_CHECKS
+        ),
         ("The form has the numbers of {}.", _copied_forms(graded)),
-        ("The text shares whole passages with those of {}.", _copied_notes(graded)),
     ):
         others: dict[str, list[str]] = defaultdict(list)
-        for first, second, share in pairs:
+        for first, second in pairs:
             for one, other in ((first, second), (second, first)):
-                how = share or one_line(other.submission, 80)
-                others[one.submission].append(f"{_name(other)} ({how})")
-        for name, those in others.items():
-            found[name].append(said.format(few_words(those, SHOWN, "; ")))
-    return found
+                file = one_line(other.submission, 80)
+                others[one.submission].append(f"{_name(other)} ({file})")
+        for name, names in others.items():
+            flags_by_submission[name].append(sentence.format(join_first(names, MAX_SHOWN, "; ")))
+    return flags_by_submission
 
 
-def _same(
-    graded: Sequence[Graded], what: Callable[[Graded], object], whose: Callable[[Graded], str]
+def _same_pairs(
+    graded: Sequence[GradedReport],
+    key_of: Callable[[GradedReport], object],
+    owner_of: Callable[[GradedReport], str],
 ) -> Pairs:
-    alike: dict[object, list[Graded]] = defaultdict(list)
+    groups: dict[object, list[GradedReport]] = defaultdict(list)
     for one in graded:
-        alike[what(one)].append(one)
-    for key, those in alike.items():
-        for one, other in combinations(those if key else (), 2):
-            if whose(one) != whose(other):
-                yield one, other, ""
+        groups[key_of(one)].append(one)
+    for key, group in groups.items():
+        for one, other in combinations(group if key else (), 2):
+            if owner_of(one) != owner_of(other):
+                yield one, other
 
 
-def _copied_forms(graded: Sequence[Graded]) -> Pairs:
+def _copied_forms(graded: Sequence[GradedReport]) -> Pairs:
     """Whose forms have the same numbers, though the flights are others."""
     numbers = [(one, _form_numbers(one)) for one in graded]
-    for (one, own), (other, theirs) in combinations(numbers, 2):
-        if _same_numbers(own, theirs) >= SAME_NUMBERS and _who(one) != _who(other):
-            yield one, other, ""
+    for (one, form_numbers), (other, other_numbers) in combinations(numbers, 2):
+        if _same_numbers(form_numbers, other_numbers) >= SAME_NUMBERS and _student_key(
+            one
+        ) != _student_key(other):
+            yield one, other
 
 
-def _copied_notes(graded: Sequence[Graded]) -> Pairs:
-    """Whose texts share passages: with the share of the shorter one, the most alike first."""
-    each = [runs(words_of(one.notes[:MAX_CHARACTERS])) for one in graded]
-    if len(each) >= TEMPLATE_CLASS:
-        counted = Counter(part for parts in each for part in parts)
-        common = {part for part, count in counted.items() if count > TEMPLATE_SHARE * len(each)}
-        each = [parts - common for parts in each]
-    long = [(one, own) for one, own in zip(graded, each, strict=True) if len(own) >= MIN_RUNS]
-    shares = [
-        (len(own & other) / min(len(own), len(other)), first, second)
-        for (first, own), (second, other) in combinations(long, 2)
-        if _who(first) != _who(second)
-    ]
-    for share, first, second in sorted(shares, key=lambda one: -one[0]):
-        if share >= COPIED:
-            yield first, second, f"{share:.0%} of the shorter"
-
-
-def _name(one: Graded) -> str:
+def _name(one: GradedReport) -> str:
     """A student in a sentence."""
-    parts = filter(None, (one.student.strip(), one.student_id.strip()))
-    return one_line(", ".join(parts) or one.submission, 80)
+    names = filter(None, (one.student.strip(), one.student_id.strip()))
+    return one_line(", ".join(names) or one.submission, 80)
 
 
 def _digits(number: float) -> int:
     """Significant digits of a number as typed."""
     return len(Decimal(repr(abs(number))).normalize().as_tuple().digits) if number else 0
-
-
-# ------------------------------------------------------------------ texts
-
-
-def words_of(text: str) -> list[str]:
-    """Words as they are compared: one spelling per character, no case, no accents, no signs.
-
-    >>> words_of("Naïve, ｎaïve: SIGMA_Z")
-    ['naive', 'naive', 'sigma', 'z']
-    """
-    plain = unicodedata.normalize("NFKD", text).casefold().translate(LOOK_ALIKE)
-    seen = "".join(part for part in plain if unicodedata.category(part) not in ("Mn", "Cf"))
-    return re.findall(r"[^\W_]+", seen)
-
-
-def runs(words: Sequence[str]) -> frozenset[tuple[str, ...]]:
-    """Every few words in a row, of all words and of the longer ones: "the" is quickly a "this"."""
-    long = [word for word in words if len(word) > SMALL]
-    return frozenset(
-        tuple(each[at : at + RUN]) for each in (words, long) for at in range(len(each) - RUN + 1)
-    )
-
-
-def text_flags(results: Reported, min_words: int, common_words: Sequence[str]) -> Iterator[str]:
-    """What stands out in one text by itself: sentences for the instructor."""
-    text = results.student.notes
-    words = words_of(text[:MAX_CHARACTERS])
-    if not text.strip():
-        return
-    if len(words) < min_words:
-        yield f"The text has {len(words)} words; {min_words} were asked for."
-    if len(words) >= JUDGED_FROM and common_words:
-        known = sum(word in set(common_words) for word in words) / len(words)
-        if known < OF_THE_LANGUAGE:
-            yield f"The text is in another language than the course's ({known:.0%} of its words)."
-    own = runs(words)
-    if len(own) >= MIN_RUNS:
-        told = to_plain(results)
-        told.pop("student", None)
-        printed = runs(words_of(json.dumps(told, ensure_ascii=False)))
-        share = len(own & printed) / len(own)
-        if share >= QUOTED:
-            yield f"The text is px4fuse's own: {share:.0%} of it is in the report."
-    if said := TO_A_GRADER.search(text):
-        yield f"The text speaks to who grades it (\u201c{said[0]}\u201d): it is not followed."

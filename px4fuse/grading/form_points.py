@@ -11,20 +11,20 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from px4fuse.answers import MISTAKES, Answers, Claim, Quantified
-from px4fuse.assignment.truth import FormTruth, Wrong
-from px4fuse.filter.consistency import SIGMA_OFF
+from px4fuse.answers import MISTAKES, Answers, ClaimedMistake, QuantityAnswer
+from px4fuse.assignment.truth import FormTruth, TrueMistake
+from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING
 from px4fuse.record import table
 
-FALSE_CLAIM, MOST_FALSE = 10.0, 3
-NEIGHBOUR, SAME_NUMBER, EFFECT = 0.4, 2.0 / 3.0, 0.15
+FALSE_CLAIM_POINTS, MAX_FALSE_CLAIMS = 10.0, 3
+NEIGHBOUR_SHARE, SAME_NUMBER_SHARE, EFFECT_SHARE = 0.4, 2.0 / 3.0, 0.15
 # What needs no measurement: it counts only where the size is right, and close is not enough, since
 # the sizes that are drawn lie close to each other
-GUESSABLE = frozenset(("open-end",))
-ANY = (-math.inf, math.inf)
-CLOSE_S, CLOSE_SHARE = 2.0, 0.05
-FULL_WITHIN, HALF_WITHIN = 0.02, 0.10
-HALF_SIZE = 0.4
+GUESSABLE_KINDS = frozenset(("open-end",))
+ANY_VALUE = (-math.inf, math.inf)
+TIME_TOLERANCE_S, TIME_TOLERANCE_SHARE = 2.0, 0.05
+FULL_TOLERANCE, HALF_TOLERANCE = 0.02, 0.10
+HALF_SIZE_TOLERANCE = 0.4
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,14 @@ class _Cure:
 
     parameter: str
     of: Mapping[str, float]
-    to: tuple[float, float] | str = ANY
+    to: tuple[float, float] | str = ANY_VALUE
     late: bool = False
 
 
 TABLE = table(__file__, "form_points.toml", dict)
 CURES = msgspec.convert(TABLE["cures"], tuple[_Cure, ...])
 NEIGHBOURS = msgspec.convert([*TABLE["neighbours"].values()], tuple[frozenset[str], ...])
-PARTS = tuple(TABLE["weights"])
+PART_NAMES = tuple(TABLE["weights"])
 
 
 @dataclass(frozen=True)
@@ -49,83 +49,94 @@ class FormPoints:
 
     Attributes
     ----------
-    parts : mapping
+    points_by_part : mapping
         Points by the name of the part, of :attr:`of`.
-    said : tuple of str
+    feedback : tuple of str
         What was right and what was not, for the student.
     named : mapping
         The flight's mistakes, and whether the form names each.
     """
 
-    parts: Mapping[str, float]
+    points_by_part: Mapping[str, float]
     of: Mapping[str, float]
-    said: tuple[str, ...] = ()
+    feedback: tuple[str, ...] = ()
     named: Mapping[str, bool] = field(default_factory=dict)
 
     @property
     def share(self) -> float:
         """Of all points."""
-        return sum(self.parts.values()) / sum(self.of.values())
+        return sum(self.points_by_part.values()) / sum(self.of.values())
 
 
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     """Points for a form about a flight whose truth is known."""
-    called_clean = not truth.mistakes and answers.says_none
-    weights = TABLE["weights_clean" if called_clean else "weights"]
-    shares = dict.fromkeys(PARTS, 0.0)
-    matched, false = _matched(answers, truth)
-    if truth.mistakes and len(false) < MOST_FALSE:
-        shares |= _of_mistakes(matched, truth)
-    shares["quantities"] = computed = _quantities(answers, truth)
+    is_claimed_clean = not truth.mistakes and answers.claims_no_mistake
+    weights = TABLE["weights_clean" if is_claimed_clean else "weights"]
+    shares = dict.fromkeys(PART_NAMES, 0.0)
+    matches, false_claims = _match_claims(answers, truth)
+    if truth.mistakes and len(false_claims) < MAX_FALSE_CLAIMS:
+        shares |= _mistake_shares(matches, truth)
+    shares["quantities"] = computed = _quantities_share(answers, truth)
     # on many flights the verdicts are the same: who computed nothing may have guessed them
-    shares["verdicts"] = _verdicts(answers, truth) * (1.0 if computed else 0.5)
-    parts = {name: weights[name] * share for name, share in shares.items()}
-    if called_clean:
-        parts["kinds"] = weights["kinds"]
-    elif truth.mistakes and all(wrong.size is None for wrong in truth.mistakes):
-        parts["kinds"] += weights["sizes"] * shares["kinds"]  # there is nothing to size
-    parts["kinds"] = max(parts["kinds"] - FALSE_CLAIM * len(false), 0.0)
+    shares["verdicts"] = _verdicts_share(answers, truth) * (1.0 if computed else 0.5)
+    points_by_part = {name: weights[name] * share for name, share in shares.items()}
+    if is_claimed_clean:
+        points_by_part["kinds"] = weights["kinds"]
+    elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
+        points_by_part["kinds"] += weights["sizes"] * shares["kinds"]  # there is nothing to size
+    points_by_part["kinds"] = max(
+        points_by_part["kinds"] - FALSE_CLAIM_POINTS * len(false_claims), 0.0
+    )
     claimed = [claim.kind for claim in answers.mistakes]
-    named = {wrong.kind: wrong.kind in claimed for wrong in truth.mistakes}
-    return FormPoints(parts, weights, tuple(_said(matched, false, called_clean)), named)
+    named = {mistake.kind: mistake.kind in claimed for mistake in truth.mistakes}
+    return FormPoints(
+        points_by_part,
+        weights,
+        tuple(_mistake_feedback(matches, false_claims, is_claimed_clean)),
+        named,
+    )
 
 
-Match = tuple[Wrong, Claim | None, float]
+Match = tuple[TrueMistake, ClaimedMistake | None, float]
 
 
-def _said(matched: list[Match], false: list[Claim], called_clean: bool) -> Iterator[str]:
+def _mistake_feedback(
+    matches: list[Match], false_claims: list[ClaimedMistake], is_claimed_clean: bool
+) -> Iterator[str]:
     """What of the mistakes was found, in words."""
-    if not matched:
-        yield f"your flight has no mistake{', as you say' * called_clean}"
-    for wrong, claim, _ in matched:
-        what = f"{wrong.kind} ({MISTAKES[wrong.kind].words})"
+    if not matches:
+        yield f"your flight has no mistake{', as you say' * is_claimed_clean}"
+    for mistake, claim, _ in matches:
+        mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].words})"
         if claim is None:
-            yield f"you missed {what}"
-        elif claim.kind != wrong.kind:
-            yield f"you named {claim.kind} where it is {what}"
+            yield f"you missed {mistake_text}"
+        elif claim.kind != mistake.kind:
+            yield f"you named {claim.kind} where it is {mistake_text}"
         else:
-            yield f"you found {wrong.kind}"
-    if false:
-        yield f"not in your flight: {', '.join(claim.kind for claim in false)}"
+            yield f"you found {mistake.kind}"
+    if false_claims:
+        yield f"not in your flight: {', '.join(claim.kind for claim in false_claims)}"
 
 
-def _matched(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[Claim]]:
+def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[ClaimedMistake]]:
     """Each mistake with the claim that stands for it and its share of the kind; false claims.
 
     The best match is taken first: the kind itself, then its neighbours, then what it causes.
     """
-    left = [claim for claim in answers.mistakes if claim.kind != "none"]
-    found: dict[str, tuple[Claim, float]] = {}
-    tried = [
-        (kind_share(wrong.kind, claim.kind), wrong.kind, claim)
-        for wrong in truth.mistakes
-        for claim in left
+    unmatched = [claim for claim in answers.mistakes if claim.kind != "none"]
+    claim_by_kind: dict[str, tuple[ClaimedMistake, float]] = {}
+    candidates = [
+        (kind_share(mistake.kind, claim.kind), mistake.kind, claim)
+        for mistake in truth.mistakes
+        for claim in unmatched
     ]
-    for share, kind, claim in sorted(tried, key=lambda one: -one[0]):
-        if share and kind not in found and claim in left:
-            found[kind] = claim, share
-            left.remove(claim)
-    return [(wrong, *found.get(wrong.kind, (None, 0.0))) for wrong in truth.mistakes], left
+    for share, kind, claim in sorted(candidates, key=lambda one: -one[0]):
+        if share and kind not in claim_by_kind and claim in unmatched:
+            claim_by_kind[kind] = claim, share
+            unmatched.remove(claim)
+    return [
+        (mistake, *claim_by_kind.get(mistake.kind, (None, 0.0))) for mistake in truth.mistakes
+    ], unmatched
 
 
 def kind_share(kind: str, claimed: str) -> float:
@@ -133,54 +144,59 @@ def kind_share(kind: str, claimed: str) -> float:
     if kind == claimed:
         return 1.0
     if (kind, claimed) == ("r-scale", "ekf2-noise"):
-        return SAME_NUMBER
+        return SAME_NUMBER_SHARE
     if any({kind, claimed} <= group for group in NEIGHBOURS):
-        return NEIGHBOUR
-    return EFFECT if claimed in TABLE["effects"].get(kind, ()) else 0.0
+        return NEIGHBOUR_SHARE
+    return EFFECT_SHARE if claimed in TABLE["effects"].get(kind, ()) else 0.0
 
 
-def _of_mistakes(matched: list[Match], truth: FormTruth) -> dict[str, float]:
+def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
     """Shares of kinds, sizes, when and cure, each the mean over the mistakes."""
-    sized = sum(wrong.size is not None for wrong, _, _ in matched)
+    sized = sum(mistake.size is not None for mistake, _, _ in matches)
     shares = dict.fromkeys(("kinds", "sizes", "when", "cure"), 0.0)
-    for wrong, claim, share in matched:
+    for mistake, claim, share in matches:
         if claim is None:
             continue
-        size = size_share(wrong, claim)
-        seen = when_share(wrong, claim) * (1.0 if claim.kind == wrong.kind else 0.5)
-        cured = cure_share(wrong, claim, truth)
-        counts = size if wrong.kind in GUESSABLE else 1.0
-        shares["kinds"] += share / len(matched)
-        shares["when"] += seen * counts / len(matched)
-        shares["cure"] += cured * counts / len(matched)
+        size = size_share(mistake, claim)
+        when_points = when_share(mistake, claim) * (1.0 if claim.kind == mistake.kind else 0.5)
+        cure_points = cure_share(mistake, claim, truth)
+        weight = size if mistake.kind in GUESSABLE_KINDS else 1.0
+        shares["kinds"] += share / len(matches)
+        shares["when"] += when_points * weight / len(matches)
+        shares["cure"] += cure_points * weight / len(matches)
         shares["sizes"] += size / max(sized, 1)
     return shares
 
 
-def size_share(wrong: Wrong, claim: Claim) -> float:
+def size_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
     """What a size is worth: in full, half, or a third with the wrong sign or for a neighbour."""
     size = claim.size_in_first_unit()
-    if wrong.size is None or wrong.low is None or wrong.high is None or size is None:
+    if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
         return 0.0
-    if claim.kind != wrong.kind:
-        same_unit = [*MISTAKES[claim.kind].units][:1] == [*MISTAKES[wrong.kind].units][:1]
-        return 1.0 / 3.0 if wrong.low <= size <= wrong.high and same_unit else 0.0
-    close = wrong.kind not in GUESSABLE and abs(size - wrong.size) <= HALF_SIZE * abs(wrong.size)
-    return _value_share(size, wrong.low, wrong.high, 0.5 if close else 0.0)
+    if claim.kind != mistake.kind:
+        same_unit = [*MISTAKES[claim.kind].units][:1] == [*MISTAKES[mistake.kind].units][:1]
+        return 1.0 / 3.0 if mistake.low <= size <= mistake.high and same_unit else 0.0
+    close = mistake.kind not in GUESSABLE_KINDS and abs(
+        size - mistake.size
+    ) <= HALF_SIZE_TOLERANCE * abs(mistake.size)
+    return _value_share(size, mistake.low, mistake.high, 0.5 if close else 0.0)
 
 
-def when_share(wrong: Wrong, claim: Claim) -> float:
+def when_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
     """Half for the time, half for a panel that can show it."""
-    if wrong.from_s is None and wrong.until_s is None:
-        timed = claim.when == "whole flight"
+    if mistake.from_s is None and mistake.until_s is None:
+        is_time_right = claim.when == "whole flight"
     else:
-        asked = (wrong.from_s, claim.from_s), (wrong.until_s, claim.until_s)
-        timed = not claim.when and all(
-            known is None
-            or (given is not None and abs(given - known) <= max(CLOSE_S, CLOSE_SHARE * known))
-            for known, given in asked
+        times = (mistake.from_s, claim.from_s), (mistake.until_s, claim.until_s)
+        is_time_right = not claim.when and all(
+            true_s is None
+            or (
+                claimed_s is not None
+                and abs(claimed_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_SHARE * true_s)
+            )
+            for true_s, claimed_s in times
         )
-    return 0.5 * timed + 0.5 * (claim.panel in panels(wrong.kind))
+    return 0.5 * is_time_right + 0.5 * (claim.panel in panels(mistake.kind))
 
 
 def panels(kind: str) -> list[str]:
@@ -188,33 +204,36 @@ def panels(kind: str) -> list[str]:
     return [*(panel for panel, kinds in TABLE["shows"].items() if kind in kinds), "cover"]
 
 
-def cure_share(wrong: Wrong, claim: Claim, truth: FormTruth) -> float:
+def cure_share(mistake: TrueMistake, claim: ClaimedMistake, truth: FormTruth) -> float:
     """What the parameter and its value are worth, by what they do to this flight."""
     value = claim.value_in_first_unit()
     worth = [
-        share if (low, high) == ANY
+        share
+        if (low, high) == ANY_VALUE
         else share * (0.5 if value is None else _value_share(value, low, high, 0.5))
-        for parameter, (low, high), share in cures(wrong, truth)
+        for parameter, (low, high), share in cures(mistake, truth)
         if parameter == claim.parameter
-    ]  # fmt: skip
+    ]
     return max(worth, default=0.0)
 
 
-def _value_share(value: float, low: float, high: float, otherwise: float) -> float:
+def _value_share(value: float, low: float, high: float, fallback: float) -> float:
     """All for what is right, a third for the wrong sign."""
     if low <= value <= high:
         return 1.0
-    return 1.0 / 3.0 if low <= -value <= high else otherwise
+    return 1.0 / 3.0 if low <= -value <= high else fallback
 
 
 Cure = tuple[str, tuple[float, float], float]
 
 
-def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
+def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
     """Parameters that act on a mistake, from which value to which they cure it, and their share."""
-    size, low, high = (0.0 if one is None else one for one in (wrong.size, wrong.low, wrong.high))
-    from_s = 0.0 if wrong.from_s is None else wrong.from_s
-    until_s = from_s if wrong.until_s is None else wrong.until_s
+    size, low, high = (
+        0.0 if one is None else one for one in (mistake.size, mistake.low, mistake.high)
+    )
+    from_s = 0.0 if mistake.from_s is None else mistake.from_s
+    until_s = from_s if mistake.until_s is None else mistake.until_s
     bounds = {
         "back": (-high, -low),
         "size": (low, high),
@@ -229,49 +248,59 @@ def cures(wrong: Wrong, truth: FormTruth) -> tuple[Cure, ...]:
         (
             row.parameter,
             bounds[row.to] if isinstance(row.to, str) else row.to,
-            0.0 if row.late and size <= 0.0 else row.of[wrong.kind],
+            0.0 if row.late and size <= 0.0 else row.of[mistake.kind],
         )
         for row in CURES
-        if wrong.kind in row.of
+        if mistake.kind in row.of
     )
 
 
-def _verdicts(answers: Answers, truth: FormTruth) -> float:
+def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
     """Mean share of the verdicts on both filters and of what EKF2 did."""
-    shares = [_did(answers, truth)]
-    for given, known in ((answers.verdict_ours, truth.ours), (answers.verdict_ekf2, truth.ekf2)):
-        right = given and given == known.verdict
+    shares = [_ekf2_behaviour_share(answers, truth)]
+    for answer, known in ((answers.verdict_ours, truth.ours), (answers.verdict_ekf2, truth.ekf2)):
+        is_right = answer and answer == known.verdict
         # a factor so small can be taken for none
-        nearly = known.factor is not None and known.factor < SIGMA_OFF and given == "consistent"
-        shares.append(1.0 if right else 0.5 if nearly else 0.0)
+        is_nearly_right = (
+            known.factor is not None
+            and known.factor < SIGMA_FACTOR_FINDING
+            and answer == "consistent"
+        )
+        shares.append(1.0 if is_right else 0.5 if is_nearly_right else 0.0)
     return sum(shares) / len(shares)
 
 
-def _did(answers: Answers, truth: FormTruth) -> float:
+def _ekf2_behaviour_share(answers: Answers, truth: FormTruth) -> float:
     """What EKF2 did: full for all of it and nothing false, half for some."""
-    given, must = set(answers.ekf2_did), set(truth.ekf2_did)
-    allowed = must | set(truth.ekf2_did_also)
-    false, right = len(given - allowed), len(given & allowed)
-    if not right or false > 1:
+    claimed, required = set(answers.ekf2_did), set(truth.ekf2_did)
+    allowed = required | set(truth.ekf2_did_also)
+    false_count, right_count = len(claimed - allowed), len(claimed & allowed)
+    if not right_count or false_count > 1:
         return 0.0
-    whole = must <= given or (len(must) == 1 and bool(given & set(truth.ekf2_did_also)))
-    return 1.0 if whole and not false else 0.5
+    is_complete = required <= claimed or (
+        len(required) == 1 and bool(claimed & set(truth.ekf2_did_also))
+    )
+    return 1.0 if is_complete and not false_count else 0.5
 
 
-def _quantities(answers: Answers, truth: FormTruth) -> float:
+def _quantities_share(answers: Answers, truth: FormTruth) -> float:
     """Mean share of the numbers that can be known."""
     # an empty list is right on most flights of some kinds, and says nothing
     known = sum(one not in (None, ()) for one in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)
-    return sum(_quantity(*pair) for pair in pairs) / max(known, 1)
+    return sum(_quantity_share(*pair) for pair in pairs) / max(known, 1)
 
 
-def _quantity(given: Quantified, known: Quantified) -> float:
-    if isinstance(given, tuple) and isinstance(known, tuple):
-        off = len(set(given) ^ set(known))
-        return (1.0, 0.5)[off] if off < 2 and set(given) & set(known) else 0.0
-    if isinstance(given, float | int) and isinstance(known, float | int):
-        for within, share in ((FULL_WITHIN, 1.0), (HALF_WITHIN, 0.5)):
-            if abs(given - known) <= within * abs(known):
+def _quantity_share(answer: QuantityAnswer, known: QuantityAnswer) -> float:
+    if isinstance(answer, tuple) and isinstance(known, tuple):
+        difference_count = len(set(answer) ^ set(known))
+        return (
+            (1.0, 0.5)[difference_count]
+            if difference_count < 2 and set(answer) & set(known)
+            else 0.0
+        )
+    if isinstance(answer, float | int) and isinstance(known, float | int):
+        for within, share in ((FULL_TOLERANCE, 1.0), (HALF_TOLERANCE, 0.5)):
+            if abs(answer - known) <= within * abs(known):
                 return share
     return 0.0

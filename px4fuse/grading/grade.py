@@ -10,14 +10,14 @@ from pathlib import Path
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.errors import ResultsError
 from px4fuse.grading import submissions
-from px4fuse.grading.entries import NAME, Course, Overrides, class_entries, read_overrides
-from px4fuse.grading.model import Entry, Graded, Submission
+from px4fuse.grading.entries import OVERRIDES_NAME, Course, class_entries, read_overrides
+from px4fuse.grading.model import Entry, GradedReport, Submission
 from px4fuse.grading.outputs import grade_column, write_class
-from px4fuse.grading.records import RECORDS, verified
-from px4fuse.grading.rubric import Rubric, assess, refused
+from px4fuse.grading.records import RECORDS, load_or_verify
+from px4fuse.grading.rubric import Rubric, assess, refused_report
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.reading import one_line
-from px4fuse.workers import Failed, run_bounded
+from px4fuse.workers import JobFailure, run_bounded
 
 FAILED = "Do not open it: ask for the report as px4fuse wrote it."
 
@@ -29,7 +29,7 @@ class GradeOutcome:
     Attributes
     ----------
     entries : tuple of Entry
-        Everyone in the roster, then who is not in it; without pictures and redrawn reports.
+        Everyone in the roster, then who is not in it; without redrawn reports.
     notes : tuple of str
         What was passed over.
     reused : int
@@ -42,7 +42,7 @@ class GradeOutcome:
     written: tuple[Path, ...]
 
     @property
-    def graded(self) -> tuple[Graded, ...]:
+    def graded(self) -> tuple[GradedReport, ...]:
         """Every file that was handed in, those that count first, in the order of the entries."""
         return tuple(one for entry in self.entries for one in entry.files)
 
@@ -77,61 +77,45 @@ def grade(
     OutputError
         The folder cannot be written.
     """
-    overrides = read_overrides(output / NAME)
+    overrides = read_overrides(output / OVERRIDES_NAME)
     for sheet in course.worksheets:
         grade_column(sheet, course.column)
-    unread = sorted(one.name for one in output.glob("overrides*") if one.name != NAME)
-    renamed = [f"{one_line(name, 80)}: not read; only {NAME} is." for name in unread]
-    found, notes = submissions.collect(paths)
-    entries, unknown, reused = grade_all(
-        found, course, output / RECORDS, overrides, processes, progress
+    unread_names = sorted(
+        one.name for one in output.glob("overrides*") if one.name != OVERRIDES_NAME
     )
-    written, more = write_class(entries, course, output)
-    return GradeOutcome(entries, (*notes, *renamed, *unknown, *more), reused, written)
-
-
-def grade_all(
-    found: Sequence[Submission],
-    course: Course,
-    records: Path,
-    overrides: Overrides,
-    processes: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
-) -> tuple[tuple[Entry, ...], tuple[str, ...], int]:
-    """Verify, or recall, and score every file, each within bounds, and lay out the class.
-
-    Returns
-    -------
-    entries, notes
-        As :func:`~px4fuse.grading.entries.class_entries` gives them.
-    reused : int
-        How many reports were recalled.
-    """
+    unread_notes = [
+        f"{one_line(name, 80)}: not read; only {OVERRIDES_NAME} is." for name in unread_names
+    ]
+    found_files, notes = submissions.find_submissions(paths)
     jobs = []
-    for submission in found:
-        place = course.register.place(submission.origin.person)
-        owner = "" if place is None else course.register.people[place].student_id
+    for submission in found_files:
+        student_index = course.register.student_index(submission.origin.person)
+        owner = "" if student_index is None else course.register.people[student_index].student_id
         jobs.append((submission, owner))
     rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
-    scored = partial(grade_one, *rules, logs, records, max_log_bytes.get())
-    made: dict[int, Graded] = {}
+    scored = partial(grade_one, *rules, logs, output / RECORDS, max_log_bytes.get())
+    made: dict[int, GradedReport] = {}
     reused = 0
-    progress(0, len(found))
+    progress(0, len(found_files))
     with closing(run_bounded(scored, jobs, processes=processes)) as work:
         for index, result in work:
-            if isinstance(result, Failed):
-                one = refused(*rules, f"Grading it failed: {result.reason}", FAILED)
+            if isinstance(result, JobFailure):
+                one = refused_report(*rules, f"Grading it failed: {result.reason}", FAILED)
                 recalled = False
             else:
                 one, recalled = result
-            submission = found[index]
+            submission = found_files[index]
             known = one.student or one.student_id
             student = one.student if known else submission.origin.person.name
             made[index] = replace(one, submission=submission.name, student=student)
             reused += recalled
-            progress(len(made), len(found))
-    graded = [made[index] for index in range(len(found))]
-    return (*class_entries(graded, found, course, overrides), reused)
+            progress(len(made), len(found_files))
+    graded = [made[index] for index in range(len(found_files))]
+    entries, override_notes = class_entries(graded, found_files, course, overrides)
+    written, class_notes = write_class(entries, course, output)
+    return GradeOutcome(
+        entries, (*notes, *unread_notes, *override_notes, *class_notes), reused, written
+    )
 
 
 def grade_one(
@@ -141,7 +125,7 @@ def grade_one(
     records: Path,
     largest_log_bytes: int,
     job: tuple[Submission, str],
-) -> tuple[Graded, bool]:
+) -> tuple[GradedReport, bool]:
     """Read, verify or recall, and score a file, whoever it is from; in a process of its own."""
     max_log_bytes.set(largest_log_bytes)
     submission, owner_id = job
@@ -150,9 +134,9 @@ def grade_one(
     try:
         content = submissions.read(submission)
         sha256 = hashlib.sha256(content).hexdigest()
-        results, verdict, recalled = verified(records, content, logs, handed_out)
+        results, verdict, recalled = load_or_verify(records, content, logs, handed_out)
     except ResultsError as error:
-        one = refused(rubric, key, f"{error.reason}.", error.remedy)
+        one = refused_report(rubric, key, f"{error.reason}.", error.remedy)
     else:
         one = assess(results, verdict, rubric, key, owner_id)
     return replace(one, sha256=sha256), recalled

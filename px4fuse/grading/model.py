@@ -13,7 +13,7 @@ from px4fuse.verification.model import Verdict
 TOTAL = "total"
 
 
-UNKNOWN = Person("")
+UNKNOWN_PERSON = Person("")
 
 
 @dataclass(frozen=True)
@@ -31,18 +31,18 @@ class ExportOrigin:
         Without a time zone where the platform leaves it out.
     late : bool
         Whether the platform marks it so.
-    imitated : bool
+    is_imitated : bool
         Whether a student's own part of the name looks like a platform's.
     """
 
     platform: str = ""
-    person: Person = UNKNOWN
+    person: Person = UNKNOWN_PERSON
     time: datetime | None = None
     late: bool = False
-    imitated: bool = False
+    is_imitated: bool = False
 
 
-NOBODY = ExportOrigin()
+UNKNOWN_SUBMITTER = ExportOrigin()
 
 
 @dataclass(frozen=True)
@@ -69,14 +69,14 @@ class Submission:
     entry: str
     name: str
     time: datetime | None = None
-    origin: ExportOrigin = NOBODY
+    origin: ExportOrigin = UNKNOWN_SUBMITTER
 
 
 @dataclass(frozen=True)
 class Item:
     """Points for one part of the rubric, and why.
 
-    ``by_hand``: only the instructor gives them; ``waits``: has not yet.
+    ``by_hand``: only the instructor gives them; ``awaits_points``: has not yet.
     """
 
     title: str
@@ -84,11 +84,11 @@ class Item:
     of: float
     comment: str
     by_hand: bool = False
-    waits: bool = False
+    awaits_points: bool = False
 
 
 @dataclass(frozen=True)
-class Graded:
+class GradedReport:
     """One submission, graded; texts and bytes are empty where there is nothing to say.
 
     Attributes
@@ -115,9 +115,8 @@ class Graded:
         The student's own words.
     mistakes : mapping
         What the answer key says is wrong in the student's flight, and whether the form names it.
-    handed_in, sheets, redrawn_name : str, tuple of str, str
-        Where the picture of a page as it was handed in (the verdict's), pictures of the redrawn
-        pages, and the redrawn PDF stand, relative to the class page.
+    redrawn_name : str
+        Where the redrawn PDF stands, relative to the class page.
     """
 
     submission: str
@@ -134,15 +133,12 @@ class Graded:
     version: str = ""
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
-    handed_in: str = ""
     redrawn_name: str = ""
-    sheets: tuple[str, ...] = ()
 
     @property
     def status(self) -> str:
-        """That of the verdict, or "page differs" where only the numbers are verified."""
-        differ = self.verdict.page_status == "differ"
-        return self.verdict.outcome if differ else self.verdict.status
+        """That of the verdict, or "page differs" if only the numbers are verified."""
+        return self.verdict.outcome
 
     @property
     def points(self) -> float:
@@ -152,12 +148,12 @@ class Graded:
     @property
     def counted(self) -> float | None:
         """The points that count; None while they, or some of them, are the instructor's to say."""
-        return None if self.pending or self.waits else self.points
+        return None if self.pending or self.awaits_points else self.points
 
     @property
-    def waits(self) -> bool:
+    def awaits_points(self) -> bool:
         """Whether the instructor has not yet given the points of an item."""
-        return any(item.waits for item in self.items)
+        return any(item.awaits_points for item in self.items)
 
     @property
     def of(self) -> float:
@@ -207,8 +203,8 @@ class Entry:
 
     student: str
     student_id: str
-    counting: Graded | None
-    others: tuple[Graded, ...] = ()
+    counting: GradedReport | None
+    others: tuple[GradedReport, ...] = ()
     handed_in: str = ""
     late_s: float | None = None
     deduction: float = 0.0
@@ -219,12 +215,12 @@ class Entry:
     flags: tuple[str, ...] = ()
 
     @property
-    def files(self) -> tuple[Graded, ...]:
+    def files(self) -> tuple[GradedReport, ...]:
         """All attempts, the one that counts first."""
         return (*([self.counting] if self.counting else []), *self.others)
 
     @property
-    def called(self) -> str:
+    def display_name(self) -> str:
         """What the class page calls the student."""
         return self.student or self.student_id or "no name"
 

@@ -13,7 +13,7 @@ for one to delete, and zero for a grade.
   Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment; columns
   marked "(read only)" in the row "Points Possible" are ignored.
 - Any other: a table with a column of ids, logins, emails or names, and one for the grade, whose
-  title is given or one of :data:`GRADE`.
+  title is given or one of :data:`GRADE_TITLES`.
 """
 
 import html
@@ -26,17 +26,24 @@ from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
-from px4fuse.assignment.roster import Register, distinct, file_names, folded, person_of_row
+from px4fuse.assignment.roster import (
+    Register,
+    file_names,
+    make_unique,
+    normalise_text,
+    read_student,
+)
 from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.checks import text_of
 from px4fuse.grading.class_page import html_text
-from px4fuse.grading.entries import NAME, TEMPLATE, Course
-from px4fuse.grading.model import TOTAL, Entry, Graded, columns
-from px4fuse.grading.records import HANDED_IN, PAGE, RECORDS, REDRAWN
-from px4fuse.plain import few_words
+from px4fuse.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
+from px4fuse.grading.model import TOTAL, Entry, GradedReport, columns
+from px4fuse.grading.records import RECORDS, REDRAWN_SUFFIX
+from px4fuse.input_files import own_files
+from px4fuse.plain import join_first
 from px4fuse.results.reading import one_line
-from px4fuse.spreadsheet import neutral, neutral_id
+from px4fuse.spreadsheet import neutralise_formulas, neutralise_id
 from px4fuse.webpage.safe import template
 from px4fuse.writing import write_all
 
@@ -47,21 +54,37 @@ GRADES = "grades"
 NAMES = "names.csv"
 NAMES_HEAD = ("pseudonym", "id", "name")
 # Columns of the class table, before and behind those of items and numbers
-FIRST = ("file", "student", "id", "status", "points", "pending points", "of", "deducted", "total")
-LAST = (
-    "handed in", "hours late", "pending", "comment", "flags", "other files", "reasons",
+FIRST_COLUMNS = (
+    "file",
+    "student",
+    "id",
+    "status",
+    "points",
+    "pending points",
+    "of",
+    "deducted",
+    "total",
+)
+LAST_COLUMNS = (
+    "handed in",
+    "hours late",
+    "pending",
+    "comment",
+    "flags",
+    "other files",
+    "reasons",
     "log SHA-256",
-)  # fmt: skip
-BETWEEN = " | "
+)
+LIST_SEPARATOR = " | "
 # A list of reasons is cut where it would become longer than a sentence
-NAMED = 4
+MAX_REASONS = 4
 # Titles of columns of platforms' tables
-GRADE = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
-MAX_GRADE = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
+GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
+MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
 # Read as HTML, and read as text
-HTML_COMMENTS = ("feedbackcomments", "feedbackalskommentar")
-COMMENTS = (*HTML_COMMENTS, "feedbacktolearner", "feedback", "comment")
-ASSIGNMENT = re.compile(r" \(\d+\)$")
+HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
+COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
+ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
 # Never written into: of Canvas, what it computes
 READ_ONLY = "(read only)"
 
@@ -90,28 +113,32 @@ def write_class(
     """
     title = course.title or course.rubric.title or "Class"
     stems = file_names([_identity(entry, stem=True) for entry in entries])
-    shown = [_with_files(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)]
-    drawn = any(entry.counting and entry.counting.redrawn_name for entry in shown)
-    texts = [returned_text(entry, title) for entry in entries]
+    page_entries = [
+        _add_file_names(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
+    ]
+    has_redrawn = any(entry.counting and entry.counting.redrawn_name for entry in page_entries)
+    texts = [feedback_text(entry, title) for entry in entries]
     contents = {"class.csv": csv_text(entries).encode()}
     if course.anonymous:
-        shown, listed = _pseudonyms(shown, output / NAMES)
-        contents[NAMES] = listed.encode()
+        page_entries, names_table = _pseudonyms(page_entries, output / NAMES)
+        contents[NAMES] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
-    contents["class.html"] = html_text(shown, title, made_with).encode()
-    if not (output / NAME).exists():
-        contents[NAME] = TEMPLATE.encode()
+    contents["class.html"] = html_text(page_entries, title, made_with).encode()
+    if not (output / OVERRIDES_NAME).exists():
+        contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
     for stem, text in zip(stems, texts, strict=True):
         contents[f"{FEEDBACK}/{stem}.txt"] = text.encode()
     notes: list[str] = []
-    names = distinct((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
+    names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, names, strict=True):
-        made, said = filled(sheet, entries, course.register, course.column, texts)
-        contents[f"{GRADES}/{name}"] = made.content()
-        notes += said
+        filled_sheet, sheet_notes = fill_grades(
+            sheet, entries, course.register, course.column, texts
+        )
+        contents[f"{GRADES}/{name}"] = filled_sheet.content()
+        notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
-    folders = [REPORTS] * drawn + [FEEDBACK] + [GRADES] * bool(course.worksheets)
-    written = tuple(output / name for name in ("class.csv", "class.html", *folders, NAME))
+    folders = [REPORTS] * has_redrawn + [FEEDBACK] + [GRADES] * bool(course.worksheets)
+    written = tuple(output / name for name in ("class.csv", "class.html", *folders, OVERRIDES_NAME))
     return written, tuple(notes)
 
 
@@ -121,22 +148,17 @@ def _identity(entry: Entry, stem: bool = False) -> str:
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
 
-def _with_files(entry: Entry, stem: str, output: Path) -> Entry:
-    """With the redrawn report in its folder, and where the pictures of the pages stand."""
+def _add_file_names(entry: Entry, stem: str, output: Path) -> Entry:
+    """Add the place of the redrawn report, and write it there."""
     one = entry.counting
     if one is None or not one.sha256:
         return entry
-
-    def there(end: str) -> str:
-        name = f"{RECORDS}/{one.sha256}{end}"
-        return name if (output / name).exists() else ""
-
-    name = f"{REPORTS}/{stem}.pdf" if (redrawn := there(REDRAWN)) else ""
-    if name:
-        write_all({output / name: (output / redrawn).read_bytes()})
-    sheets = tuple(itertools.takewhile(bool, map(there, map(PAGE.format, itertools.count(1)))))
-    shown = replace(one, handed_in=there(HANDED_IN), redrawn_name=name, sheets=sheets)
-    return replace(entry, counting=shown)
+    redrawn = output / RECORDS / f"{one.sha256}{REDRAWN_SUFFIX}"
+    if not redrawn.exists():
+        return entry
+    name = f"{REPORTS}/{stem}.pdf"
+    write_all({output / name: redrawn.read_bytes()})
+    return replace(entry, counting=replace(one, redrawn_name=name))
 
 
 def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
@@ -144,39 +166,62 @@ def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]
 
     A second run keeps the pseudonyms of the first; their order says nothing of the names.
     """
-    kept: dict[str, tuple[str, str]] = {}
+    names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
-        sheet = read_sheet(path)
+        with own_files():
+            sheet = read_sheet(path)
         for row in sheet.rows:
-            name, who, student = (sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_HEAD)
-            kept[who] = name, student
-    taken = {name for name, _ in kept.values()}
+            name, identity, student = (sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_HEAD)
+            names_by_identity[identity] = name, student
+    used_names = {name for name, _ in names_by_identity.values()}
     numbered = (f"Student {number:03}" for number in itertools.count(1))
-    free = (name for name in numbered if name not in taken)
-    new = {who: entry.student for entry in entries if (who := _identity(entry)) not in kept}
-    for who in random.SystemRandom().sample(list(new), len(new)):
-        kept[who] = next(free), new[who]
-    ordered = sorted(kept.items(), key=lambda pair: pair[1])
-    rows = ((name, neutral_id(who), neutral(student)) for who, (name, student) in ordered)
-    made = [nameless(entry, kept[_identity(entry)][0]) for entry in entries]
-    listed = "\ufeff" + Sheet(path, NAMES_HEAD, tuple(rows)).text
-    return sorted(made, key=lambda entry: entry.student), listed
+    free = (name for name in numbered if name not in used_names)
+    new = {
+        identity: entry.student
+        for entry in entries
+        if (identity := _identity(entry)) not in names_by_identity
+    }
+    for identity in random.SystemRandom().sample(list(new), len(new)):
+        names_by_identity[identity] = next(free), new[identity]
+    ordered = sorted(names_by_identity.items(), key=lambda pair: pair[1])
+    rows = (
+        (name, neutralise_id(identity), neutralise_formulas(student))
+        for identity, (name, student) in ordered
+    )
+    anonymous_entries = [
+        anonymise_entry(entry, names_by_identity[_identity(entry)][0]) for entry in entries
+    ]
+    names_table = "\ufeff" + Sheet(path, NAMES_HEAD, tuple(rows)).text
+    return sorted(anonymous_entries, key=lambda entry: entry.student), names_table
 
 
-def nameless(entry: Entry, pseudonym: str) -> Entry:
+def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
     """What may be shown to others: states, points and the form, and no text that anybody wrote."""
     one = entry.counting
     if one is not None:
-        one = Graded(
-            "", "", "", replace(one.verdict, reasons=(), differences=()),
+        one = GradedReport(
+            "",
+            "",
+            "",
+            replace(one.verdict, reasons=(), differences=()),
             tuple(replace(item, comment="") for item in one.items),
             pending=one.pending and "Its points are pending.",
-            form=one.form, numbers=one.numbers, mistakes=one.mistakes,
-        )  # fmt: skip
+            form=one.form,
+            numbers=one.numbers,
+            mistakes=one.mistakes,
+        )
     return Entry(
-        pseudonym, "", one, (), entry.handed_in, entry.late_s, entry.deduction,
-        total=entry.total, of=entry.of, flags=("Flagged.",) * bool(entry.flags),
-    )  # fmt: skip
+        pseudonym,
+        "",
+        one,
+        (),
+        entry.handed_in,
+        entry.late_s,
+        entry.deduction,
+        total=entry.total,
+        of=entry.of,
+        flags=("Flagged.",) * bool(entry.flags),
+    )
 
 
 # ------------------------------------------------------------------ the class table
@@ -194,24 +239,36 @@ def csv_text(entries: Sequence[Entry]) -> str:
         without translating line ends.
     """
     items, numbers = columns(entries)
-    head = tuple(map(neutral, (*FIRST, *items, *numbers, *LAST)))
+    head = tuple(map(neutralise_formulas, (*FIRST_COLUMNS, *items, *numbers, *LAST_COLUMNS)))
     rows = []
     for entry in entries:
         one = entry.counting
         points = {item.title: item.points for item in one.items} if one else {}
         row: list[str | float | None] = [
-            one.submission if one else "", entry.student, None, one.status if one else "missing",
-            one.counted if one else None, one.points if one and one.counted is None else None,
-            entry.of, entry.deduction or None, entry.total,
+            one.submission if one else "",
+            entry.student,
+            None,
+            one.status if one else "missing",
+            one.counted if one else None,
+            one.points if one and one.counted is None else None,
+            entry.of,
+            entry.deduction or None,
+            entry.total,
             *map(points.get, items),
             *(one.numbers.get(title) if one else None for title in numbers),
-            entry.handed_in, None if entry.late_s is None else entry.late_s / 3600.0,
-            one.pending if one else "", entry.comment, BETWEEN.join(entry.flags),
-            BETWEEN.join(other.submission for other in entry.others),
-            BETWEEN.join(one.verdict.reasons) if one else "", one.log_sha256 if one else "",
-        ]  # fmt: skip
-        cells = [neutral(part) if isinstance(part, str) else number(part) for part in row]
-        cells[FIRST.index("id")] = neutral_id(entry.student_id)
+            entry.handed_in,
+            None if entry.late_s is None else entry.late_s / 3600.0,
+            one.pending if one else "",
+            entry.comment,
+            LIST_SEPARATOR.join(entry.flags),
+            LIST_SEPARATOR.join(other.submission for other in entry.others),
+            LIST_SEPARATOR.join(one.verdict.reasons) if one else "",
+            one.log_sha256 if one else "",
+        ]
+        cells = [
+            neutralise_formulas(part) if isinstance(part, str) else number(part) for part in row
+        ]
+        cells[FIRST_COLUMNS.index("id")] = neutralise_id(entry.student_id)
         rows.append(tuple(cells))
     return "\ufeff" + Sheet(Path(), head, tuple(rows)).text
 
@@ -219,14 +276,16 @@ def csv_text(entries: Sequence[Entry]) -> str:
 # ------------------------------------------------------------------ feedback
 
 
-def returned_text(entry: Entry, class_name: str = "") -> str:
+def feedback_text(entry: Entry, class_name: str = "") -> str:
     """Plain text for one student: points and why, what being late costs, and the instructor's word.
 
     Flags and remarks are for the instructor and are not in it.
     """
     graded = entry.counting
-    reasons = (text_of(one).rstrip(".") for one in graded.verdict.reasons[:NAMED]) if graded else ()
-    made = template("grading/feedback.j2").render(
+    reasons = (
+        (text_of(one).rstrip(".") for one in graded.verdict.reasons[:MAX_REASONS]) if graded else ()
+    )
+    text = template("grading/feedback.j2").render(
         entry=entry,
         graded=graded,
         class_name=class_name,
@@ -234,16 +293,20 @@ def returned_text(entry: Entry, class_name: str = "") -> str:
         final=TOTAL in entry.overrides,
         line=text_of,
         number=number,
-        wrapped=_wrapped,
+        wrapped=_wrap_text,
     )
-    return made.rstrip("\n") + "\n"
+    return text.rstrip("\n") + "\n"
 
 
-def _wrapped(text: str, indent: str = "") -> str:
+def _wrap_text(text: str, indent: str = "") -> str:
     return textwrap.fill(
-        text, 88, initial_indent=indent, subsequent_indent=indent, break_long_words=False,
+        text,
+        88,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
         break_on_hyphens=False,
-    )  # fmt: skip
+    )
 
 
 # ------------------------------------------------------------------ platforms' tables
@@ -267,23 +330,27 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
         for at, title in enumerate(sheet.head)
         if not any(READ_ONLY in row[at] for row in sheet.rows[:3])
     }
-    usual = sheet.column(GRADE)
-    assignments = [at for at in titles if ASSIGNMENT.search(titles[at])]
-    named = [at for at, title in titles.items()
-             if folded(wanted) in (folded(title), folded(ASSIGNMENT.sub("", title)))]  # fmt: skip
-    found = assignments if usual is None else [usual]
+    grade_index = sheet.column(GRADE_TITLES)
+    assignments = [at for at in titles if ASSIGNMENT_NUMBER.search(titles[at])]
+    matching_columns = [
+        at
+        for at, title in titles.items()
+        if normalise_text(wanted)
+        in (normalise_text(title), normalise_text(ASSIGNMENT_NUMBER.sub("", title)))
+    ]
+    candidates = assignments if grade_index is None else [grade_index]
     # the title may be meant for another table than Moodle's
-    if wanted and (named or sheet.column(("identifier",)) is None):
-        found = named
-    if len(found) == 1:
-        return found[0]
-    several = "several columns for the grade" if found else "no column for the grade"
-    shown = (ASSIGNMENT.sub("", titles[at]) for at in assignments or titles)
+    if wanted and (matching_columns or sheet.column(("identifier",)) is None):
+        candidates = matching_columns
+    if len(candidates) == 1:
+        return candidates[0]
+    several = "several columns for the grade" if candidates else "no column for the grade"
+    shown = (ASSIGNMENT_NUMBER.sub("", titles[at]) for at in assignments or titles)
     others = one_line(", ".join(one_line(title, 40) for title in shown), 300)
     raise SettingsError(f"{sheet.path}: {several}", f"Name one with --column: {others}.")
 
 
-def filled(
+def fill_grades(
     sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter the grades of a class into a platform's table, and say what could not be entered.
@@ -302,41 +369,46 @@ def filled(
     SettingsError
         From :func:`grade_column`.
     """
-    place, comments = grade_column(sheet, column), sheet.column(COMMENTS)
-    as_read = neutral if sheet.column(HTML_COMMENTS) is None else as_html
+    student_index, comments = grade_column(sheet, column), sheet.column(COMMENT_TITLES)
+    as_read = neutralise_formulas if sheet.column(HTML_COMMENT_TITLES) is None else as_html
     cells = [list(row) for row in sheet.rows]
     names = [one_line(entry.student or entry.student_id, 40) for entry in entries]
     comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
-    notes, seen = [], set()
+    notes, found_people = [], set()
     for row in cells:
-        person = person_of_row(sheet, row)
-        at = register.place(person) if person else None
+        person = read_student(sheet, row)
+        at = register.student_index(person) if person else None
         if at is None:
             continue
-        seen.add(at)
+        found_people.add(at)
         total = entries[at].total
         if total is None:
             continue
-        most = _most(sheet, row, place)
-        if most is not None and total > most:
+        max_points = _max_points(sheet, row, student_index)
+        if max_points is not None and total > max_points:
             notes.append(
                 f"{sheet.path.name}: {number(total)} points of {names[at]} are more than "
-                f"the platform's {number(most)}, and will not be taken: change its maximum."
+                f"the platform's {number(max_points)}, and will not be taken: change its maximum."
             )
-        row[place] = number(total).replace(".", "," if comma else ".")
-        if comments is not None and comments != place:
+        row[student_index] = number(total).replace(".", "," if comma else ".")
+        if comments is not None and comments != student_index:
             row[comments] = as_read(feedback[at])
-    left = [names[at] for at in range(len(register.people))
-            if at not in seen and entries[at].total is not None]  # fmt: skip
-    if left:
-        notes.append(f"{sheet.path.name}: it has no row for {few_words(left, 4)}.")
+    missing_names = [
+        names[at]
+        for at in range(len(register.people))
+        if at not in found_people and entries[at].total is not None
+    ]
+    if missing_names:
+        notes.append(f"{sheet.path.name}: it has no row for {join_first(missing_names, 4)}.")
     return replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes)
 
 
-def _most(sheet: Sheet, row: Sequence[str], place: int) -> float | None:
+def _max_points(sheet: Sheet, row: Sequence[str], student_index: int) -> float | None:
     """The most points that the platform takes, where the table says it."""
-    possible = (one[place] for one in sheet.rows[:3] if "points possible" in one[0].casefold())
-    return decimal(next(possible, sheet.cell(row, MAX_GRADE)))
+    possible = (
+        one[student_index] for one in sheet.rows[:3] if "points possible" in one[0].casefold()
+    )
+    return decimal(next(possible, sheet.cell(row, MAX_GRADE_TITLES)))
 
 
 def as_html(text: str) -> str:

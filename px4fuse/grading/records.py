@@ -8,28 +8,24 @@ request. Rubric, answer key, roster and overrides are not in it.
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from importlib.util import find_spec
+from functools import cache
 from pathlib import Path
 
 import msgspec
 
 from px4fuse.errors import ResultsError
-from px4fuse.results.contract import Reported, files_named, to_json
+from px4fuse.results.contract import Reported, file_hashes_in, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.pages import MEMORY_BYTES, TIMEOUT_S, pictures
 from px4fuse.verification.verification import log_sha256, verify
-from px4fuse.workers import bounded
 from px4fuse.writing import write_all
 
 # In the folder of a class
 RECORDS = "records"
-# Behind the SHA-256 of a PDF, whose record is ".json". Pictures stand in files that the class page
-# loads when a row is unfolded: three hundred reports have a hundred megabytes of them
-HANDED_IN, REDRAWN, PAGE = ".handed-in.png", ".pdf", ".page-{:03}.png"
+# The redrawn report: behind the SHA-256 of the handed-in PDF, whose record is ".json"
+REDRAWN_SUFFIX = ".pdf"
 
 
 @dataclass(frozen=True)
@@ -39,7 +35,7 @@ class VerificationRecord:
     Attributes
     ----------
     rests_on : dict
-        What it holds for: see :func:`_rests_on`.
+        What it holds for: see :func:`_dependencies`.
     results : str
         As they were attached.
     """
@@ -49,7 +45,7 @@ class VerificationRecord:
     verdict: Verdict
 
 
-def verified(
+def load_or_verify(
     records: Path, pdf: bytes, logs: Mapping[str, Path], handed_out: frozenset[str]
 ) -> tuple[Reported, Verdict, bool]:
     """Read and verify a report, or recall what an earlier run found.
@@ -75,29 +71,22 @@ def verified(
         It is no report.
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
-    if found := _recalled(records, sha256, logs, handed_out):
-        return *found, True
+    if loaded := _load_record(records, sha256, logs, handed_out):
+        return *loaded, True
     results = read_report(pdf, "The file")
     attached = to_json(results)
-    rests_on = _rests_on(attached, logs, handed_out)
+    rests_on = _dependencies(attached, logs, handed_out)
     gap = rests_on.get(log_sha256(results)) == "handed out"
     verdict = verify(results, pdf, {} if gap else logs)
-    parts: dict[str, bytes] = {}
-    if verdict.pages or not verdict.redrawn:
-        handed_in = bounded(partial(pictures, page=verdict.page - 1), pdf, TIMEOUT_S, MEMORY_BYTES)
-        if isinstance(handed_in, tuple) and handed_in:
-            parts[HANDED_IN] = handed_in[0]
-    if verdict.redrawn:
-        drawn = pictures(verdict.redrawn)
-        shown = drawn if isinstance(drawn, tuple) else ()
-        parts |= {PAGE.format(at): made for at, made in enumerate(shown, start=1)}
-        parts[REDRAWN] = verdict.redrawn
-    unread = replace(verdict, redrawn=b"")
-    _keep(records, sha256, VerificationRecord(rests_on, attached, unread), parts)
-    return results, unread, False
+    files = {REDRAWN_SUFFIX: verdict.redrawn} if verdict.redrawn else {}
+    stored_verdict = replace(verdict, redrawn=b"")
+    _write_record(records, sha256, VerificationRecord(rests_on, attached, stored_verdict), files)
+    return results, stored_verdict, False
 
 
-def _rests_on(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]) -> dict[str, str]:
+def _dependencies(
+    results: str, logs: Mapping[str, Path], handed_out: frozenset[str]
+) -> dict[str, str]:
     """The versions, and of every file that a report rests on, by SHA-256, where it is.
 
     "here", "handed out" by the answer key and not at hand, which is the instructor's gap, or
@@ -105,37 +94,38 @@ def _rests_on(results: str, logs: Mapping[str, Path], handed_out: frozenset[str]
     """
     return _versions() | {
         name: "here" if name in logs else "handed out" if name in handed_out else "away"
-        for name in sorted(set(files_named(results)))
+        for name in sorted(set(file_hashes_in(results)))
     }
 
 
 @cache
 def _versions() -> dict[str, str]:
-    here = provenance("")
-    drawn = f"{find_spec('pypdfium2') is not None}"  # pictures are an extra
-    return {**here.libraries, "px4fuse": here.px4fuse, "pictures": drawn}
+    versions = provenance("")
+    return {**versions.libraries, "px4fuse": versions.px4fuse}
 
 
-def _keep(records: Path, sha256: str, kept: VerificationRecord, parts: Mapping[str, bytes]) -> None:
+def _write_record(
+    records: Path, sha256: str, record: VerificationRecord, files: Mapping[str, bytes]
+) -> None:
     for earlier in records.glob(f"{sha256}.*"):
         # another process may be reading what an identical file left
         if earlier.suffix != ".json":
             earlier.unlink(missing_ok=True)
-    whole = {**parts, ".json": msgspec.json.encode(kept)}
-    write_all({records / f"{sha256}{end}": content for end, content in whole.items()})
+    contents = {**files, ".json": msgspec.json.encode(record)}
+    write_all({records / f"{sha256}{end}": content for end, content in contents.items()})
 
 
-def _recalled(
+def _load_record(
     records: Path, sha256: str, logs: Mapping[str, Path], handed_out: frozenset[str]
 ) -> tuple[Reported, Verdict] | None:
     """What an earlier run found, if nothing that it rests on has changed."""
     try:
         content = (records / f"{sha256}.json").read_bytes()
-        kept = msgspec.json.decode(content, type=VerificationRecord)
-        if kept.rests_on != _rests_on(kept.results, logs, handed_out):
+        record = msgspec.json.decode(content, type=VerificationRecord)
+        if record.rests_on != _dependencies(record.results, logs, handed_out):
             return None
-        results = read_results(kept.results.encode())
+        results = read_results(record.results.encode())
     # none, or not one of ours: done again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
-    return (results, kept.verdict) if isinstance(results, Reported) else None
+    return (results, record.verdict) if isinstance(results, Reported) else None

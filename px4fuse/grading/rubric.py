@@ -18,20 +18,20 @@ from msgspec import Meta
 
 from px4fuse.answers import Answers
 from px4fuse.assignment.key import AnswerKey
-from px4fuse.assignment.roster import distinct
+from px4fuse.assignment.roster import make_unique
 from px4fuse.errors import SettingsError
-from px4fuse.grading.checks import Evidence, RubricItem, Text, bracketed, contradictions, text_of
-from px4fuse.grading.flags import own_flags, page_flags, text_flags
-from px4fuse.grading.model import TOTAL, Graded, Item
+from px4fuse.grading.checks import Evidence, RubricItem, Text, in_brackets, text_of
+from px4fuse.grading.flags import own_flags, page_flags
+from px4fuse.grading.model import TOTAL, GradedReport, Item
 from px4fuse.reading import read_text
 from px4fuse.results.contract import Reported
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Verdict
-from px4fuse.verification.verification import log_sha256, unknown
+from px4fuse.verification.verification import cannot_verify, log_sha256
 
-DEFAULT = "rubric.toml"
+DEFAULT_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
-HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself."
+RUBRIC_HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself."
 
 # For the class table: column title, and where in the results
 NUMBERS = (
@@ -63,33 +63,27 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         What becomes of those of a report on a log that was not given to the student.
     pages : {"count", "pending", "zero"}
         What becomes of those of a verified report whose pages look otherwise.
-    min_words : int
-        Of a student's text, below which the instructor is told.
-    common_words : tuple of str
-        The commonest words of the course's language; empty for any language.
     """
 
     title: Text = ""
     unverified: Literal["pending", "zero"] = "pending"
     others_log: Doubtful = "pending"
     pages: Doubtful = "count"
-    min_words: Annotated[int, Meta(ge=0, le=100_000)] = 100
-    common_words: Annotated[tuple[Text, ...], Meta(max_length=100)] = ()
     items: Annotated[tuple[AnyItem, ...], Meta(min_length=1, max_length=100)] = msgspec.field(
         name="item"
     )
 
     def __post_init__(self) -> None:
         titles = [TOTAL, *(item.title for item in self.items)]
-        for title, apart in zip(titles, distinct(titles), strict=True):
-            if title != apart:
-                whose = "that of the sum" if title.casefold() == TOTAL else "another item's"
-                raise ValueError(f"the title {title!r} is {whose}; give each its own")
+        for title, unique_title in zip(titles, make_unique(titles), strict=True):
+            if title != unique_title:
+                owner = "that of the sum" if title.casefold() == TOTAL else "another item's"
+                raise ValueError(f"the title {title!r} is {owner}; give each its own")
 
 
 def rubric_text() -> str:
     """The default rubric, comments and all, for an instructor to copy and edit."""
-    return files("px4fuse.grading").joinpath(DEFAULT).read_text(encoding="utf-8")
+    return files("px4fuse.grading").joinpath(DEFAULT_NAME).read_text(encoding="utf-8")
 
 
 def read_rubric(path: Path | None) -> Rubric:
@@ -106,21 +100,21 @@ def read_rubric(path: Path | None) -> Rubric:
         It cannot be read, or something in it is not what it should be: the text says which item.
     """
     if path is None:
-        return parse_rubric(rubric_text(), DEFAULT)
+        return parse_rubric(rubric_text(), DEFAULT_NAME)
     return parse_rubric(read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path)), str(path))
 
 
-def parse_rubric(text: str, where: str) -> Rubric:
-    """Check the text of a rubric; ``where`` names it in errors."""
+def parse_rubric(text: str, source_name: str) -> Rubric:
+    """Check the text of a rubric; ``source_name`` names it in errors."""
     try:
         return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
     # ValueError: not TOML, or an integer of a million digits
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
-        said = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _place, str(error))
-        raise SettingsError(f"{where}: {one_line(said, 300)}", HELP) from error
+        message = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _describe_place, str(error))
+        raise SettingsError(f"{source_name}: {one_line(message, 300)}", RUBRIC_HELP) from error
 
 
-def _place(path: re.Match[str]) -> str:
+def _describe_place(path: re.Match[str]) -> str:
     """Which item and what of it, as a person counts."""
     return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
 
@@ -130,7 +124,7 @@ def _place(path: re.Match[str]) -> str:
 
 def assess(
     results: Reported, verdict: Verdict, rubric: Rubric, key: AnswerKey | None, owner_id: str = ""
-) -> Graded:
+) -> GradedReport:
     """Points for one report, whether they count, and what is left for the instructor.
 
     Items for another kind of report are left out, and without an answer key those on the form. The
@@ -138,34 +132,36 @@ def assess(
     ``owner_id`` is that of who handed it in, where a platform says so, whatever the report says.
     """
     evidence = Evidence(results, verdict, key, owner_id)
-    fate, why = _fate(evidence, rubric)
+    points_status, why = _points_status(evidence, rubric)
     student, kind = results.student, "compare" if evidence.comparison else "loop"
-    made = []
+    graded_items = []
     for item in rubric.items:
         if not item.applies(kind, key):
             continue
         share, comment = 0.0, f"No points, since {why}."
-        if fate != "zero":
+        if points_status != "zero":
             share, comment = item.score(evidence)
-        waits = item.by_hand and bool(student.notes.strip()) and fate != "zero"
+        awaits_points = item.by_hand and bool(student.notes.strip()) and points_status != "zero"
         points = round(item.points * min(max(share, 0.0), 1.0), 2)
-        made.append(Item(item.title, points, item.points, comment, item.by_hand, waits))
-    found, values = evidence.form_points, evidence.values
-    return Graded(
+        graded_items.append(
+            Item(item.title, points, item.points, comment, item.by_hand, awaits_points)
+        )
+    form_result, values = evidence.form_points, evidence.values
+    return GradedReport(
         "",
         student.name,
         student.id,
         verdict,
-        tuple(made),
+        tuple(graded_items),
         flags=(
             *page_flags(verdict),
             *own_flags(results, key is not None),
-            *text_flags(results, rubric.min_words, rubric.common_words),
-            *contradictions(evidence),
-            *([] if evidence.own else [_whose(evidence)]),
+            *([] if evidence.is_own_log else [_foreign_log_advice(evidence)]),
         ),
-        pending=why if fate == "pending" else "",
-        mistakes={} if isinstance(found, str) or not evidence.own else found.named,
+        pending=why if points_status == "pending" else "",
+        mistakes={}
+        if isinstance(form_result, str) or not evidence.is_own_log
+        else form_result.named,
         form=evidence.form if isinstance(evidence.form, Answers) else None,
         numbers={title: float(values[path]) for title, path in NUMBERS if path in values},
         log_sha256=log_sha256(results),
@@ -174,10 +170,10 @@ def assess(
     )
 
 
-def _fate(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
+def _points_status(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
     """What becomes of the points, and why: for "pending" what the instructor can do."""
     verdict = evidence.verdict
-    reason = bracketed("".join(verdict.reasons[:1]))
+    reason = in_brackets("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
         return "zero", f"your report's numbers are not those that its log gives{reason}"
     # of each doubt what the rubric says, why there are no points, and what can be done
@@ -188,9 +184,9 @@ def _fate(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
     elif verdict.page_status == "differ":
         why = "pages of your PDF are not those that px4fuse draws from the log"
         doubts.append((rubric.pages, why, "Compare the pages with the redrawn report."))
-    if not evidence.own:
+    if not evidence.is_own_log:
         why = "your report is not about the log that you were given"
-        doubts.append((rubric.others_log, why, _whose(evidence)))
+        doubts.append((rubric.others_log, why, _foreign_log_advice(evidence)))
     if evidence.key is not None and getattr(evidence.results.request, "position", None):
         todo = "Ask where its position file comes from: none was handed out."
         doubts.append(("pending", "", todo))
@@ -201,19 +197,21 @@ def _fate(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
     return ("pending", todo) if todo else ("count", "")
 
 
-def _whose(evidence: Evidence) -> str:
+def _foreign_log_advice(evidence: Evidence) -> str:
     """What the instructor can do about a log that is not the student's."""
     student_id = text_of(evidence.results.student.id)
-    said = f"the report gives the id {student_id}" if student_id else "the report gives no id"
+    id_text = f"the report gives the id {student_id}" if student_id else "the report gives no id"
     if evidence.owner_id:
-        said += f", and {text_of(evidence.owner_id)} handed it in"
+        id_text += f", and {text_of(evidence.owner_id)} handed it in"
     if evidence.answer is None:
         return "Ask for a report on the log that was handed out: this one is about another."
-    whose = text_of(evidence.answer.student_id)
-    return f"Find out whose report it is: the log was given to {whose}, {said}."
+    given_to = text_of(evidence.answer.student_id)
+    return f"Find out whose report it is: the log was given to {given_to}, {id_text}."
 
 
-def refused(rubric: Rubric, key: AnswerKey | None, why: str, remedy: str = "") -> Graded:
+def refused_report(
+    rubric: Rubric, key: AnswerKey | None, why: str, remedy: str = ""
+) -> GradedReport:
     """No points for what is not a report, so that it stands in the table with the others."""
     comment = f"No points, since the file could not be read as a report: {text_of(why)}"
     items = (
@@ -221,4 +219,4 @@ def refused(rubric: Rubric, key: AnswerKey | None, why: str, remedy: str = "") -
         for item in rubric.items
         if item.applies("compare", key)
     )
-    return Graded("", "", "", unknown(why, remedy), tuple(items), pending=remedy)
+    return GradedReport("", "", "", cannot_verify(why, remedy), tuple(items), pending=remedy)

@@ -33,12 +33,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
-from px4fuse.assignment.roster import Person, distinct
+from px4fuse.assignment.roster import Person, make_unique
 from px4fuse.errors import ResultsError, SettingsError
-from px4fuse.grading.model import NOBODY, ExportOrigin, Submission
+from px4fuse.grading.model import UNKNOWN_SUBMITTER, ExportOrigin, Submission
+from px4fuse.input_files import add_input
 from px4fuse.reading import files_below
 from px4fuse.record import table
-from px4fuse.results.reading import cleaned, one_line
+from px4fuse.results.reading import clean_text, one_line
 from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import BAD_VALUES
 
@@ -63,7 +64,7 @@ PLATFORMS = {
     for name, pattern in table(__file__, "platforms.toml", dict[str, str]).items()
 }
 # What a platform writes into a name once, and nobody else by chance
-_PARTS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
+_PLATFORM_MARKS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 TIME_IN_NAMES = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION = re.compile(r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE)
 _SUBMITTERS = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
@@ -78,7 +79,7 @@ _BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryErr
 _UNREADABLE = (_EntryError, *_BROKEN_ZIP, *BAD_VALUES)
 
 
-def _why(error: Exception) -> str:
+def _unread_reason(error: Exception) -> str:
     """Why something could not be read: the end of a sentence."""
     if isinstance(error, _EntryError):
         return str(error)
@@ -86,7 +87,7 @@ def _why(error: Exception) -> str:
     return f"it cannot be read ({why})."
 
 
-def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
+def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
     """Find the PDFs in files, folders and zip files, and who handed them in by their names.
 
     Parameters
@@ -110,42 +111,46 @@ def collect(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, .
         A path does not exist, or there is no PDF in any of them.
     """
     notes: list[str] = []
-    found: dict[tuple[Path, str], Submission] = {}
+    submissions_by_place: dict[tuple[Path, str], Submission] = {}
     people: dict[str, ExportOrigin] = {}
-    others = zips = 0
+    other_count = zip_count = 0
     for path in paths:
         export = path.is_file() and path.name.lower().endswith(".zip")
-        for place in (_exported if export else _files)(path, notes):
+        for place in (_zip_submissions if export else _folder_submissions)(path, notes):
+            add_input(place.file)
             end = place.name.lower()[-4:]
             if end in (".pdf", ".zip"):
-                found.setdefault((place.file, place.entry), place)
-                zips += end == ".zip"
+                submissions_by_place.setdefault((place.file, place.entry), place)
+                zip_count += end == ".zip"
             elif not _is_metadata(place.name):
-                others += 1
+                other_count += 1
             else:
                 try:
                     text = read(place).decode("utf-8", errors="replace")
                     people |= gradescope_metadata(text)
                 except ResultsError as error:
                     notes.append(str(error))
-    if others:
-        notes.append(f"Files passed over that are not PDFs: {others}.")
-    if zips:
-        notes.append(f"Zip files not opened: {zips}; give a platform's export by its own name.")
-    if not found:
+    if other_count:
+        notes.append(f"Files passed over that are not PDFs: {other_count}.")
+    if zip_count:
+        notes.append(
+            f"Zip files not opened: {zip_count}; give a platform's export by its own name."
+        )
+    if not submissions_by_place:
         raise SettingsError(
             one_line(" ".join(["No PDF was found in what was given.", *notes]), 500)
         )
     order = sorted(
-        found.values(), key=lambda one: (one.name.casefold(), one.name, one.file, one.entry)
+        submissions_by_place.values(),
+        key=lambda one: (one.name.casefold(), one.name, one.file, one.entry),
     )
-    names = distinct(_shown(one.name) for one in order)
-    named = [replace(one, name=name) for one, name in zip(order, names, strict=True)]
-    return tuple(with_origins(named, people)), tuple(notes)
+    names = make_unique(_short_name(one.name) for one in order)
+    named_submissions = [replace(one, name=name) for one, name in zip(order, names, strict=True)]
+    return tuple(with_origins(named_submissions, people)), tuple(notes)
 
 
 def with_origins(
-    those: Sequence[Submission], people: Mapping[str, ExportOrigin]
+    submissions: Sequence[Submission], people: Mapping[str, ExportOrigin]
 ) -> Iterator[Submission]:
     """Submissions with who handed in each, and by which platform.
 
@@ -157,12 +162,14 @@ def with_origins(
     people : mapping
         Of Gradescope's metadata, by number of a submission.
     """
-    exports = [one.file if one.entry else one.name.partition("/")[0] for one in those]
-    counted: dict[object, Counter[str]] = defaultdict(Counter)
-    for export, one in zip(exports, those, strict=True):
-        counted[export].update(filter(None, [origin_of(one.name).platform]))
-    for export, one in zip(exports, those, strict=True):
-        origin = origin_of(one.name, [platform for platform, _ in counted[export].most_common(1)])
+    exports = [one.file if one.entry else one.name.partition("/")[0] for one in submissions]
+    platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
+    for export, one in zip(exports, submissions, strict=True):
+        platform_counts[export].update(filter(None, [origin_of(one.name).platform]))
+    for export, one in zip(exports, submissions, strict=True):
+        origin = origin_of(
+            one.name, [platform for platform, _ in platform_counts[export].most_common(1)]
+        )
         if origin.platform in ("gradescope", ""):
             # PDF assignments are exported as 123456.pdf
             stem = one.name.rpartition("/")[2].casefold().removesuffix(".pdf")
@@ -182,13 +189,15 @@ def read(submission: Submission) -> bytes:
         with submission.file.open("rb") as file:
             if submission.entry:
                 with _archive(file) as archive:
-                    content = _unpacked(archive, submission.entry)
+                    content = _read_entry(archive, submission.entry)
             else:
                 content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
             raise _EntryError(_TOO_LARGE)
     except _UNREADABLE as error:
-        raise ResultsError(f"{one_line(submission.name, MAX_NAME)}: {_why(error)}") from error
+        raise ResultsError(
+            f"{one_line(submission.name, MAX_NAME)}: {_unread_reason(error)}"
+        ) from error
     return content
 
 
@@ -197,7 +206,7 @@ def _is_metadata(name: str) -> bool:
     return last == METADATA and not any(one.startswith("submission_") for one in folders)
 
 
-class _Limited:
+class _LimitedFile:
     """A file of which no more than a table of contents can be read in one piece."""
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -214,13 +223,13 @@ class _Limited:
 
 @contextmanager
 def _archive(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
-    with zipfile.ZipFile(_Limited(file)) as archive:
+    with zipfile.ZipFile(_LimitedFile(file)) as archive:
         if len(archive.infolist()) > MAX_ENTRIES:
             raise _EntryError(f"it has more than {MAX_ENTRIES} entries.")
         yield archive
 
 
-def _exported(path: Path, notes: list[str]) -> list[Submission]:
+def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     """What is in a zip file; nothing, and a note, where it cannot be read."""
     try:
         with path.open("rb") as file, _archive(file) as archive:
@@ -229,21 +238,22 @@ def _exported(path: Path, notes: list[str]) -> list[Submission]:
         if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
             raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
     except _UNREADABLE as error:
-        notes.append(f"{_shown(path.name)}: passed over: {_why(error)}")
+        notes.append(f"{_short_name(path.name)}: passed over: {_unread_reason(error)}")
         return []
     last = {one.filename: one for one in entries}
     if len(last) < len(entries):
         notes.append(
-            f"{_shown(path.name)}: {len(entries) - len(last)} entries have the name of another "
+            f"{_short_name(path.name)}: {len(entries) - len(last)} entries have the name of another "
             "one; only the last of each name was read."
         )
     places = (
-        Submission(path.resolve(), name, _label(one), _time(one)) for name, one in last.items()
+        Submission(path.resolve(), name, _entry_label(one), _entry_time(one))
+        for name, one in last.items()
     )
-    return [place for place in places if not any(map(_hidden, place.name.split("/")))]
+    return [place for place in places if not any(map(_is_hidden, place.name.split("/")))]
 
 
-def _files(path: Path, notes: list[str]) -> Iterator[Submission]:
+def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
     """Regular files with their names for people, without hidden ones."""
     if path.is_file():
         yield Submission(path.resolve(), "", path.name)
@@ -252,12 +262,12 @@ def _files(path: Path, notes: list[str]) -> Iterator[Submission]:
         raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no regular file, and no folder.")
     root = path.resolve()
     outside = 0
-    for whole in files_below(root):  # symbolic links to folders are not entered
-        name = whole.relative_to(root)
-        if any(map(_hidden, name.parts)):
+    for file in files_below(root):  # symbolic links to folders are not entered
+        name = file.relative_to(root)
+        if any(map(_is_hidden, name.parts)):
             continue
         try:
-            resolved = whole.resolve(strict=True)
+            resolved = file.resolve(strict=True)
             # a named pipe would keep us waiting forever
             inside = resolved.is_relative_to(root) and resolved.is_file()
         except (OSError, RuntimeError):  # it leads nowhere, or in a circle
@@ -272,11 +282,11 @@ def _files(path: Path, notes: list[str]) -> Iterator[Submission]:
         )
 
 
-def _hidden(name: str) -> bool:
+def _is_hidden(name: str) -> bool:
     return name.startswith(".") or name == "__MACOSX"
 
 
-def _time(entry: zipfile.ZipInfo) -> datetime | None:
+def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
     """When an entry was changed, in the time zone of who packed it; None where that is nonsense."""
     try:
         time = datetime(*entry.date_time)
@@ -285,7 +295,7 @@ def _time(entry: zipfile.ZipInfo) -> datetime | None:
     return time if time.year > ZIP_EPOCH else None
 
 
-def _label(entry: zipfile.ZipInfo) -> str:
+def _entry_label(entry: zipfile.ZipInfo) -> str:
     """Name of an entry for people: its folders and name, whatever else is in it left out."""
     name = entry.filename
     if not entry.flag_bits & _UTF8:
@@ -294,32 +304,38 @@ def _label(entry: zipfile.ZipInfo) -> str:
             name = name.encode("cp437").decode("utf-8")
         except UnicodeError:
             name = entry.filename
-    parts = re.split(r"[/\\]", name)
-    return "/".join(part for part in parts if part not in ("", ".", "..") and part[1:] != ":")
+    path_parts = re.split(r"[/\\]", name)
+    return "/".join(
+        path_part
+        for path_part in path_parts
+        if path_part not in ("", ".", "..") and path_part[1:] != ":"
+    )
 
 
-def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
+def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
     """Content of an entry, if it is one that a learning platform would write."""
     entry = archive.getinfo(name)
-    small = entry.file_size <= max(1_000_000, MAX_RATIO * entry.compress_size)
-    known = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-    for wrong, why in (
+    is_small = entry.file_size <= max(1_000_000, MAX_RATIO * entry.compress_size)
+    is_known_method = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+    for has_problem, why in (
         (entry.flag_bits & _ENCRYPTED, "encrypted in its zip file."),
-        (stat.S_ISLNK(entry.external_attr >> 16),
-         "a symbolic link in its zip file, which is not followed."),
-        (not known, "packed in its zip file by a method that is not read."),
+        (
+            stat.S_ISLNK(entry.external_attr >> 16),
+            "a symbolic link in its zip file, which is not followed.",
+        ),
+        (not is_known_method, "packed in its zip file by a method that is not read."),
         (entry.file_size > MAX_BYTES, _TOO_LARGE),
-        (not small, f"it shrinks more than {MAX_RATIO} times in its zip file: no report."),
-    ):  # fmt: skip
-        if wrong:
+        (not is_small, f"it shrinks more than {MAX_RATIO} times in its zip file: no report."),
+    ):
+        if has_problem:
             raise _EntryError(why)
     # zipfile gives no more than the declared size
     return archive.read(entry)
 
 
-def _shown(name: str) -> str:
+def _short_name(name: str) -> str:
     """A name on one line, with its end, where the file's name is."""
-    line = " ".join(cleaned(name[-10 * MAX_NAME :]).split())
+    line = " ".join(clean_text(name[-10 * MAX_NAME :]).split())
     if len(line) > MAX_NAME:
         line = f"{line[: MAX_NAME // 2]}…{line[-(MAX_NAME - MAX_NAME // 2 - 1) :]}"
     return line or "nameless"
@@ -340,38 +356,42 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
     >>> origin_of("report.pdf") == ExportOrigin()
     True
     """
-    parts = name.split("/")
-    for index in range(len(parts)):
-        tail = "/".join(parts[index:])
+    path_parts = name.split("/")
+    for index in range(len(path_parts)):
+        tail = "/".join(path_parts[index:])
         for platform in platforms:
             match = PLATFORMS[platform].match(tail)
             if match is None:
                 continue
-            said = {key: value or "" for key, value in match.groupdict().items()}
-            stamp = said.get("time", "")
+            fields = {key: value or "" for key, value in match.groupdict().items()}
+            stamp = fields.get("time", "")
             try:
                 time = datetime.strptime(stamp, TIME_IN_NAMES) if stamp else None
             except ValueError:  # a 99th month: a student's own name
                 continue
-            whole = said.get("name") or f"{said.get('first', '')} {said.get('last', '')}".strip()
-            numbers = {platform: said["number"]} if "number" in said else {}
-            person = Person("", whole, "", said.get("login", ""), numbers)
-            imitated = len(_PARTS.findall(name)) > (platform in ("moodle", "blackboard"))
-            return ExportOrigin(platform, person, time, bool(said.get("late")), imitated)
-    return NOBODY
+            full_name = (
+                fields.get("name") or f"{fields.get('first', '')} {fields.get('last', '')}".strip()
+            )
+            numbers = {platform: fields["number"]} if "number" in fields else {}
+            person = Person("", full_name, "", fields.get("login", ""), numbers)
+            is_imitated = len(_PLATFORM_MARKS.findall(name)) > (
+                platform in ("moodle", "blackboard")
+            )
+            return ExportOrigin(platform, person, time, bool(fields.get("late")), is_imitated)
+    return UNKNOWN_SUBMITTER
 
 
 def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     r"""People and times of Gradescope's ``submission_metadata.yml``, by number of submission.
 
-    Only what stands where Gradescope writes it: outputs of autograders are in it as well, deeper.
+    Only the keys at Gradescope's own depth are read: texts of students are in it as well, deeper.
     Of a group the first member is named.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
     >>> gradescope_metadata(text)["7"].person.student_id
     '12'
     """
-    found = {}
+    origins = {}
     for number, block in _SUBMISSION.findall(text.replace("\r\n", "\n")):
         people = _SUBMITTERS.search(block)
         name, student_id, email = (
@@ -379,8 +399,10 @@ def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
             for key in ("name", "sid", "email")
         )
         person = Person(student_id, name, email, "", {"gradescope": number})
-        found[number] = ExportOrigin("gradescope", person, _time_of(_value(block, "  :created_at")))
-    return found
+        origins[number] = ExportOrigin(
+            "gradescope", person, _time_of(_value(block, "  :created_at"))
+        )
+    return origins
 
 
 def _value(block: str, key: str) -> str:
@@ -396,7 +418,7 @@ def _time_of(value: str) -> datetime | None:
     '2026-11-20T12:34:56.123456+00:00'
     """
     try:
-        found = datetime.fromisoformat(re.sub(r" (?=Z|[+-]\d)", "", value))
+        time = datetime.fromisoformat(re.sub(r" (?=Z|[+-]\d)", "", value))
     except ValueError:
         return None
-    return found if found.tzinfo else found.replace(tzinfo=UTC)
+    return time if time.tzinfo else time.replace(tzinfo=UTC)

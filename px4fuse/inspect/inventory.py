@@ -10,24 +10,24 @@ import pandas as pd
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.events import longest_s
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import of_source
-from px4fuse.ekf2.aids import judge_aids
-from px4fuse.ekf2.inputs import prepare
+from px4fuse.comparison.preparation import flight_for_source
+from px4fuse.ekf2.aids import evaluate_aids
+from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
 from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_acceleration, within
-from px4fuse.findings import ekf2_not_fusing, imu, missing, named, recording
+from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
-from px4fuse.inspect.tables import NO_POSITION, absent
-from px4fuse.plain import capital, plain, utc_time
+from px4fuse.inspect.tables import NO_POSITION, unavailable_parts
+from px4fuse.plain import capitalise_first, to_json_types, utc_time
 from px4fuse.recording import Stream
 from px4fuse.request import with_options
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
 # What is told of a flight as it is
-OF_FLIGHT = ("log", "airborne", "clocks", "missing", "unused", "inputs")
+FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
 # How a part is named for a person, by its name in Flight.streams
-PARTS = {
+PART_NAMES = {
     "imu": "IMU",
     "attitude": "attitude",
     "position": "position",
@@ -39,7 +39,7 @@ PARTS = {
     "airborne": "land detector",
 }
 # What compare does with EKF2 and the truth, and the part that each needs
-OF_PARTS = {
+PARTS_OF_COMPARE = {
     "EKF2 states": "ekf2_state",
     "EKF2 variances": "ekf2_variance",
     "EKF2 innovations": "ekf2_innovations",
@@ -50,7 +50,7 @@ Spans = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
-class Ability:
+class AnalysisOption:
     """One thing that px4fuse can or cannot do with the log, and with what or why not."""
 
     name: str
@@ -59,7 +59,7 @@ class Ability:
 
 
 @dataclass(frozen=True)
-class Advice:
+class LoggingAdvice:
     """What to do before the next flight, and for what."""
 
     remedy: str
@@ -93,7 +93,7 @@ class Source:
     Attributes
     ----------
     part : str
-        "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PARTS`.
+        "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PART_NAMES`.
     name : str
         The name of a position track, else the first topic; empty where unavailable.
     topics : tuple of str
@@ -157,8 +157,8 @@ class Inventory:
     sources: tuple[Source, ...]
     source_reason: str
     segment: Segment | None
-    abilities: tuple[Ability, ...]
-    advice: tuple[Advice, ...]
+    abilities: tuple[AnalysisOption, ...]
+    advice: tuple[LoggingAdvice, ...]
     notes: tuple[str, ...]
 
 
@@ -180,9 +180,9 @@ def take_inventory(flight: Flight) -> Inventory:
         if not isinstance(error, MissingDataError):
             remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
     if compared is not None:
-        flight = of_source(flight, compared.source)
+        flight = flight_for_source(flight, compared.source)
     log = flight.log
-    cut = log.ends_in_flight and not log.damage
+    is_cut = log.ends_in_flight and not log.damage
     return Inventory(
         flight=flight,
         start_utc=utc_time(log.start_unix_s),
@@ -190,10 +190,10 @@ def take_inventory(flight: Flight) -> Inventory:
         source_reason=reason,
         segment=None if compared is None else compared.segment,
         abilities=tuple(_abilities(flight, compared, reason)),
-        advice=_advice(flight, compared, remedy),
+        advice=_logging_advice(flight, compared, remedy),
         notes=(
             *log.damage,
-            *(("the log ends in flight: the landing is not in it",) if cut else ()),
+            *(("the log ends in flight: the landing is not in it",) if is_cut else ()),
             *log.notes,
             *(() if compared is None else compared.source.notes),
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
@@ -203,39 +203,39 @@ def take_inventory(flight: Flight) -> Inventory:
 
 def to_plain(inventory: Inventory) -> dict[str, Any]:
     """The inventory for JSON: what is not known is absent."""
-    found = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
-    flight: Flight = found.pop("flight")
-    logged = {name: getattr(flight, name) for name in OF_FLIGHT}
+    inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
+    flight: Flight = inventory_fields.pop("flight")
+    flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
     if isinstance(flight.airborne, Unavailable):
-        del logged["airborne"]
-    data: dict[str, Any] = plain(logged | found)
+        del flight_fields["airborne"]
+    data: dict[str, Any] = to_json_types(flight_fields | inventory_fields)
     return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
 
 
-def _parts(flight: Flight) -> dict[str, pd.DataFrame | Spans | Unavailable]:
+def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | Spans | Unavailable]:
     """All but the positions, by their names in Flight.streams; of EKF2 that is missing the state.
 
     Innovations are those of the axis that has most of them.
     """
     ekf2, truth = flight.ekf2, flight.truth
-    parts = {"imu": flight.imu, "attitude": flight.attitude}
+    data_by_part = {"imu": flight.imu, "attitude": flight.attitude}
     if isinstance(ekf2, Unavailable):
-        parts["ekf2_state"] = ekf2
+        data_by_part["ekf2_state"] = ekf2
     else:
         axes = ekf2.innovations.values()
         frames = [frame for frame in axes if isinstance(frame, pd.DataFrame)]
-        most = max(frames, key=len) if frames else next(iter(axes))
-        parts |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
-        parts |= {"ekf2_innovations": most, "ekf2_fusing": ekf2.fusing}
+        longest_frame = max(frames, key=len) if frames else next(iter(axes))
+        data_by_part |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
+        data_by_part |= {"ekf2_innovations": longest_frame, "ekf2_fusing": ekf2.fusing}
     samples = truth if isinstance(truth, Unavailable) else truth.samples
-    return {**parts, "truth": samples, "airborne": flight.airborne}
+    return {**data_by_part, "truth": samples, "airborne": flight.airborne}
 
 
 def _sources(flight: Flight, compared: Comparison | None, reason: str) -> Iterator[Source]:
-    parts = _parts(flight)
-    for key, name in PARTS.items():
-        if key in parts:
-            yield _source(name, parts[key], flight.streams.get(key))
+    data_by_part = _data_by_part(flight)
+    for key, name in PART_NAMES.items():
+        if key in data_by_part:
+            yield _source(name, data_by_part[key], flight.streams.get(key))
         for track in flight.positions if key == "position" else ():
             chosen = compared is not None and track.name == compared.source.name
             about = {"name": track.name, "description": track.description, "chosen": chosen}
@@ -264,7 +264,10 @@ def _source(
     if times_s:
         about |= {"start_s": times_s[0], "end_s": times_s[-1]}
     if isinstance(data, pd.DataFrame) and len(data) > 1:
-        about |= {"rate_hz": sample_rate(data), "gaps": _gaps(data, of_imu=part == PARTS["imu"])}
+        about |= {
+            "rate_hz": sample_rate(data),
+            "gaps": _gaps(data, of_imu=part == PART_NAMES["imu"]),
+        }
     return Source(part, **about)
 
 
@@ -275,91 +278,116 @@ def _gaps(frame: pd.DataFrame, *, of_imu: bool) -> Gaps:
         if of_imu
         else float(longest_s(1.0 / sample_rate(frame)))
     )
-    long = intervals[intervals > limit_s]
-    return Gaps(len(long), float(long.sum()), float(long.max(initial=0.0)), limit_s)
+    long_intervals = intervals[intervals > limit_s]
+    return Gaps(
+        len(long_intervals),
+        float(long_intervals.sum()),
+        float(long_intervals.max(initial=0.0)),
+        limit_s,
+    )
 
 
-def _abilities(flight: Flight, compared: Comparison | None, reason: str) -> Iterator[Ability]:
+def _abilities(
+    flight: Flight, compared: Comparison | None, reason: str
+) -> Iterator[AnalysisOption]:
     """What compare does, with what, or why not."""
     acceleration: object = ned_acceleration(flight)
-    done: dict[str, tuple[object, str]] = {}
+    rows_by_name: dict[str, tuple[object, str]] = {}
     if compared is None:
-        yield Ability("compare", False, reason)
+        yield AnalysisOption("compare", False, reason)
     else:
         source, segment = compared.source, compared.segment
         count, span = len(within(source.samples, segment)), (segment.start_s, segment.end_s)
-        said = "our filter on {}, {} samples, {:.1f} s to {:.1f} s"
-        yield Ability("compare", True, said.format(source.name, count, *span))
-        acceleration, done = compared.lines[0].acceleration, _done(compared)
-    slow = " ".join(found.message for found in imu.rates(flight))
+        description = "our filter on {}, {} samples, {:.1f} s to {:.1f} s"
+        yield AnalysisOption("compare", True, description.format(source.name, count, *span))
+        acceleration, rows_by_name = compared.lines[0].acceleration, _ekf2_and_truth_rows(compared)
+    slow = " ".join(finding.message for finding in imu.rates(flight))
     if isinstance(acceleration, Unavailable):
         slow = f"{acceleration.reason}; velocity is held constant"
-    turned = "IMU turned into NED by the attitude, gravity removed"
-    yield Ability("acceleration", not slow, slow or turned)
-    parts = _parts(flight)
-    for name, key in OF_PARTS.items():
-        logged, (used, said) = parts.get(key, flight.ekf2), done.get(name, (NO_AXIS, ""))
-        yield _ability(name, logged if isinstance(logged, Unavailable) else used, said)
-    aids, ekf2 = judge_aids(flight), flight.ekf2
+    acceleration_text = "IMU turned into NED by the attitude, gravity removed"
+    yield AnalysisOption("acceleration", not slow, slow or acceleration_text)
+    data_by_part = _data_by_part(flight)
+    for name, key in PARTS_OF_COMPARE.items():
+        logged, (used_part, description) = (
+            data_by_part.get(key, flight.ekf2),
+            rows_by_name.get(name, (NO_AXIS, "")),
+        )
+        yield _ability(name, logged if isinstance(logged, Unavailable) else used_part, description)
+    aids, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
-        rates = (f"{a.label} {sample_rate(ekf2.aids[n].samples):.2g} Hz" for n, a in aids.items())
-        said = f"each judged by its own innovations: {', '.join(rates)}"
-    yield _ability("aids", aids, said)
-    inputs = prepare(flight)
+        rates = (f"{a.label} {_rate_text(ekf2.aids[n].samples)}" for n, a in aids.items())
+        description = f"each judged by its own innovations: {', '.join(rates)}"
+    yield _ability("aids", aids, description)
+    inputs = prepare_inputs(flight)
     if not isinstance(inputs, Unavailable):
         replayed_s = sum(float(np.ptp(stretch.time_s)) for stretch in inputs.stretches)
-        said = f"EKF2 replayed on {inputs.aid.label} for {replayed_s:.0f} s, also otherwise set"
-    yield _ability("what if", inputs, said)
+        description = (
+            f"EKF2 replayed on {inputs.aid.label} for {replayed_s:.0f} s, also otherwise set"
+        )
+    yield _ability("what if", inputs, description)
 
 
-def _ability(name: str, part: object, said: str) -> Ability:
+def _rate_text(samples: pd.DataFrame) -> str:
+    """Format the rate of samples (Hz); a single sample has none."""
+    return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
+
+
+def _ability(name: str, part: object, description: str) -> AnalysisOption:
     """What is said of what is done with a part, or why it is not done."""
     if isinstance(part, Unavailable):
-        return Ability(name, False, part.reason)
-    return Ability(name, True, said)
+        return AnalysisOption(name, False, part.reason)
+    return AnalysisOption(name, True, description)
 
 
-def _done(compared: Comparison) -> dict[str, tuple[object, str]]:
+def _ekf2_and_truth_rows(compared: Comparison) -> dict[str, tuple[object, str]]:
     """What compare did with EKF2 and the truth along its first axis, and what is said of it."""
     first, truth = next(iter(compared.axes.values())), compared.flight.truth
     innovations = {name: axis.ekf2_innovations for name, axis in compared.axes.items()}
     counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
-    judged = [axis.filters["ekf2"] for axis in compared.axes.values()]
-    what = "position only"
+    summaries = [axis.filters["ekf2"] for axis in compared.axes.values()]
+    quantities_text = "position only"
     if isinstance(truth, Truth) and truth.samples[Columns.VELOCITY].notna().any(axis=None):
-        what = "position and velocity"
+        quantities_text = "position and velocity"
     return {
-        "EKF2 states": (first.difference, f"{_count(first.ekf2_state)} of position and velocity"),
-        "EKF2 variances": (first.ekf2_variance, _count(first.ekf2_variance)),
+        "EKF2 states": (
+            first.difference,
+            f"{_count_text(first.ekf2_state)} of position and velocity",
+        ),
+        "EKF2 variances": (first.ekf2_variance, _count_text(first.ekf2_variance)),
         "EKF2 innovations": (
-            next((one for one in judged if not isinstance(one, Unavailable)), judged[0]),
+            next((one for one in summaries if not isinstance(one, Unavailable)), summaries[0]),
             f"two-sided consistency: {', '.join(counts)}",
         ),
-        "truth": (first.truth, f"RMSE and NEES of {what} against {getattr(truth, 'name', '')}"),
+        "truth": (
+            first.truth,
+            f"RMSE and NEES of {quantities_text} against {getattr(truth, 'name', '')}",
+        ),
     }
 
 
-def _count(part: pd.DataFrame | Unavailable) -> str:
+def _count_text(part: pd.DataFrame | Unavailable) -> str:
     return "" if isinstance(part, Unavailable) else f"{len(part)} samples"
 
 
-def _advice(flight: Flight, compared: Comparison | None, remedy: str) -> tuple[Advice, ...]:
+def _logging_advice(
+    flight: Flight, compared: Comparison | None, remedy: str
+) -> tuple[LoggingAdvice, ...]:
     """Remedies of what compare finds about the recording and of all that is missing, each once."""
-    found = [*recording.loss(flight), *recording.clocks_set_back(flight)]
-    lacking = [(remedy, "position")] if remedy else []
+    findings = [*recording.loss(flight), *recording.clocks_set_back(flight)]
+    needs = [(remedy, "position")] if remedy else []
     if compared is not None:
-        found += [*missing.source_as_sent(compared), *ekf2_not_fusing.detect(compared)]
-        found += [*missing.innovations(compared), *recording.dropouts(compared)]
-    found += imu.rates(flight)
-    lacking += [(one.remedy, named(one.id)) for one in found]
+        findings += [*missing.source_as_sent(compared), *ekf2_not_fusing.detect(compared)]
+        findings += [*missing.innovations(compared), *recording.dropouts(compared)]
+    findings += imu.rates(flight)
+    needs += [(one.remedy, finding_title(one.id)) for one in findings]
     # no other autopilot than PX4 could have recorded more of its estimator
     of_all = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
-    lacking += [
+    needs += [
         (part.remedy, part.what)
-        for part in absent(flight)
+        for part in unavailable_parts(flight)
         if part is not NO_POSITION and (flight.log.has_ulog or any(part is one for one in of_all))
     ]
     improves: dict[str, dict[str, None]] = {}
-    for said, what in lacking:
-        improves.setdefault(capital(said), {})[what] = None
-    return tuple(Advice(said, tuple(parts)) for said, parts in improves.items())
+    for action, what in needs:
+        improves.setdefault(capitalise_first(action), {})[what] = None
+    return tuple(LoggingAdvice(action, tuple(purposes)) for action, purposes in improves.items())

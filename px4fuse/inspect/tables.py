@@ -11,12 +11,12 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.comparison.preparation import choose_source, of_source
+from px4fuse.comparison.preparation import choose_source, flight_for_source
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.plain import plain
-from px4fuse.record import lacking
+from px4fuse.plain import to_json_types
+from px4fuse.record import missing_data
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
@@ -24,7 +24,7 @@ DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_top
 # What a file name may not hold on some system, or what is awkward in a shell
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_NAME = 80
-NO_POSITION = lacking("no_track")
+NO_POSITION = missing_data("no_track")
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class DescribedTable:
     columns: pd.DataFrame
 
 
-def of_best_source(flight: Flight) -> Flight:
+def with_best_source(flight: Flight) -> Flight:
     """The flight with EKF2's innovations of the position that compare would take."""
     try:
-        return of_source(flight, choose_source(flight)[0])
+        return flight_for_source(flight, choose_source(flight)[0])
     except MissingDataError:
         return flight
 
@@ -51,7 +51,7 @@ def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
     -------
     mapping from table name to DataFrame
         The first column of a time series is ``time_s``. Names are safe as file names. Parts that
-        are unavailable have no table; see :func:`absent`.
+        are unavailable have no table; see :func:`unavailable_parts`.
     """
     return {table.name: table.data for table in _tables(flight)}
 
@@ -65,47 +65,49 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
         Columns table, column, unit (ASCII, so that every spreadsheet reads it), frame, meaning,
         source_topic, clock.
     """
-    parts = [table.columns for table in _tables(flight)]
-    if not parts:
+    frames = [table.columns for table in _tables(flight)]
+    if not frames:
         return pd.DataFrame(columns=DICTIONARY_COLUMNS)
-    return pd.concat(parts, ignore_index=True)[DICTIONARY_COLUMNS]
+    return pd.concat(frames, ignore_index=True)[DICTIONARY_COLUMNS]
 
 
-def absent(flight: Flight) -> tuple[Unavailable, ...]:
+def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
     """Parts of the flight that have no table, and why."""
     ekf2 = flight.ekf2
-    parts: list[object] = [flight.imu, flight.attitude, ekf2]
+    sections: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
-        parts += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusing]
-    if not any(isinstance(part, Unavailable) for part in (flight.imu, flight.attitude)):
-        parts.append(ned_acceleration(flight))
-    parts += [flight.airborne, flight.truth]
-    found = [part for part in parts if isinstance(part, Unavailable)]
+        sections += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusing]
+    if not any(isinstance(section, Unavailable) for section in (flight.imu, flight.attitude)):
+        sections.append(ned_acceleration(flight))
+    sections += [flight.airborne, flight.truth]
+    unavailable = [section for section in sections if isinstance(section, Unavailable)]
     if not flight.positions:
-        found.append(NO_POSITION)
-    return tuple(dict.fromkeys(found))
+        unavailable.append(NO_POSITION)
+    return tuple(dict.fromkeys(unavailable))
 
 
 def description(flight: Flight) -> dict[str, Any]:
     """What the log is and what is missing from it, for JSON: what is not known is absent."""
     ekf2 = flight.ekf2
-    about: dict[str, Any] = {
+    description_fields: dict[str, Any] = {
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
         "log": flight.log,
         "streams": flight.streams,
-        "positions": [{"table": table, **track.about()} for table, track in _named_tracks(flight)],
+        "positions": [
+            {"table": table, **track.description_fields()} for table, track in _named_tracks(flight)
+        ],
         "ekf2": {"gate": ekf2.gate, "notes": ekf2.notes} if isinstance(ekf2, Ekf2) else None,
         "clocks": flight.clocks,
-        "missing": tuple(dict.fromkeys((*absent(flight), *flight.missing))),
+        "missing": tuple(dict.fromkeys((*unavailable_parts(flight), *flight.missing))),
         "unused": flight.unused,
         "inputs": flight.inputs,
     }
-    data: dict[str, Any] = plain(about)
+    data: dict[str, Any] = to_json_types(description_fields)
     return data
 
 
 @cache
-def _described() -> pd.DataFrame:
+def _column_descriptions() -> pd.DataFrame:
     """Unit, frame and meaning of every column, by table."""
     with files("px4fuse.inspect").joinpath("columns.csv").open(encoding="utf-8") as file:
         return pd.read_csv(file, index_col="table", keep_default_na=False)
@@ -127,76 +129,82 @@ def _table(
     **words
         What stands in braces in the descriptions.
     """
-    columns = _described().loc[of or name].map(lambda cell: cell.format(**words))
+    columns = _column_descriptions().loc[of or name].map(lambda cell: cell.format(**words))
     topics, clock = origin
     columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
     return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
 
 
-def _series(
+def _stream_table(
     flight: Flight, name: str, data: pd.DataFrame | Unavailable
 ) -> Iterator[DescribedTable]:
     """A time series that is named as its stream; nothing where it is unavailable."""
     if isinstance(data, pd.DataFrame):
-        yield _table(name, _timed(data), _origin(flight, name))
+        yield _table(name, _with_time_column(data), _origin(flight, name))
 
 
-def _timed(data: pd.DataFrame) -> pd.DataFrame:
+def _with_time_column(data: pd.DataFrame) -> pd.DataFrame:
     return data.rename_axis("time_s").reset_index()
 
 
 def _tables(flight: Flight) -> Iterator[DescribedTable]:
-    yield from _series(flight, "imu", flight.imu)
-    yield from _series(flight, "attitude", flight.attitude)
+    yield from _stream_table(flight, "imu", flight.imu)
+    yield from _stream_table(flight, "attitude", flight.attitude)
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         data = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
         (imu, clock), (attitude, _) = _origin(flight, "imu"), _origin(flight, "attitude")
-        yield _table("acceleration_ned", _timed(data), ((*imu, *attitude), clock))
+        yield _table("acceleration_ned", _with_time_column(data), ((*imu, *attitude), clock))
     for name, track in _named_tracks(flight):
         words = {"frame": track.frame, "description": track.description}
         origin = (track.topics, track.clock)
-        yield _table(name, _timed(track.samples), origin, "position", **words)
+        yield _table(name, _with_time_column(track.samples), origin, "position", **words)
         if track.orientation is not None:
-            turned = _timed(track.orientation)
+            orientation_table = _with_time_column(track.orientation)
             yield _table(
-                f"orientation_{name.partition('_')[2]}", turned, origin, "orientation", **words
+                f"orientation_{name.partition('_')[2]}",
+                orientation_table,
+                origin,
+                "orientation",
+                **words,
             )
     if isinstance(flight.ekf2, Ekf2):
         yield from _ekf2(flight, flight.ekf2)
     if isinstance(flight.truth, Truth):
-        yield from _series(flight, "truth", flight.truth.samples)
+        yield from _stream_table(flight, "truth", flight.truth.samples)
     log = flight.log
     if not isinstance(flight.airborne, Unavailable):
-        spans = _listed(["time_s", "end_s"], flight.airborne)
+        spans = _numeric_table(["time_s", "end_s"], flight.airborne)
         yield _table("airborne", spans, _origin(flight, "airborne"))
     if log.dropouts:
         rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
-        yield _table("dropouts", _listed(["time_s", "duration_s"], rows))
+        yield _table("dropouts", _numeric_table(["time_s", "duration_s"], rows))
     if parameters := _parameters(flight):
         yield _table("parameters", pd.DataFrame(parameters.items(), columns=["name", "value"]))
     if flight.clocks:
-        mapped = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
+        clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
         # NaN where they do tell the time
-        yield _table("clocks", mapped.astype({"distinct_stamps": np.float64}))
+        yield _table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
 def _parameters(flight: Flight) -> dict[str, float]:
     """Every parameter that an analysis reads."""
-    found = dict(flight.log.parameters)
+    logged_values = dict(flight.log.parameters)
     if isinstance(flight.ekf2, Ekf2):
-        for part in (flight.ekf2.record, *flight.ekf2.aids.values()):
-            found |= {} if isinstance(part, Unavailable) else part.parameters
-    return found
+        for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
+            logged_values |= (
+                {} if isinstance(record_or_aid, Unavailable) else record_or_aid.parameters
+            )
+    return logged_values
 
 
-def _listed(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
+def _numeric_table(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
     return pd.DataFrame(list(rows), columns=columns, dtype=np.float64)
 
 
 def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
-    yield from _series(flight, "ekf2_state", ekf2.state)
-    yield from _series(flight, "ekf2_variance", ekf2.variance)
+    yield from _stream_table(flight, "ekf2_state", ekf2.state)
+    yield from _stream_table(flight, "ekf2_variance", ekf2.variance)
     frames = [
         frame.assign(axis=axis)
         for axis, frame in ekf2.innovations.items()
@@ -204,32 +212,32 @@ def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     ]
     if frames:
         tidy = pd.concat(frames).sort_index(kind="stable")
-        yield from _series(flight, "ekf2_innovations", tidy)
-    yield from _series(flight, "ekf2_fusing", ekf2.fusing)
+        yield from _stream_table(flight, "ekf2_innovations", tidy)
+    yield from _stream_table(flight, "ekf2_fusing", ekf2.fusing)
     origin = _origin(flight, "ekf2_state")
     jumps = [reset.delta for reset in ekf2.resets]
-    resets = _listed(["delta_north", "delta_east", "delta_down"], jumps)
+    resets = _numeric_table(["delta_north", "delta_east", "delta_down"], jumps)
     resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
     yield _table("resets", resets, origin)
     # the first instance holds from the beginning, which a reader stamps minus infinity
     begin = min(float(ekf2.state.index[0]), 0.0)
     rows = [(max(time, begin), number) for time, number in ekf2.instances]
-    instances = _listed(["time_s", "instance"], rows).astype({"instance": np.int64})
+    instances = _numeric_table(["time_s", "instance"], rows).astype({"instance": np.int64})
     yield _table("instances", instances, origin)
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
     """Every position track with the name of its table, each name once whatever its case."""
-    taken: set[str] = set()
+    used_names: set[str] = set()
     for track in flight.positions:
         # the first word is ours, so that none of the names that Windows reserves can result
         stem = _UNSAFE.sub("_", f"position_{track.name}")[:MAX_NAME].rstrip("_")
         name, number = stem, 1
-        while name.lower() in taken:
+        while name.lower() in used_names:
             number += 1
             name = f"{stem}_{number}"
-        taken.add(name.lower())
+        used_names.add(name.lower())
         yield name, track
 
 

@@ -8,12 +8,12 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop import part
-from px4fuse.loop.closure import key_frame_spacing_m, key_frames, upright
-from px4fuse.loop.corrections import by_distance, judge, score_all, solve_all
+from px4fuse.loop.closure import key_frame_spacing_m, key_frames, to_z_down
+from px4fuse.loop.corrections import correct_paths_by_distance, gate_closures, score_all, solve_all
 from px4fuse.loop.model import LANDING, KnownEnd, Loop, OdometryNoise
-from px4fuse.loop.odometry import Claim, pose_graph
+from px4fuse.loop.odometry import ClosureClaim, pose_graph
 from px4fuse.loop.tracks import LoopSource, odometry_of, trajectory_of
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, by_axis, cumulative_distance
@@ -26,7 +26,7 @@ MIN_PATH_M = 2.0
 LOOP_MIN_PATH_M = 10.0
 LOOP_MAX_GAP_SHARE = 0.10
 # In m, or degrees: what is larger was mistyped
-MOST = 100.0
+MAX_VALUE = 100.0
 
 
 def analyse(
@@ -55,47 +55,61 @@ def analyse(
     """
     request = request or LoopRequest(source=source.trajectory.name)
     noise = OdometryNoise(request.position_drift_m, request.heading_drift_deg)
-    _within("position_drift_m", noise.position_m, 1e-4)
-    _within("heading_drift_deg", noise.heading_deg, 1e-4)
+    _require_in_range("position_drift_m", noise.position_m, 1e-4)
+    _require_in_range("heading_drift_deg", noise.heading_deg, 1e-4)
     trajectory, flight = source.trajectory, source.flight
     zero_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
     def stamp(time_s: float) -> float:
         return time_s + zero_s if abs(time_s) < SMALLEST_STAMP_S else time_s
 
-    given = (request.start_s, request.end_s)
-    start, end = (None if time_s is None else stamp(time_s) for time_s in given)
-    segment, at_rest = part.chosen_part(flight, trajectory, start, end)
+    request_times = (request.start_s, request.end_s)
+    start, end = (None if time_s is None else stamp(time_s) for time_s in request_times)
+    segment, at_rest = part.choose_loop_segment(flight, trajectory, start, end)
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
-    whole = upright(trajectory)
-    path = part.part_of(whole, segment, at_rest)
-    real = truth if request.came_back and request.landed_at is None else None
-    by_truth = None if real is None else part.true_end(path, real, segment, at_rest)
-    known = _known_end(path, request, by_truth)
-    said = [GivenClosure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in request.closures]
-    for closure in said:
-        _check(closure, path)
-    claims: list[Claim] = [(closure, None) for closure in said]
-    if not isinstance(known, Unavailable):
-        claims.insert(0, (GivenClosure(segment.start_s, segment.end_s, known.sigma_m), known))
+    z_down_trajectory = to_z_down(trajectory)
+    path = part.cut_trajectory(z_down_trajectory, segment, at_rest)
+    truth_used = truth if request.came_back and request.landed_at is None else None
+    by_truth = None if truth_used is None else part.true_end(path, truth_used, segment, at_rest)
+    known_end_found = _find_known_end(path, request, by_truth)
+    given_closures = [
+        GivenClosure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in request.closures
+    ]
+    for closure in given_closures:
+        _require_valid_closure(closure, path)
+    claims: list[ClosureClaim] = [(closure, None) for closure in given_closures]
+    if not isinstance(known_end_found, Unavailable):
+        claims.insert(
+            0,
+            (
+                GivenClosure(segment.start_s, segment.end_s, known_end_found.sigma_m),
+                known_end_found,
+            ),
+        )
     spacing = request.key_frames_m
     spacing = key_frame_spacing_m(path.position_m) if spacing is None else spacing
     frames, distance = _key_frames(path, spacing)
     graph, nodes, statement = pose_graph(path, frames, claims, noise)
-    notes = [*whole.notes, statement]
+    notes = [*z_down_trajectory.notes, statement]
     if isinstance(by_truth, str):
         notes.append(f"the truth does not tell where it ended: {by_truth}")
-    judged = judge(graph, claims)
-    solved, judged = solve_all(path, nodes, graph, judged, progress)
+    gated_closures = gate_closures(graph, claims)
+    graph_corrections, gated_closures = solve_all(path, nodes, graph, gated_closures, progress)
     end_m, heading = path.position_m[-1] - path.position_m[0], part.heading_change_deg(path)
-    missed = known if isinstance(known, Unavailable) else end_m - known.displacement
-    heading_error = _heading_error(known, heading)
-    landing = judged[0] if judged and judged[0].source == LANDING else None
-    spread = by_distance(path, distance, missed, heading_error, landing)
+    misclosure_m = (
+        known_end_found
+        if isinstance(known_end_found, Unavailable)
+        else end_m - known_end_found.displacement
+    )
+    heading_error = _heading_error(known_end_found, heading)
+    landing = gated_closures[0] if gated_closures and gated_closures[0].source == LANDING else None
+    corrected_by_distance = correct_paths_by_distance(
+        path, distance, misclosure_m, heading_error, landing
+    )
     references = tuple(one for one in (truth, reference) if one is not None)
     error = error_axes = None
-    if not isinstance(missed, Unavailable):
-        error, error_axes = float(np.linalg.norm(missed)), by_axis(path.frame, missed)
+    if not isinstance(misclosure_m, Unavailable):
+        error, error_axes = float(np.linalg.norm(misclosure_m)), by_axis(path.frame, misclosure_m)
     return Loop(
         track=path.name,
         kind=path.kind,
@@ -109,25 +123,25 @@ def analyse(
         path_length_m=float(distance[-1]),
         end_from_start_m=by_axis(path.frame, end_m),
         heading_change_deg=heading,
-        known_end=known,
+        known_end=known_end_found,
         closure_error_m=error,
         closure_percent=None if error is None else 100.0 * error / float(distance[-1]),
         closure_error_axes_m=error_axes,
         heading_error_deg=heading_error,
         absolute=flight is not None and _is_absolute(trajectory, flight),
         odometry_noise=noise,
-        closures=judged,
-        corrections=score_all(path, spread | solved, references),
+        closures=gated_closures,
+        corrections=score_all(path, corrected_by_distance | graph_corrections, references),
         notes=tuple(note for note in notes if note),
         nodes=frames,
         distance_m=distance,
         graph=graph,
         references=references,
-        given_frame=trajectory.frame,
+        original_frame=trajectory.frame,
     )
 
 
-def _known_end(
+def _find_known_end(
     path: Trajectory, request: LoopRequest, by_truth: KnownEnd | str | None
 ) -> KnownEnd | Unavailable:
     """Where it really ended: as measured, else by the truth in the log, else where it began."""
@@ -136,20 +150,20 @@ def _known_end(
             raise SettingsError("`landed_at` and `came_back` exclude each other", "Leave one out.")
         return part.measured_end(path, request.landed_at)
     if not request.came_back:
-        return lacking("open_end")
+        return missing_data("open_end")
     return by_truth if isinstance(by_truth, KnownEnd) else part.assumed_end(path)
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
     """Whether it follows a position that the flight was told, and no odometry."""
-    told = any(track.origin.is_vision for track in flight.positions)
+    has_vision = any(track.origin.is_vision for track in flight.positions)
     no_odometry = isinstance(odometry_of(flight), Unavailable)
-    return trajectory.kind in ("ekf2", "kf") and told and no_odometry
+    return trajectory.kind in ("ekf2", "kf") and has_vision and no_odometry
 
 
 def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     """Indices of poses that are key frames, and the distance along them at each pose."""
-    _within("key_frames_m", spacing_m, 1e-3)
+    _require_in_range("key_frames_m", spacing_m, 1e-3)
     frames = key_frames(path.position_m, spacing_m)
     along = cumulative_distance(path.position_m[frames])
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
@@ -157,18 +171,18 @@ def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     return frames, np.interp(path.time_s, path.time_s[frames], along)
 
 
-def _within(name: str, value: float, least: float) -> None:
-    if not least <= value <= MOST:
-        raise SettingsError(f"`{name}` {value:g} is outside {least:g} to {MOST:g}.")
+def _require_in_range(name: str, value: float, least: float) -> None:
+    if not least <= value <= MAX_VALUE:
+        raise SettingsError(f"`{name}` {value:g} is outside {least:g} to {MAX_VALUE:g}.")
 
 
-def _check(closure: GivenClosure, path: Trajectory) -> None:
+def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
     """Refuse a closure outside the path, one that leads back in time, and one without width."""
     (low, high), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
     label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
     if not low <= times[0] < times[1] <= high:
         raise TrajectoryError.of("closure_outside", label=label, low=low, high=high)
-    if not 1e-4 <= closure.sigma_m <= MOST:
+    if not 1e-4 <= closure.sigma_m <= MAX_VALUE:
         raise TrajectoryError(f"{label}: SIGMA {closure.sigma_m:g} is outside 0.0001 to 100 m.")
 
 
@@ -180,7 +194,7 @@ def _heading_error(end: KnownEnd | Unavailable, heading_deg: float | None) -> fl
     if heading_deg is None:
         return Unavailable(what, "the trajectory has no orientations", "None needed.")
     if end.heading_change_deg is None:
-        return lacking("turn_unknown", what=what, heading_deg=heading_deg)
+        return missing_data("turn_unknown", what=what, heading_deg=heading_deg)
     return float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
 
 
@@ -192,7 +206,9 @@ def truth_of(flight: Flight) -> Trajectory | None:
         return None
 
 
-def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) -> Loop | Unavailable:
+def analyse_flight_loop(
+    flight: Flight, progress: Callable[[str], None] = lambda _: None
+) -> Loop | Unavailable:
     """The loop that a flight's odometry holds, for ``px4fuse compare``.
 
     Unavailable where there is no odometry, or where it does not come back near its start.
@@ -202,8 +218,8 @@ def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) ->
         trajectory = trajectory_of(flight, "vio")
     except MissingDataError as error:  # too few poses, or none
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
-        return lacking("no_odometry_for_loop", reason=reason)
-    segment, _ = part.chosen_part(flight, trajectory, None, None)
+        return missing_data("no_odometry_for_loop", reason=reason)
+    segment, _ = part.choose_loop_segment(flight, trajectory, None, None)
     time = trajectory.time_s
     inside = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
     extent = gap = 0.0
@@ -211,5 +227,5 @@ def loop_in(flight: Flight, progress: Callable[[str], None] = lambda _: None) ->
         extent = float(np.linalg.norm(np.ptp(inside, axis=0)))
         gap = float(np.linalg.norm(inside[-1] - inside[0]))
     if 2.0 * extent < LOOP_MIN_PATH_M or gap > LOOP_MAX_GAP_SHARE * 2.0 * extent:
-        return lacking("no_loop", gap=gap, extent=extent)
+        return missing_data("no_loop", gap=gap, extent=extent)
     return analyse(LoopSource(trajectory, flight), progress=progress)

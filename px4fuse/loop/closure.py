@@ -1,6 +1,6 @@
 """Loop closure by hand: path length, misclosure, and its distribution by distance.
 
-Positions have z down here (NED, or forward-right-down at the start); see :func:`upright`.
+Positions have z down here (NED, or forward-right-down at the start); see :func:`to_z_down`.
 """
 
 from dataclasses import replace
@@ -35,7 +35,7 @@ SPACING_SHARE = 0.02
 MIN_SPACING_M, MAX_SPACING_M = 0.02, 0.5
 
 
-def upright(trajectory: Trajectory) -> Trajectory:
+def to_z_down(trajectory: Trajectory) -> Trajectory:
     """The same trajectory in a frame with z down.
 
     A camera's orientation becomes that of a vehicle whose nose is where the camera looks.
@@ -45,28 +45,28 @@ def upright(trajectory: Trajectory) -> Trajectory:
     order, sign, frame, note = _TO_Z_DOWN[trajectory.frame]
     variance = trajectory.position_variance_m2
     return replace(
-        _turned(trajectory, np.diag(sign) @ np.eye(3)[order], frame),
+        _rotate(trajectory, np.diag(sign) @ np.eye(3)[order], frame),
         position_variance_m2=None if variance is None else variance[:, order],
         rotation_variance_rad2=trajectory.rotation_variance_rad2,
         notes=(*trajectory.notes, note),
     )
 
 
-def in_frame(trajectory: Trajectory, frame: Frame) -> Trajectory:
-    """What :func:`upright` made of a trajectory in ``frame``, turned back into that frame."""
+def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
+    """What :func:`to_z_down` made of a trajectory in ``frame``, turned back into that frame."""
     if frame not in _TO_Z_DOWN or trajectory.frame in _TO_Z_DOWN:
         return trajectory
     order, sign, _, _ = _TO_Z_DOWN[frame]
-    return _turned(trajectory, (np.diag(sign) @ np.eye(3)[order]).T, frame)
+    return _rotate(trajectory, (np.diag(sign) @ np.eye(3)[order]).T, frame)
 
 
-def _turned(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
+def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
     """The same poses in another frame; a camera's axes turn with its world."""
     turn = Rotation.from_matrix(matrix)
-    made = replace(trajectory.moved(trajectory.position_m @ matrix.T, turn), frame=frame)
-    if made.rotation is None or "camera" not in (trajectory.frame, frame):
-        return made
-    return replace(made, rotation=made.rotation * turn.inv())
+    rotated = replace(trajectory.moved(trajectory.position_m @ matrix.T, turn), frame=frame)
+    if rotated.rotation is None or "camera" not in (trajectory.frame, frame):
+        return rotated
+    return replace(rotated, rotation=rotated.rotation * turn.inv())
 
 
 def key_frame_spacing_m(position_m: Array) -> float:
@@ -81,16 +81,16 @@ def key_frames(position_m: Array, spacing_m: float) -> IntArray:
     Length along every sample of a noisy track is too long: each step of 30 Hz adds the noise of
     two positions. Steps that are long against the noise do not.
     """
-    kept = [0]
+    frame_indices = [0]
     last = position_m[0]
     for index, position in enumerate(position_m[1:-1], start=1):
         step = position - last
         if step @ step >= spacing_m * spacing_m:
-            kept.append(index)
+            frame_indices.append(index)
             last = position
-    if len(kept) > 1 and np.linalg.norm(position_m[-1] - last) < spacing_m / 2.0:
-        kept.pop()  # so that the last step is not one of noise alone
-    return np.array([*kept, len(position_m) - 1])
+    if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last) < spacing_m / 2.0:
+        frame_indices.pop()  # so that the last step is not one of noise alone
+    return np.array([*frame_indices, len(position_m) - 1])
 
 
 def distribute_by_distance(
@@ -157,9 +157,11 @@ def correct_by_distance(
     position = trajectory.position_m
     share = cumulative_m / cumulative_m[-1]
     turn = Rotation.from_rotvec(np.outer(-share * misclosure_heading_rad, DOWN))
-    middle = (share[1:] + share[:-1]) / 2.0
-    between = Rotation.from_rotvec(np.outer(-middle * misclosure_heading_rad, DOWN))
-    steps = between.apply(np.diff(position, axis=0))
-    turned = position[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    left = turned[-1] - (position[-1] - misclosure_m)
-    return trajectory.moved(distribute_by_distance(turned, left, cumulative_m), turn)
+    middle_share = (share[1:] + share[:-1]) / 2.0
+    middle_rotation = Rotation.from_rotvec(np.outer(-middle_share * misclosure_heading_rad, DOWN))
+    steps = middle_rotation.apply(np.diff(position, axis=0))
+    rotated_position = position[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    remaining_m = rotated_position[-1] - (position[-1] - misclosure_m)
+    return trajectory.moved(
+        distribute_by_distance(rotated_position, remaining_m, cumulative_m), turn
+    )

@@ -12,8 +12,8 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Way
-from px4fuse.loop.odometry import Claim
-from px4fuse.record import lacking, written
+from px4fuse.loop.odometry import ClosureClaim
+from px4fuse.record import missing_data, to_serializable
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate
@@ -22,12 +22,12 @@ from px4fuse.trajectory.graph.solver import Solution, solve
 from px4fuse.trajectory.model import Trajectory
 
 UNCORRECTED = "uncorrected"
-PLAIN = "by distance, positions only"
+POSITIONS_ONLY = "by distance, positions only"
 BY_DISTANCE = "by distance, headings too"
 # What the ways are called
 NAMES: Mapping[str, str] = {
     "uncorrected": UNCORRECTED,
-    "by_distance_plain": PLAIN,
+    "by_distance_plain": POSITIONS_ONLY,
     "by_distance": BY_DISTANCE,
     **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
 }
@@ -39,7 +39,7 @@ SINGLE_LOOP = (
 Corrected = tuple[Trajectory, Solution | None] | Unavailable
 
 
-def by_distance(
+def correct_paths_by_distance(
     path: Trajectory,
     distance: Array,
     misclosure_m: Array | Unavailable,
@@ -48,33 +48,38 @@ def by_distance(
 ) -> dict[Way, Corrected]:
     """Positions alone (the lesson's Example 2), and headings too."""
     if landing is not None and not landing.accepted:
-        misclosure_m = _refused("correction by distance", landing)
+        misclosure_m = _rejected_closure("correction by distance", landing)
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
-    plain = distribute_by_distance(path.position_m, misclosure_m, distance)
-    turned = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
-    whole = correct_by_distance(path, distance, misclosure_m, turned)
-    return {"by_distance_plain": (path.moved(plain), None), "by_distance": (whole, None)}
+    positions_only = distribute_by_distance(path.position_m, misclosure_m, distance)
+    heading_rad = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
+    with_headings = correct_by_distance(path, distance, misclosure_m, heading_rad)
+    return {
+        "by_distance_plain": (path.moved(positions_only), None),
+        "by_distance": (with_headings, None),
+    }
 
 
-def _refused(what: str, closure: Closure) -> Unavailable:
-    return lacking("closure_rejected", what=what, closure=closure, d2=closure.d2, p=closure.p)
+def _rejected_closure(what: str, closure: Closure) -> Unavailable:
+    return missing_data("closure_rejected", what=what, closure=closure, d2=closure.d2, p=closure.p)
 
 
-def judge(graph: PoseGraph | Unavailable, claims: Sequence[Claim]) -> tuple[Closure, ...]:
+def gate_closures(
+    graph: PoseGraph | Unavailable, claims: Sequence[ClosureClaim]
+) -> tuple[Closure, ...]:
     """What odometry says of each closure: the last edges of the graph; none without a graph."""
     if isinstance(graph, Unavailable):
         return ()
     edges = np.arange(len(graph.first) - len(claims), len(graph.first))
-    judged = []
-    for result, (given, end) in zip(gate(graph, edges), claims, strict=True):
-        missed = graph.poses[result.second, :3] - graph.poses[result.first, :3]
-        facts = structs.asdict(given) | structs.asdict(result)
+    closures = []
+    for result, (closure, end) in zip(gate(graph, edges), claims, strict=True):
+        odometry_m = graph.poses[result.second, :3] - graph.poses[result.first, :3]
+        facts = structs.asdict(closure) | structs.asdict(result)
         del facts["first"], facts["second"]
         facts["source"] = "given" if end is None else LANDING
-        there = np.zeros(3) if end is None else end.displacement
-        judged.append(Closure(distance_m=float(np.linalg.norm(missed - there)), **facts))
-    return tuple(judged)
+        true_m = np.zeros(3) if end is None else end.displacement
+        closures.append(Closure(distance_m=float(np.linalg.norm(odometry_m - true_m)), **facts))
+    return tuple(closures)
 
 
 def solve_all(
@@ -102,20 +107,25 @@ def solve_all(
             more = "Give further closures with --closure."
             found[way] = Unavailable(label, SINGLE_LOOP, more)
         elif name == "gated" and rejected[loops].all():
-            found[way] = _refused("pose graph", closures[0])
+            found[way] = _rejected_closure("pose graph", closures[0])
         elif name == "gated" and not rejected.any():
             found[way] = found["pose_graph_all"]
         else:
             used = ~rejected if name == "gated" else np.ones_like(rejected)
-            solution = solve(graph.of_edges(used), robust=robust, loops=loops[used])
-            found[way] = _carried(path, nodes, graph.poses, solution.poses), solution
+            solution = solve(graph.select_edges(used), robust=robust, loops=loops[used])
+            found[way] = (
+                _interpolate_corrections(path, nodes, graph.poses, solution.poses),
+                solution,
+            )
             if robust != "none":
                 each = zip(closures, solution.weights[loops].tolist(), strict=True)
                 closures = tuple(structs.replace(one, **{f"weight_{name}": w}) for one, w in each)
     return found, closures
 
 
-def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> Trajectory:
+def _interpolate_corrections(
+    path: Trajectory, nodes: IntArray, before: Array, after: Array
+) -> Trajectory:
     """All poses of a path, each moved as the nodes before and after it were."""
     turn = Rotation.from_quat(after[:, 3:]) * Rotation.from_quat(before[:, 3:]).inv()
     left = np.searchsorted(nodes, np.arange(len(path)), side="right") - 1
@@ -132,7 +142,9 @@ def _carried(path: Trajectory, nodes: IntArray, before: Array, after: Array) -> 
 
 
 def score_all(
-    odometry: Trajectory, made: Mapping[Way, Corrected], references: tuple[Trajectory, ...]
+    odometry: Trajectory,
+    corrected_paths: Mapping[Way, Corrected],
+    references: tuple[Trajectory, ...],
 ) -> dict[Way, CorrectedPath | Unavailable]:
     """The odometry, and every path, scored; the clocks are matched once, on the odometry."""
     offsets: dict[str, float] = {}
@@ -147,26 +159,28 @@ def score_all(
             return Unavailable(what, str(error), "Give another --reference.")
 
     def scored(way: Way, path: Trajectory, solution: Solution | None) -> CorrectedPath:
-        moved: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
-        costs: dict[str, Any] = {} if solution is None else structs.asdict(written(solution))
+        displacement_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
+        costs: dict[str, Any] = (
+            {} if solution is None else structs.asdict(to_serializable(solution))
+        )
         costs.pop("dropped", None)
         return CorrectedPath(
             name=NAMES[way],
             trajectory=path,
-            moved_m=moved,
-            moved_max_m=float(moved.max()),
-            moved_rms_m=float(np.sqrt(np.mean(moved**2))),
+            moved_m=displacement_m,
+            moved_max_m=float(displacement_m.max()),
+            moved_rms_m=float(np.sqrt(np.mean(displacement_m**2))),
             scores={reference.name: score(path, reference) for reference in references},
             solution=solution,
             **costs,
         )
 
     raw = scored("uncorrected", odometry, None)
-    for name, one in raw.scores.items():
-        if isinstance(one, Evaluation) and one.time_offset.offset_s is not None:
-            offsets[name] = one.time_offset.offset_s
+    for name, path_scored in raw.scores.items():
+        if isinstance(path_scored, Evaluation) and path_scored.time_offset.offset_s is not None:
+            offsets[name] = path_scored.time_offset.offset_s
     found: dict[Way, CorrectedPath | Unavailable] = {"uncorrected": raw}
-    for way, corrected in made.items():
+    for way, corrected in corrected_paths.items():
         same = found.get("pose_graph_all")
         if isinstance(corrected, Unavailable):
             found[way] = corrected

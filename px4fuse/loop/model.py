@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.errors import MissingDataError
-from px4fuse.record import Count, Maybe, NotNegative, Record, Share, Unavailable
+from px4fuse.record import Count, NotNegative, OrUnavailable, Record, Share, Unavailable
 from px4fuse.trajectory.evaluation import Evaluation, Score
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
@@ -17,9 +17,14 @@ from px4fuse.trajectory.model import AxisLengths, Frame, Kind, Trajectory
 
 # How a path is corrected; the part after "pose_graph_" as in `trajectory.graph.analysis.SOLUTIONS`
 Way = Literal[
-    "uncorrected", "by_distance_plain", "by_distance",
-    "pose_graph_all", "pose_graph_gated", "pose_graph_dcs", "pose_graph_gnc",
-]  # fmt: skip
+    "uncorrected",
+    "by_distance_plain",
+    "by_distance",
+    "pose_graph_all",
+    "pose_graph_gated",
+    "pose_graph_dcs",
+    "pose_graph_gnc",
+]
 LANDING = "landing"
 
 
@@ -125,7 +130,7 @@ class Correction(Record, frozen=True, kw_only=True):
     cost: NotNegative | None = None
     iterations: Count | None = None
     converged: bool | None = None
-    scores: Mapping[str, Maybe[Score]]
+    scores: Mapping[str, OrUnavailable[Score]]
 
 
 class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
@@ -143,17 +148,17 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
         Of a pose graph.
     """
 
-    written_as = Correction
+    schema_type = Correction
     scores: Mapping[str, Evaluation | Unavailable]
     name: str
     trajectory: Trajectory
     moved_m: Array
     solution: Solution | None = None
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
-class LoopPart(Record, frozen=True, kw_only=True):
+class LoopResult(Record, frozen=True, kw_only=True):
     """A path that truly returns.
 
     ``closure_error_m`` is how far its end is from where the vehicle really ended;
@@ -175,7 +180,7 @@ class LoopPart(Record, frozen=True, kw_only=True):
     path_length_m: NotNegative
     end_from_start_m: AxisLengths
     heading_change_deg: float | None = None
-    known_end: Maybe[KnownEnd]
+    known_end: OrUnavailable[KnownEnd]
     closure_error_m: NotNegative | None = None
     closure_percent: NotNegative | None = None
     closure_error_axes_m: AxisLengths | None = None
@@ -183,11 +188,11 @@ class LoopPart(Record, frozen=True, kw_only=True):
     absolute: bool
     odometry_noise: OdometryNoise
     closures: tuple[Closure, ...]
-    corrections: Mapping[Way, Maybe[Correction]]
+    corrections: Mapping[Way, OrUnavailable[Correction]]
     notes: tuple[str, ...]
 
 
-class Loop(LoopPart, frozen=True, kw_only=True, eq=False):
+class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
     """The result of ``px4fuse loop``: what is written, and the paths.
 
     Attributes
@@ -200,19 +205,19 @@ class Loop(LoopPart, frozen=True, kw_only=True, eq=False):
     graph : PoseGraph or Unavailable
         With all closures, before it is solved.
     references : tuple of Trajectory
-    given_frame : Frame
+    original_frame : Frame
         That of the trajectory as it was given.
     """
 
-    written_as = LoopPart
+    schema_type = LoopResult
     corrections: Mapping[Way, CorrectedPath | Unavailable]
     nodes: IntArray
     distance_m: Array
     graph: PoseGraph | Unavailable
     references: tuple[Trajectory, ...]
-    given_frame: Frame
+    original_frame: Frame
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
     def odometry(self) -> CorrectedPath:
@@ -226,7 +231,7 @@ class Loop(LoopPart, frozen=True, kw_only=True, eq=False):
         return {way: path for way, path in every if isinstance(path, CorrectedPath)}
 
     @property
-    def reported(self) -> tuple[CorrectedPath, ...]:
+    def reported_paths(self) -> tuple[CorrectedPath, ...]:
         """The paths worth a row: each once."""
         same: set[Way] = set()
         if all(closure.accepted for closure in self.closures):
@@ -242,7 +247,7 @@ class Loop(LoopPart, frozen=True, kw_only=True, eq=False):
         return next(self.paths[way] for way in ways if way in self.paths)
 
     @property
-    def end_assumed(self) -> bool:
+    def is_end_assumed(self) -> bool:
         """Whether the misclosure rests on the assumption that it landed where it took off."""
         return isinstance(self.known_end, KnownEnd) and self.known_end.assumed
 

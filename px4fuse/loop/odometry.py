@@ -15,12 +15,12 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 # The reported variances of an odometry tell its drift only where they grow along the path
-GROWTH = 2.0
+MIN_VARIANCE_GROWTH = 2.0
 # Stated variances are floored at this share of the default drift: an edge must have a variance
 FLOOR_SHARE = 1e-2
-TENTH = 0.1
+END_SHARE = 0.1
 # A closure that was given, or that of the landing and where that was
-Claim = tuple[GivenClosure, KnownEnd | None]
+ClosureClaim = tuple[GivenClosure, KnownEnd | None]
 
 
 def odometry_variances(
@@ -51,36 +51,36 @@ def odometry_variances(
     heading = heading + np.radians(noise.heading_deg_per_root_s) ** 2 * duration
     tilt = noise.tilt_share**2 * heading
     rotation = np.column_stack([tilt, tilt, heading])
-    stated = "the defaults" if noise == OdometryNoise() else "as set"
-    size = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
-    said = [f"drift of the odometry: {size} (one standard deviation, {stated})"]
-    reported = _growth(path.position_variance_m2, nodes)
+    noise_origin = "the defaults" if noise == OdometryNoise() else "as set"
+    format_noise = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
+    statements = [f"drift of the odometry: {format_noise} (one standard deviation, {noise_origin})"]
+    reported = _variance_growth(path.position_variance_m2, nodes)
     if reported is not None:
         translation = np.maximum(reported.mean(axis=1), FLOOR_SHARE * translation)
-        said.append("translation as the log's own position variances grow")
+        statements.append("translation as the log's own position variances grow")
     elif path.position_variance_m2 is not None:
-        said.append("the log's own position variances do not grow, so they tell no drift")
-    turned = _growth(path.rotation_variance_rad2, nodes)
-    if turned is not None:
-        rotation = np.maximum(turned, FLOOR_SHARE * rotation)
-        said.append("rotation as the log's own orientation variances grow")
-    return translation, rotation, "; ".join(said)
+        statements.append("the log's own position variances do not grow, so they tell no drift")
+    rotation_growth = _variance_growth(path.rotation_variance_rad2, nodes)
+    if rotation_growth is not None:
+        rotation = np.maximum(rotation_growth, FLOOR_SHARE * rotation)
+        statements.append("rotation as the log's own orientation variances grow")
+    return translation, rotation, "; ".join(statements)
 
 
-def _growth(variance: Array | None, nodes: IntArray) -> Array | None:
+def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
     """Growth of reported variances from node to node, shape (k - 1, 3); None without any."""
     if variance is None:
         return None
-    tenth = max(1, int(TENTH * len(variance)))
+    tenth = max(1, int(END_SHARE * len(variance)))
     early = float(np.median(variance[:tenth].sum(axis=1)))
     late = float(np.median(variance[-tenth:].sum(axis=1)))
-    if not late > GROWTH * early:
+    if not late > MIN_VARIANCE_GROWTH * early:
         return None
     return np.maximum(np.diff(variance[nodes], axis=0), 0.0)
 
 
 def pose_graph(
-    path: Trajectory, frames: IntArray, claims: Sequence[Claim], noise: OdometryNoise
+    path: Trajectory, frames: IntArray, claims: Sequence[ClosureClaim], noise: OdometryNoise
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
     """Pose graph of a path: an edge from node to node by odometry, and one per closure.
 
@@ -115,16 +115,18 @@ def pose_graph(
     information = np.zeros((len(first), 6, 6))
     diagonal = np.column_stack([np.repeat(1.0 / translation[:, None], 3, axis=1), 1.0 / turn])
     information[steps[:, None], range(6), range(6)] = diagonal
-    back, there = rotation[first].inv(), rotation[second]
-    moved = back.apply(position[second] - position[first])
+    first_inverse, second_rotation = rotation[first].inv(), rotation[second]
+    translation_measured = first_inverse.apply(position[second] - position[first])
     for row, (closure, end) in enumerate(claims, start=len(steps)):
-        moved[row] = 0.0 if end is None else back[row].apply(end.displacement)
+        translation_measured[row] = (
+            0.0 if end is None else first_inverse[row].apply(end.displacement)
+        )
         information[row, range(3), range(3)] = closure.sigma_m**-2
         if end is not None and end.heading_change_deg is not None:
-            by_odometry = heading_change_rad(there[row] * rotation[first[row]].inv())
+            by_odometry = heading_change_rad(second_rotation[row] * rotation[first[row]].inv())
             error = float(lie.wrap(np.radians(end.heading_change_deg) - by_odometry))
-            there[row] = Rotation.from_rotvec(error * DOWN) * there[row]
-            vertical = there[row].inv().apply(DOWN)
+            second_rotation[row] = Rotation.from_rotvec(error * DOWN) * second_rotation[row]
+            vertical = second_rotation[row].inv().apply(DOWN)
             sigma = np.radians(end.sigma_heading_deg or 0.0)
             information[row, 3:, 3:] = np.outer(vertical, vertical) / sigma**2
     graph = PoseGraph(
@@ -133,7 +135,9 @@ def pose_graph(
         poses=np.column_stack([position, rotation.as_quat()]),
         first=first,
         second=second,
-        measurements=np.column_stack([moved, (back * there).as_quat()]),
+        measurements=np.column_stack(
+            [translation_measured, (first_inverse * second_rotation).as_quat()]
+        ),
         information=information,
         initialised="odometry",
     )

@@ -21,7 +21,7 @@ REST_RANGE_M = 0.15
 SAME_HEADING_DEG = 15.0
 
 
-def part_of(trajectory: Trajectory, segment: Segment, at_rest: bool = False) -> Trajectory:
+def cut_trajectory(trajectory: Trajectory, segment: Segment, at_rest: bool = False) -> Trajectory:
     """The poses of a part of a trajectory; those on the ground at its ends averaged into one.
 
     Raises
@@ -54,7 +54,7 @@ def part_of(trajectory: Trajectory, segment: Segment, at_rest: bool = False) -> 
     return replace(part, position_m=position, rotation=rotation)
 
 
-def chosen_part(
+def choose_loop_segment(
     flight: Flight | None, trajectory: Trajectory, start_s: float | None, end_s: float | None
 ) -> tuple[Segment, bool]:
     """The part between first take-off and last landing, and whether the vehicle rests at its ends.
@@ -123,9 +123,9 @@ def measured_end(path: Trajectory, landed: Landing) -> KnownEnd:
     if path.rotation is not None:
         nose = path.rotation[0].apply([1.0, 0.0, 0.0])
         heading = float(np.arctan2(nose[1], nose[0]))
-    moved = Rotation.from_rotvec(heading * DOWN).apply([forward_m, right_m, 0.0])
+    ned_displacement_m = Rotation.from_rotvec(heading * DOWN).apply([forward_m, right_m, 0.0])
     return KnownEnd(
-        displacement_m=by_axis(path.frame, moved),
+        displacement_m=by_axis(path.frame, ned_displacement_m),
         heading_change_deg=turned_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if turned_deg is None else 2.0,
@@ -144,19 +144,19 @@ def true_end(
     The truth is turned into the odometry's frame by their headings at the start.
     """
     try:
-        real = part_of(truth, segment, at_rest)
+        true_path = cut_trajectory(truth, segment, at_rest)
     except TrajectoryError as error:
         return str(error)
-    moved, change = real.position_m[-1] - real.position_m[0], None
-    landed_m = np.linalg.norm(moved)
-    if path.rotation is not None and real.rotation is not None:
-        turn = heading_change_rad(path.rotation[0] * real.rotation[0].inv())
-        moved = Rotation.from_rotvec(turn * DOWN).apply(moved)
-        change = heading_change_deg(real)
-    elif path.frame != real.frame:
+    ned_displacement_m, change = true_path.position_m[-1] - true_path.position_m[0], None
+    landed_m = np.linalg.norm(ned_displacement_m)
+    if path.rotation is not None and true_path.rotation is not None:
+        turn = heading_change_rad(path.rotation[0] * true_path.rotation[0].inv())
+        ned_displacement_m = Rotation.from_rotvec(turn * DOWN).apply(ned_displacement_m)
+        change = heading_change_deg(true_path)
+    elif path.frame != true_path.frame:
         return "the truth has no orientation by which to turn it into the odometry's frame"
     return KnownEnd(
-        displacement_m=by_axis(path.frame, moved),
+        displacement_m=by_axis(path.frame, ned_displacement_m),
         heading_change_deg=change,
         sigma_m=0.02,
         sigma_heading_deg=None if change is None else 0.5,

@@ -16,14 +16,14 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.parts import finite_rows
-from px4fuse.readers.text_table import text_of
+from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
-from px4fuse.reading import read_head, shown
-from px4fuse.record import lacking
+from px4fuse.reading import display_name, read_head
+from px4fuse.record import missing_data
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
-Part = Literal["vio", "ekf2", "kf", "truth"]
-PARTS: tuple[Part, ...] = get_args(Part)
+FlightPart = Literal["vio", "ekf2", "kf", "truth"]
+FLIGHT_PARTS: tuple[FlightPart, ...] = get_args(FlightPart)
 _HEAD_BYTES = 4096
 _G2O = (b"VERTEX_", b"EDGE_", b"FIX")
 
@@ -37,10 +37,10 @@ def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.orientation is not None:
             return track
     have = ", ".join(track.name for track in flight.positions) or "none"
-    return lacking("no_odometry", have=have)
+    return missing_data("no_odometry", have=have)
 
 
-def trajectory_of(flight: Flight, part: Part) -> Trajectory:
+def trajectory_of(flight: Flight, part: FlightPart) -> Trajectory:
     """One part of a flight as a trajectory.
 
     Parameters
@@ -55,7 +55,7 @@ def trajectory_of(flight: Flight, part: Part) -> Trajectory:
         The log lacks it; the text says what would have logged it.
     """
     if part == "kf":
-        return _ours(flight)
+        return _kf_trajectory(flight)
     found = {"vio": odometry_of(flight), "truth": flight.truth, "ekf2": flight.ekf2}[part]
     if isinstance(found, PositionTrack):
         # where the log does not say, x is taken to be forward at the start
@@ -69,19 +69,19 @@ def trajectory_of(flight: Flight, part: Part) -> Trajectory:
     state, notes = found.state, ["EKF2's position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
-        whole = Segment(0.0, flight.log.duration_s, "the whole log")
-        state, resets = continuous_state(found, source, whole)
+        log_segment = Segment(0.0, flight.log.duration_s, "the whole log")
+        state, resets = continuous_state(found, source, log_segment)
         notes += [resets] if resets else []
     return _trajectory(flight, part, state, flight.attitude, tuple(notes))
 
 
-def _ours(flight: Flight) -> Trajectory:
-    compared = compare(flight, axes=AXIS_NAMES)
-    columns = zip(Columns.POSITION, compared.axes.values(), strict=True)
+def _kf_trajectory(flight: Flight) -> Trajectory:
+    kf_comparison = compare(flight, axes=AXIS_NAMES)
+    columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position = pd.DataFrame({name: axis.replay.steps["position_m"] for name, axis in columns})
-    used = compared.settings
+    used = kf_comparison.settings
     noises = f"SIGMA_A {used.sigma_a_m_s2:g} m/s², SIGMA_Z {used.sigma_z_m:g} m"
-    note = f"our filter over {compared.source.name}, {noises}"
+    note = f"our filter over {kf_comparison.source.name}, {noises}"
     return _trajectory(flight, "kf", position, flight.attitude, (note,))
 
 
@@ -104,7 +104,7 @@ def _trajectory(
             quaternions = orientation[Columns.QUATERNION].to_numpy(copy=True)
             turns = Rotation.from_quat(quaternions, scalar_first=True)
             rotation = Slerp(known, turns)(samples.index.to_numpy())
-            reported = _whole(orientation, Columns.ROTATION_VARIANCE)
+            reported = _complete_variances(orientation, Columns.ROTATION_VARIANCE)
             if reported is not None:
                 columns = [np.interp(samples.index, known, column) for column in reported.T]
                 rotation_variance = np.column_stack(columns)
@@ -120,7 +120,7 @@ def _trajectory(
         rotation=rotation,
         frame=frame,
         unix_offset_s=flight.log.start_unix_s,
-        position_variance_m2=_whole(samples, Columns.POSITION_VARIANCE),
+        position_variance_m2=_complete_variances(samples, Columns.POSITION_VARIANCE),
         rotation_variance_rad2=rotation_variance,
         sha256=flight.log.sha256,
         size_bytes=flight.log.bytes,
@@ -128,7 +128,7 @@ def _trajectory(
     )
 
 
-def _whole(samples: pd.DataFrame, columns: list[str]) -> Array | None:
+def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
     """Reported variances, shape (n, 3); None where there are none, or some are missing."""
     if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
@@ -149,7 +149,7 @@ def file_name(source: Path) -> str:
     return path.stem if part is None else f"{path.stem}_{part}"
 
 
-def split_part(argument: str) -> tuple[Path, Part | None]:
+def split_part(argument: str) -> tuple[Path, FlightPart | None]:
     """File and part of ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth``.
 
     Raises
@@ -157,17 +157,17 @@ def split_part(argument: str) -> tuple[Path, Part | None]:
     TrajectoryError
         What follows the colon is no part.
     """
-    whole = Path(argument)
+    full_path = Path(argument)
     path, colon, part = argument.rpartition(":")
-    if whole.exists() or not colon:
-        return whole, None
-    if part in PARTS:
+    if full_path.exists() or not colon:
+        return full_path, None
+    if part in FLIGHT_PARTS:
         return Path(path), part
     if Path(path).is_file():
         raise TrajectoryError.of(
-            "no_such_part", path=shown(Path(path)), part=part, known=", ".join(PARTS)
+            "no_such_part", path=display_name(Path(path)), part=part, known=", ".join(FLIGHT_PARTS)
         )
-    return whole, None
+    return full_path, None
 
 
 def is_g2o(path: Path) -> bool:
@@ -179,7 +179,7 @@ def is_g2o(path: Path) -> bool:
         It cannot be read.
     """
     head = read_head(path, _HEAD_BYTES, TrajectoryError)
-    return text_of(head) is not None and any(
+    return decode_text(head) is not None and any(
         line.strip().startswith(_G2O) for line in head.splitlines()
     )
 
@@ -187,7 +187,7 @@ def is_g2o(path: Path) -> bool:
 def read_source(
     argument: str,
     *,
-    default: Part | None = None,
+    default: FlightPart | None = None,
     frame: Frame | None = None,
     system: int | None = None,
 ) -> LoopSource:
@@ -215,16 +215,18 @@ def read_source(
     path, part = split_part(argument)
     head = read_head(path, _HEAD_BYTES, TrajectoryError)
     if not head:
-        raise TrajectoryError(f"{shown(path)}: the file is empty", "Copy or export it again.")
+        raise TrajectoryError(
+            f"{display_name(path)}: the file is empty", "Copy or export it again."
+        )
     if is_g2o(path):
-        raise TrajectoryError.of("graph_not_trajectory", path=shown(path))
-    if text_of(head) is not None:  # and so no flight log
+        raise TrajectoryError.of("graph_not_trajectory", path=display_name(path))
+    if decode_text(head) is not None:  # and so no flight log
         if part is not None:
-            raise TrajectoryError.of("part_of_trajectory", path=shown(path), part=part)
+            raise TrajectoryError.of("part_of_trajectory", path=display_name(path), part=part)
         trajectory = read_trajectory(path)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
-        raise SettingsError.of("frame_of_log", frame=frame.lower(), path=shown(path))
+        raise SettingsError.of("frame_of_log", frame=frame.lower(), path=display_name(path))
     flight = read_log(path, system=system)
     chosen = part or default
     if chosen is None:

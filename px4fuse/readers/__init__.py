@@ -4,22 +4,34 @@ from pathlib import Path
 
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight import Flight
-from px4fuse.reading import read_head, read_log_bytes, shown
+from px4fuse.reading import display_name, read_head, read_log_bytes
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 # What is given for a log by mistake: how it begins, or the ends of its name; and what it is for
-_FOREIGN = (
+_FOREIGN_FORMATS = (
     # libraries/AP_Logger/LogStructure.h
-    (b"\xa3\x95", (), "an ArduPilot DataFlash log, not a PX4 ULog",
-     "Give the .tlog that the ground station wrote."),
+    (
+        b"\xa3\x95",
+        (),
+        "an ArduPilot DataFlash log, not a PX4 ULog",
+        "Give the .tlog that the ground station wrote.",
+    ),
     (b"%PDF-", (), "a PDF, not a flight log", "To check a report: px4fuse verify {name} LOG."),
-    (b"", (".csv", ".tsv"), "a table, not a flight log",
-     "If it holds positions, give it beside the log of the flight: px4fuse compare LOG --position "
-     "{name}."),
-    (b"", (".tum", ".g2o"), "a trajectory or a pose graph, not a flight log",
-     "Score it with px4fuse evaluate, or correct its loop: px4fuse loop {name}."),
-)  # fmt: skip
+    (
+        b"",
+        (".csv", ".tsv"),
+        "a table, not a flight log",
+        "If it holds positions, give it beside the log of the flight: px4fuse compare LOG "
+        "--position {name}.",
+    ),
+    (
+        b"",
+        (".tum", ".g2o"),
+        "a trajectory or a pose graph, not a flight log",
+        "Score it with px4fuse evaluate, or correct its loop: px4fuse loop {name}.",
+    ),
+)
 
 
 def read_log(path: str | Path, *, system: int | None = None) -> Flight:
@@ -42,7 +54,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         ``system`` is not in the recording, or the log is a ULog, which has no systems.
     """
     path = Path(path)
-    name = shown(path)
+    name = display_name(path)
     head = read_head(path, _SNIFF_BYTES, LogError)
     # each reader is imported when its format is met: pyulog and pymavlink cost time
     if head.startswith(ULOG_MAGIC):
@@ -51,10 +63,10 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))
-    for magic, suffixes, what, remedy in _FOREIGN:
-        named_so = path.suffix.lower() in suffixes and head.isascii()
-        if named_so or (magic and head.startswith(magic)):
-            raise LogError(f"{name}: {what}", remedy.format(name=name))
+    for magic, suffixes, description, remedy in _FOREIGN_FORMATS:
+        has_suffix = path.suffix.lower() in suffixes and head.isascii()
+        if has_suffix or (magic and head.startswith(magic)):
+            raise LogError(f"{name}: {description}", remedy.format(name=name))
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 
     return read_mavlink(name, read_log_bytes(path), system)

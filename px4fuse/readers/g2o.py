@@ -8,8 +8,9 @@ import numpy as np
 
 from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import Rows, at_line, quote, text_of
-from px4fuse.reading import read_whole, shown
+from px4fuse.readers.text_table import Rows, decode_text, format_line_error, quote
+from px4fuse.readers.trajectory import MAX_VALUE
+from px4fuse.reading import display_name, read_bytes_limited
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
@@ -31,9 +32,9 @@ _VERTEX = re.compile("[+-]?[0-9]{1,18}")
 # Files are printed with few digits: a matrix this far from semidefinite is meant as one
 _ROUNDING = 1e-9
 # Of a squared norm: what normalising again would not improve
-_UNIT = 1e-15
+_UNIT_NORM_TOLERANCE = 1e-15
 # In 1/m² or 1/rad². Far beyond any measurement, and far from where squares and inverses overflow
-_LEAST_INFORMATION, _MOST_INFORMATION = 1e-50, 1e50
+_MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
@@ -52,10 +53,10 @@ def read_g2o(path: str | Path) -> PoseGraph:
         no information matrix, or both kinds of pose.
     """
     file = Path(path)
-    text = text_of(read_whole(file, TrajectoryError, MAX_FILE_BYTES))
+    text = decode_text(read_bytes_limited(file, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
-        raise TrajectoryError(f"{shown(file)}: not a text file", _REMEDY)
-    return parse_g2o(text, shown(file))
+        raise TrajectoryError(f"{display_name(file)}: not a text file", _REMEDY)
+    return parse_g2o(text, display_name(file))
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
@@ -71,39 +72,41 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     TrajectoryError
         As :func:`read_g2o`.
     """
-    found = _by_tag(text, name)
-    in_plane = any(rows.lines for tag, rows in found.items() if tag.endswith("SE2"))
+    rows_by_tag = _rows_by_tag(text, name)
+    in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
     dimension, kind, width = (2, "SE2", 3) if in_plane else (3, "SE3:QUAT", 7)
-    for tag, rows in found.items():
+    for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(kind):
             what = "poses in space (SE3) beside poses in the plane (SE2)"
-            raise rows.refuse(0, what, "Give one kind per file.")
-    vertices, edges = found[f"VERTEX_{kind}"], found[f"EDGE_{kind}"]
+            raise rows.row_error(0, what, "Give one kind per file.")
+    vertices, edges = rows_by_tag[f"VERTEX_{kind}"], rows_by_tag[f"EDGE_{kind}"]
     if not edges.lines:
         raise TrajectoryError(f"{name}: no edges", _REMEDY)
-    ends, numbers = _parse(edges, f"EDGE_{kind}")
-    ids = np.unique(ends)
+    end_ids, numbers = _parse(edges, f"EDGE_{kind}")
+    ids = np.unique(end_ids)
     poses = np.zeros((len(ids), width))
     poses[:, 6:] = 1.0  # w of the quaternion
     if vertices.lines:
-        numbered, poses = _parse(vertices, f"VERTEX_{kind}")
-        order = np.argsort(numbered[:, 0], kind="stable")
-        ids, poses = numbered[order, 0], _unit(vertices, poses)[order]
-        twice = np.zeros(len(ids), dtype=np.bool_)
-        twice[order[1:]] = ids[1:] == ids[:-1]
-        vertices.refuse_where(twice, "a vertex for the second time", "Take one of them out.")
-    index = np.minimum(np.searchsorted(ids, ends), len(ids) - 1)
+        vertex_ids, poses = _parse(vertices, f"VERTEX_{kind}")
+        order = np.argsort(vertex_ids[:, 0], kind="stable")
+        ids, poses = vertex_ids[order, 0], _normalise_quaternions(vertices, poses)[order]
+        is_repeated = np.zeros(len(ids), dtype=np.bool_)
+        is_repeated[order[1:]] = ids[1:] == ids[:-1]
+        vertices.raise_where(is_repeated, "a vertex for the second time", "Take one of them out.")
+    index = np.minimum(np.searchsorted(ids, end_ids), len(ids) - 1)
     what = "an edge to a vertex that the file does not have"
     remedy = "Add its VERTEX line, or take all of them out."
-    edges.refuse_where(ids[index] != ends, what, remedy)
-    edges.refuse_where(ends[:, 0] == ends[:, 1], "an edge from a vertex to itself", "Take it out.")
+    edges.raise_where(ids[index] != end_ids, what, remedy)
+    edges.raise_where(
+        end_ids[:, 0] == end_ids[:, 1], "an edge from a vertex to itself", "Take it out."
+    )
     graph = PoseGraph(
         dimension=dimension,
         ids=ids,
         poses=poses,
         first=index[:, 0],
         second=index[:, 1],
-        measurements=_unit(edges, numbers[:, :width]),
+        measurements=_normalise_quaternions(edges, numbers[:, :width]),
         information=_information(edges, numbers[:, width:], 3 if dimension == 2 else 6),
         initialised=FROM_FILE,
     )
@@ -133,40 +136,47 @@ def g2o_text(graph: PoseGraph) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _by_tag(text: str, name: str) -> dict[str, Rows]:
+def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
     """Lines of vertices and edges by their tag."""
-    found = {tag: Rows(name) for tag in _TAGS}
+    rows_by_tag = {tag: Rows(name) for tag in _TAGS}
     fixed: set[str] = set()
     for number, raw in enumerate(text.split("\n"), start=1):
         line = raw.partition("#")[0].strip()
         if not line:
             continue
         tag, *rest = line.split(maxsplit=1)
-        if tag in found:
-            found[tag].lines.append((number, line))
+        if tag in rows_by_tag:
+            rows_by_tag[tag].lines.append((number, line))
         elif tag == "FIX":
             fixed.update(" ".join(rest).split())
             if len(fixed) > 1:
                 remedy = "One pose is held here: take the line out, or join the two by an edge."
-                raise TrajectoryError(at_line(name, number, "FIX of a second vertex", remedy))
+                raise TrajectoryError(
+                    format_line_error(name, number, "FIX of a second vertex", remedy)
+                )
         elif not tag.startswith(_IGNORED):
-            raise TrajectoryError(at_line(name, number, f"{quote(tag)} is not read here", _REMEDY))
-    return found
+            raise TrajectoryError(
+                format_line_error(name, number, f"{quote(tag)} is not read here", _REMEDY)
+            )
+    return rows_by_tag
 
 
 def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Array]:
     """Vertices that the rows of a tag name, and the numbers behind them."""
-    named, count = _TAGS[tag]
-    words, numbers = rows.parse(1 + named, count)
-    wrong = np.array([_VERTEX.fullmatch(word) is None for word in words[:, 1:].flat])
+    vertex_count, count = _TAGS[tag]
+    words, numbers = rows.parse(1 + vertex_count, count)
+    is_no_number = np.array([_VERTEX.fullmatch(word) is None for word in words[:, 1:].flat])
     what = "the number of a vertex is no integer"
-    rows.refuse_where(wrong.reshape(-1, named), what, "Give an integer.")
+    rows.raise_where(is_no_number.reshape(-1, vertex_count), what, "Give an integer.")
     remedy = "Correct it, or take the line out."
-    rows.refuse_where(~np.isfinite(numbers), "a number that is not finite", remedy)
+    rows.raise_where(~np.isfinite(numbers), "a number that is not finite", remedy)
+    # of positions in m; of SE2 also the angle
+    far = np.abs(numbers[:, :3]) >= MAX_VALUE
+    rows.raise_where(far, f"a value beyond {MAX_VALUE:.0e}", remedy)
     return words[:, 1:].astype(np.int64), numbers
 
 
-def _unit(rows: Rows, poses: Array) -> Array:
+def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     """Poses with unit quaternions."""
     if poses.shape[1] == 3:
         return poses
@@ -174,25 +184,25 @@ def _unit(rows: Rows, poses: Array) -> Array:
         norm = np.linalg.norm(poses[:, 3:], axis=1)
     what = "a quaternion whose length is far from 1 is not a rotation"
     remedy = "Give qx qy qz qw, of length 1, behind the position."
-    rows.refuse_where((norm < 1e-6) | ~(norm < 1e6), what, remedy)
+    rows.raise_where((norm < 1e-6) | ~(norm < 1e6), what, remedy)
     # What is a unit quaternion already stays as it is, so that writing and reading changes nothing
-    norm[np.abs(norm - 1.0) <= _UNIT] = 1.0
+    norm[np.abs(norm - 1.0) <= _UNIT_NORM_TOLERANCE] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
 
 
 def _information(rows: Rows, numbers: Array, size: int) -> Array:
     """Symmetric matrices from their upper triangles, row by row."""
     row, column = np.triu_indices(size)
-    made = np.empty((len(numbers), size, size))
-    made[:, row, column] = made[:, column, row] = numbers
+    matrices = np.empty((len(numbers), size, size))
+    matrices[:, row, column] = matrices[:, column, row] = numbers
     entry = np.abs(numbers)
-    tiny = (row == column) & (entry > 0.0) & (entry < _LEAST_INFORMATION)
+    tiny = (row == column) & (entry > 0.0) & (entry < _MIN_INFORMATION)
     what = "the information matrix has an entry that cannot be computed with"
-    usual = f"{_LEAST_INFORMATION:g} to {_MOST_INFORMATION:g}"
-    remedy = f"Give 0 for what the edge does not tell, else {usual}."
-    rows.refuse_where(tiny | (entry > _MOST_INFORMATION), what, remedy)
-    values = np.linalg.eigvalsh(made)
+    usual_range = f"{_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}"
+    remedy = f"Give 0 for what the edge does not tell, else {usual_range}."
+    rows.raise_where(tiny | (entry > _MAX_INFORMATION), what, remedy)
+    values = np.linalg.eigvalsh(matrices)
     what = "the information matrix has a negative eigenvalue"
     remedy = "Give the upper triangle of an inverse covariance, row by row."
-    rows.refuse_where(values[:, 0] < -_ROUNDING * np.maximum(values[:, -1], 0.0), what, remedy)
-    return made
+    rows.raise_where(values[:, 0] < -_ROUNDING * np.maximum(values[:, -1], 0.0), what, remedy)
+    return matrices

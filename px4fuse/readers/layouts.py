@@ -11,6 +11,8 @@ import msgspec
 
 from px4fuse.flight import Columns
 
+# No field reaches it, flags and UNIX times in µs (1.8e15) included
+IMPOSSIBLE = 1e17
 GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
 
@@ -36,20 +38,20 @@ class Layout:
     scale: Mapping[str, float] = field(default_factory=dict)
 
 
-def one_by_one(rows: Mapping[str, Any]) -> dict[str, Layout]:
+def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
     """Rows as they are written, with every column named."""
     return {
         name: replace(
             row,
-            columns=columns_of(row.columns),
-            optional=columns_of(row.optional),
-            scale=columns_of(row.scale),
+            columns=expand_columns(row.columns),
+            optional=expand_columns(row.optional),
+            scale=expand_columns(row.scale),
         )
         for name, row in msgspec.convert(rows, dict[str, Layout]).items()
     }
 
 
-def columns_of(fields: Mapping[str, Any]) -> dict[str, Any]:
+def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Columns one by one, of which a row names several at once.
 
     Parameters
@@ -61,19 +63,23 @@ def columns_of(fields: Mapping[str, Any]) -> dict[str, Any]:
 
     Examples
     --------
-    >>> columns_of({"POSITION": "x y z"})
+    >>> expand_columns({"POSITION": "x y z"})
     {'north_m': 'x', 'east_m': 'y', 'down_m': 'z'}
-    >>> columns_of({"north_m east_m": "position[]"})
+    >>> expand_columns({"north_m east_m": "position[]"})
     {'north_m': 'position[0]', 'east_m': 'position[1]'}
     """
-    found: dict[str, Any] = {}
-    for ours, theirs in fields.items():
-        names: list[str] = getattr(Columns, ours) if ours.isupper() else ours.split()
-        if isinstance(theirs, float):
-            found |= dict.fromkeys(names, theirs)
+    columns: dict[str, Any] = {}
+    for column_names, field_names in fields.items():
+        names: list[str] = (
+            getattr(Columns, column_names) if column_names.isupper() else column_names.split()
+        )
+        if isinstance(field_names, float):
+            columns |= dict.fromkeys(names, field_names)
             continue
-        name, of_field, at = theirs.removesuffix("]").partition("[")
-        places = at.split() or range(len(names))
-        each = [f"{name}[{place}]" for place in places] if of_field else theirs.split()
-        found |= zip(names, each, strict=True)
-    return found
+        name, is_array, elements = field_names.removesuffix("]").partition("[")
+        element_numbers = elements.split() or range(len(names))
+        column_fields = (
+            [f"{name}[{place}]" for place in element_numbers] if is_array else field_names.split()
+        )
+        columns |= zip(names, column_fields, strict=True)
+    return columns

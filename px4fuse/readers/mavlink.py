@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force, valid_parameters
 from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
@@ -18,10 +18,10 @@ from px4fuse.readers import parts
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_frames import MESSAGE_IDS, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
-from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, settle_clocks, unix_of_boot
+from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, read_recording, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 from px4fuse.recording import LogInfo, Unused
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
@@ -57,10 +57,10 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     """
     frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system)
-    recording = settle_clocks(frames, address)
+    recording = read_recording(frames, address)
     mapped = senders.map_senders(recording)
-    parameters = _read_parameters(recording, autopilot)
-    remedies, _ = messages.remedies_of(autopilot)
+    parameters, faults = valid_parameters(_read_parameters(recording, autopilot))
+    remedies, _ = messages.remedies_of_autopilot(autopilot)
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
     ekf2 = _read_ekf2(recording, parameters, autopilot)
@@ -75,7 +75,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
         # after all that is read, since it tells what was dropped
-        log=_describe(recording, parameters, autopilot, in_flight),
+        log=_describe(recording, parameters, faults, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
         positions=positions,
@@ -84,7 +84,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         airborne=airborne,
         barometer=barometer(pressure_altitude(pressure)),
         modes=modes,
-        missing=(*parts.missing_parts(imu, attitude, ekf2, truth), *missing_positions),
+        missing=(*parts.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=senders.clock_maps(recording, mapped),
         unused=tuple(
@@ -110,8 +110,8 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     imu = recording.read(layout, rows)
     imu = parts.finite_rows(imu, imu.columns.tolist(), parts.BEYOND_IMU)
     if len(imu) < 2:
-        return lacking("imu_few", topic=layout.topic, count=len(imu))
-    recording.came_from("imu", layout.topic)
+        return missing_data("imu_few", topic=layout.topic, count=len(imu))
+    recording.record_stream("imu", layout.topic)
     return imu
 
 
@@ -119,9 +119,9 @@ def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavaila
     layout = max(messages.ATTITUDE, key=lambda layout: len(recording.rows(layout.topic)))
     attitude = parts.with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
-        *some, last = (layout.topic for layout in messages.ATTITUDE)
-        return Unavailable("attitude", f"no usable {', '.join(some)} or {last}", remedy)
-    recording.came_from("attitude", layout.topic)
+        *other_topics, last = (layout.topic for layout in messages.ATTITUDE)
+        return Unavailable("attitude", f"no usable {', '.join(other_topics)} or {last}", remedy)
+    recording.record_stream("attitude", layout.topic)
     return attitude
 
 
@@ -129,19 +129,23 @@ def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     """EKF2's output as the autopilot sent it, or why there is none."""
-    remedies, replay = messages.remedies_of(autopilot)
+    remedies, replay = messages.remedies_of_autopilot(autopilot)
     counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATES}
     # the one with variances as long as it is not much sparser than the one without
-    dense = (one for one in messages.STATES if 2 * counts[one.topic] >= max(counts.values()))
+    dense = (
+        layout_candidate
+        for layout_candidate in messages.STATES
+        if 2 * counts[layout_candidate.topic] >= max(counts.values())
+    )
     layout = next(dense)
     message = layout.topic
     if counts[message] < 2:
-        return lacking("ekf2_not_sent", remedy=remedies["state"])
+        return missing_data("ekf2_not_sent", remedy=remedies["state"])
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
         return Unavailable("EKF2", f"{message} holds no finite state", "Wait for EKF2 to start.")
-    recording.came_from("ekf2_state", message)
+    recording.record_stream("ekf2_state", message)
     notes = [f"EKF2's state is {message} as the autopilot sent it"]
     if autopilot != "PX4":
         notes.append(f"this is {autopilot}: what is called EKF2 here is its own estimator")
@@ -159,18 +163,18 @@ def _read_ekf2(
             notes.append(f"EKF2's position variances are {by}; velocity variances are not sent")
     variance: pd.DataFrame | Unavailable = found
     if found.empty:
-        variance = lacking("variances_not_sent", remedy=remedies["variance"])
+        variance = missing_data("variances_not_sent", remedy=remedies["variance"])
     else:
-        recording.came_from("ekf2_variance", message)
+        recording.record_stream("ekf2_variance", message)
     return Ekf2(
         state=state,
         variance=variance,
         innovations={
-            axis: lacking("inside_not_sent", axis=axis, remedy=remedies["inside"])
+            axis: missing_data("inside_not_sent", axis=axis, remedy=remedies["inside"])
             for axis in AXIS_NAMES
         },
         innovation_topics=(),
-        fusing=lacking("fusion_not_sent", remedy=remedies["inside"]),
+        fusing=missing_data("fusion_not_sent", remedy=remedies["inside"]),
         resets=(),
         instances=NO_SELECTOR,
         gate=settings_in_force(parameters)[EV_POS.gate],
@@ -200,10 +204,10 @@ def _read_airborne(
     known = table["landed_state"] > 0
     if not np.any(known):
         return Unavailable("land detector", "no usable EXTENDED_SYS_STATE", remedy)
-    recording.came_from("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
+    recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == messages.LANDED, index=time_s)
-    return parts.stretches_of_flight(landed, recording.duration_s)
+    return parts.flight_spans(landed, recording.duration_s)
 
 
 def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
@@ -218,10 +222,10 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
         for mode in modes.tolist()
     ]
     time_s = recording.receipt_boot_s(rows) - recording.zero_s
-    return parts.stretches_of_modes(pd.Series(names, index=time_s), recording.duration_s)
+    return parts.mode_spans(pd.Series(names, index=time_s), recording.duration_s)
 
 
-def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[str, float]:
+def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
     """Parameters as first sent; PX4 puts the bytes of an integer into the float."""
     table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
     by_bytes = (autopilot == "PX4") & (table["param_type"] < PARAMETER_REAL)
@@ -230,16 +234,24 @@ def _read_parameters(recording: Recording, autopilot: str) -> MappingProxyType[s
     found: dict[str, float] = {}
     for name, value in zip(table["param_id"].tolist(), values.tolist(), strict=True):
         text = name.decode(errors="replace")
-        if text in REPORTED and np.isfinite(value):
+        if text in REPORTED:
             found.setdefault(text, float(value))
-    return MappingProxyType(found)
+    return found
 
 
 def _describe(
-    recording: Recording, parameters: Mapping[str, float], autopilot: str, in_flight: bool
+    recording: Recording,
+    parameters: Mapping[str, float],
+    faults: tuple[str, ...],
+    autopilot: str,
+    in_flight: bool,
 ) -> LogInfo:
     frames = recording.frames
-    end = (parts.cut_off("frame", recording.duration_s, in_flight),) if frames.in_frame else ()
+    end = (
+        (parts.format_truncation("frame", recording.duration_s, in_flight),)
+        if frames.in_frame
+        else ()
+    )
     firmware, firmware_hash = f"{autopilot} (version not in the recording)", "unknown"
     vehicle = ""
     rows = recording.rows("AUTOPILOT_VERSION")
@@ -267,8 +279,8 @@ def _describe(
         hardware=f"{kind} (MAVLink system {recording.address[0]})",
         boot_time_s=recording.zero_s,
         duration_s=recording.duration_s,
-        parameters=parameters,
-        notes=(*recording.notes, *dropped),
+        parameters=MappingProxyType(parameters),
+        notes=(*recording.notes, *faults, *dropped),
         restarts=recording.restarts,
         receipt_went_back=recording.receipt_went_back,
         dropped=dict(sorted(recording.dropped.items())),

@@ -28,7 +28,7 @@ MAX_STRETCHES = 200
 # A drift is stated from this span on; below, both clocks are taken to run alike
 MIN_DRIFT_SPAN_S = 30.0
 # but a recording replayed at another speed shows at once
-OTHER_SPEED = 0.01
+MAX_SPEED_DIFFERENCE = 0.01
 # Beyond this factor neither a replay nor a wrong unit of time (s for ns: 1e9) explains a speed
 MAX_SPEED = 1e12
 MIN_PAIRS = 3
@@ -61,7 +61,7 @@ class Line:
         return Line(self.y0, self.x0, 1.0 / self.slope, self.jitter / self.slope, self.pairs)
 
 
-def least_delay(x: Array, y: Array) -> Line:
+def fit_least_delay(x: Array, y: Array) -> Line:
     """Line below which no pair lies by much: y is a reading taken a varying delay after x.
 
     Parameters
@@ -80,23 +80,27 @@ def least_delay(x: Array, y: Array) -> Line:
     span = float(x[-1] - x[0])
     stretches = int(np.clip(span / ENVELOPE_S, 1, MAX_STRETCHES))
     edges = np.searchsorted(x, np.linspace(x[0], x[-1], stretches + 1)[1:-1])
-    parts = [part for part in np.split(np.arange(len(x)), edges) if len(part)]
+    stretch_rows = [rows for rows in np.split(np.arange(len(x)), edges) if len(rows)]
     slope = 1.0
-    middles = [part[len(part) // 2] for part in parts]
+    middles = [rows[len(rows) // 2] for rows in stretch_rows]
     if len(middles) > 1 and x[middles[-1]] > x[middles[0]]:
-        rough = _median_slope(x[middles], y[middles])
-        slope = rough if abs(rough - 1.0) > OTHER_SPEED and _is_speed(rough) else 1.0
+        rough_slope = _median_slope(x[middles], y[middles])
+        slope = (
+            rough_slope
+            if abs(rough_slope - 1.0) > MAX_SPEED_DIFFERENCE and _is_speed(rough_slope)
+            else 1.0
+        )
     residual = y - slope * (x - x0)
-    lowest = [part[np.argmin(residual[part])] for part in parts]
+    lowest = [rows[np.argmin(residual[rows])] for rows in stretch_rows]
     if span >= MIN_DRIFT_SPAN_S and len(lowest) > 1:
         # with the drift known, others are the least delayed
         for _ in range(2):
             corrected = slope + _median_slope(x[lowest], residual[lowest])
             slope = corrected if _is_speed(corrected) else 1.0
             residual = y - slope * (x - x0)
-            lowest = [part[np.argmin(residual[part])] for part in parts]
+            lowest = [rows[np.argmin(residual[rows])] for rows in stretch_rows]
     y0 = float(np.median(residual[lowest]))
-    return Line(x0, y0, slope, spread(residual), len(x))
+    return Line(x0, y0, slope, robust_std(residual), len(x))
 
 
 def _median_slope(x: Array, y: Array) -> float:
@@ -110,18 +114,18 @@ def _is_speed(slope: float) -> bool:
     return 1.0 / MAX_SPEED < slope < MAX_SPEED
 
 
-def tells_time(stamp_s: Array) -> bool:
+def is_running_clock(stamp_s: Array) -> bool:
     """Whether stamps take enough values to be a clock's."""
     return len(np.unique(stamp_s)) >= max(MIN_DISTINCT_SHARE * len(stamp_s), 2)
 
 
-def spread(values: Array) -> float:
+def robust_std(values: Array) -> float:
     """Standard deviation by 1.4826 · median absolute deviation."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 @dataclass(frozen=True)
-class Mapped:
+class ClockMapping:
     """A sender's stamps on the boot clock.
 
     ``to_boot`` is None where the stamps do not tell the time; the time of receipt stands in then.
@@ -141,7 +145,7 @@ def map_clock(
     unix_of_boot: Line | None,
     *,
     has_receipt: bool,
-) -> Mapped:
+) -> ClockMapping:
     """Map a sender's own clock to the autopilot's boot clock by the best means there is.
 
     Parameters
@@ -163,25 +167,29 @@ def map_clock(
     """
     receipt = "receive time" if has_receipt else "position in the stream"
     boot_at_receipt = boot_of_receipt.at(received_s)
-    if not tells_time(stamp_s):
+    if not is_running_clock(stamp_s):
         distinct = len(np.unique(stamp_s))
-        few = f"its {len(stamp_s)} time stamps take only {distinct} values"
-        note = f"{few}, so the {receipt} stands in for them"
+        few_values = f"its {len(stamp_s)} time stamps take only {distinct} values"
+        note = f"{few_values}, so the {receipt} stands in for them"
         # what the receipt adds to evenly sent samples; gaps are no jitter
         intervals = np.diff(received_s)
         regular = intervals[intervals < MAX_INTERVAL_S]
         jitter = float(np.std(regular) / np.sqrt(2.0)) if len(regular) > 1 else 0.0
-        return Mapped(None, ClockMap(name, receipt, len(stamp_s), 0.0, 0.0, jitter, note, distinct))
-    synchronised = _by_exchange(replies, answers)
-    as_it_is = abs(float(np.median(boot_at_receipt - stamp_s)))
+        return ClockMapping(
+            None, ClockMap(name, receipt, len(stamp_s), 0.0, 0.0, jitter, note, distinct)
+        )
+    synchronised = _line_of_exchange(replies, answers)
+    unmapped_distance_s = abs(float(np.median(boot_at_receipt - stamp_s)))
     # a clock of its own may have started seconds after the autopilot's
-    gained = 0.0
+    improvement_s = 0.0
     if synchronised is not None:
-        gained = as_it_is - abs(float(np.median(boot_at_receipt - synchronised.at(stamp_s))))
-    if as_it_is <= SAME_CLOCK_S and gained < MIN_GAIN_S:
+        improvement_s = unmapped_distance_s - abs(
+            float(np.median(boot_at_receipt - synchronised.at(stamp_s)))
+        )
+    if unmapped_distance_s <= SAME_CLOCK_S and improvement_s < MIN_GAIN_S:
         line = Line(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
         note = "its stamps are on the boot clock already"
-        return Mapped(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
+        return ClockMapping(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
     kind = "UNIX time" if float(np.median(stamp_s)) > UNIX_FROM_S else "own clock"
     clock = f"{kind} of {name}"
     known = [] if synchronised is None else [("TIMESYNC", synchronised, "")]
@@ -191,31 +199,34 @@ def map_clock(
     for method, line, note in known:
         # a map that puts messages long before or after their receipt is of another clock
         if abs(float(np.median(line.at(stamp_s) - boot_at_receipt))) <= SAME_CLOCK_S:
-            return Mapped(line, _statement(clock, method, line, stamp_s, note))
-    late = least_delay(stamp_s, received_s)
-    there, slope = float(boot_of_receipt.at(late.y0)), late.slope * boot_of_receipt.slope
-    by_receipt = replace(late, y0=there, slope=slope)
+            return ClockMapping(line, _clock_map(clock, method, line, stamp_s, note))
+    receipt_line = fit_least_delay(stamp_s, received_s)
+    boot_y0, slope = (
+        float(boot_of_receipt.at(receipt_line.y0)),
+        receipt_line.slope * boot_of_receipt.slope,
+    )
+    boot_line = replace(receipt_line, y0=boot_y0, slope=slope)
     note = "no usable TIMESYNC or SYSTEM_TIME; late by the least delay of the link"
-    return Mapped(by_receipt, _statement(clock, receipt, by_receipt, stamp_s, note))
+    return ClockMapping(boot_line, _clock_map(clock, receipt, boot_line, stamp_s, note))
 
 
-def _by_exchange(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
+def _line_of_exchange(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
     """From the sender's clock to the boot clock, between the two envelopes where both exist."""
     lines = []
     if len(replies[0]) >= MIN_PAIRS:
         # asked before replied: the reply is the later reading
-        lines.append(least_delay(*replies).inverse())
+        lines.append(fit_least_delay(*replies).inverse())
     if len(answers[0]) >= MIN_PAIRS:
-        lines.append(least_delay(*answers))
+        lines.append(fit_least_delay(*answers))
     if not lines:
         return None
     x0 = lines[0].x0
-    each = [(float(line.at(x0)), line.slope, line.jitter) for line in lines]
-    y0, slope, jitter = np.mean(each, axis=0).tolist()
+    line_values = [(float(line.at(x0)), line.slope, line.jitter) for line in lines]
+    y0, slope, jitter = np.mean(line_values, axis=0).tolist()
     return Line(x0, y0, slope, jitter, sum(line.pairs for line in lines))
 
 
-def _statement(clock: str, method: str, line: Line, stamp_s: Array, note: str) -> ClockMap:
+def _clock_map(clock: str, method: str, line: Line, stamp_s: Array, note: str) -> ClockMap:
     middle = float(0.5 * (stamp_s.min() + stamp_s.max()))
     offset_s, drift_ppm = float(line.at(middle)) - middle, (line.slope - 1.0) * 1e6
     return ClockMap(clock, method, line.pairs, offset_s, drift_ppm, line.jitter, note)

@@ -33,11 +33,11 @@ SIGNATURE = 13
 SIGNED = 0x01
 LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
 # QGroundControl and MAVProxy put the time of receipt before each frame: µs, big-endian
-STAMP = 8
+STAMP_BYTES = 8
 # Bytes that are scanned at a time, which bounds the memory that hostile bytes can claim
-BLOCK = 1 << 16
+BLOCK_BYTES = 1 << 16
 # Frames that are gathered at a time
-PIECE = 1 << 12
+FRAMES_PER_PIECE = 1 << 12
 # Below this share of bytes in good frames a file is no MAVLink recording: chance makes one frame
 # in about eight million random bytes.
 MIN_GOOD_SHARE = 0.01
@@ -69,7 +69,7 @@ class Frames:
     payload_length : ndarray of uint8, shape (n,)
     received_us : ndarray of int64, shape (n,), or None
         Time of receipt, µs UNIX, of a recording with stamps (damaged ones interpolated).
-    passed_over : int
+    unknown_frame_count : int
         Whole frames of messages that the dialect does not know.
     bad_bytes : int
         Bytes that belong to no frame.
@@ -89,7 +89,7 @@ class Frames:
     payload_start: Integers
     payload_length: NDArray[np.uint8]
     received_us: Integers | None
-    passed_over: int
+    unknown_frame_count: int
     bad_bytes: int
     in_frame: bool
     bad_stamps: int
@@ -129,12 +129,12 @@ class Frames:
         for length in np.unique(lengths).tolist():
             size = min(length, layout.itemsize)
             if size:
-                of_length = np.flatnonzero(lengths == length)
+                rows_of_length = np.flatnonzero(lengths == length)
                 windows = np.lib.stride_tricks.sliding_window_view(source, size)
                 # a piece at a time: what is gathered is a copy
-                for at in range(0, len(of_length), PIECE):
-                    part = of_length[at : at + PIECE]
-                    payload[part, :size] = windows[starts[part]]
+                for at in range(0, len(rows_of_length), FRAMES_PER_PIECE):
+                    piece_rows = rows_of_length[at : at + FRAMES_PER_PIECE]
+                    payload[piece_rows, :size] = windows[starts[piece_rows]]
         return payload.view(layout)[:, 0]
 
 
@@ -174,16 +174,18 @@ def read_frames(name: str, content: bytes) -> Frames:
     LogError
         It holds no MAVLink.
     """
-    start, end, number = _without_overlap(_scan(content)).T
-    stamp = STAMP if len(start) and _is_stamped(start, end) else 0
-    good = int(np.sum(end - start))
-    if good < MIN_GOOD_SHARE * len(content) or not len(start):
+    start, end, number = _remove_overlapping(_scan(content)).T
+    stamp = STAMP_BYTES if len(start) and _has_receive_stamps(start, end) else 0
+    good_bytes = int(np.sum(end - start))
+    if good_bytes < MIN_GOOD_SHARE * len(content) or not len(start):
         raise LogError.of("not_a_log", name=name, frames=len(start), length=len(content))
     source = np.frombuffer(content, dtype=np.uint8)
-    second = source[start] == MAGIC_2
+    is_version_2 = source[start] == MAGIC_2
     # sequence, system and component follow one another
-    at = start + np.where(second, 4, 2)
-    passed_over, bad_bytes, in_frame = _between(content, start - stamp, end, stamp)
+    at = start + np.where(is_version_2, 4, 2)
+    unknown_frame_count, bad_bytes, in_frame = _count_other_bytes(
+        content, start - stamp, end, stamp
+    )
     received, bad_stamps = _stamps(source, start, end) if stamp else (None, 0)
     return Frames(
         name=name,
@@ -194,10 +196,10 @@ def read_frames(name: str, content: bytes) -> Frames:
         system=source[at + 1],
         component=source[at + 2],
         sequence=source[at],
-        payload_start=start + np.where(second, HEADER_2, HEADER_1),
+        payload_start=start + np.where(is_version_2, HEADER_2, HEADER_1),
         payload_length=source[start + 1],
         received_us=received,
-        passed_over=passed_over,
+        unknown_frame_count=unknown_frame_count,
         bad_bytes=bad_bytes,
         in_frame=in_frame,
         bad_stamps=bad_stamps,
@@ -208,7 +210,7 @@ def _scan(content: bytes) -> Integers:
     """Start, end and message id of all frames with a good checksum, shape (n, 3); may overlap."""
     source, view = np.frombuffer(content, dtype=np.uint8), memoryview(content)
     found = [np.zeros((0, 3), dtype=np.int64)]
-    for low in range(0, len(source), BLOCK):
+    for low in range(0, len(source), BLOCK_BYTES):
         frames, crc_end = _candidates(source, low)
         bodies = zip((frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
         crc = np.array([mcrf4xx(view[a:b]) for a, b in bodies], dtype=np.uint16)
@@ -218,7 +220,7 @@ def _scan(content: bytes) -> Integers:
     return np.concatenate(found)
 
 
-def _without_overlap(frames: Integers) -> Integers:
+def _remove_overlapping(frames: Integers) -> Integers:
     """Frames in file order, without those that begin inside the one before.
 
     One frame may lie in another one's payload (a tunnel). By chance a stamp looks like the
@@ -227,12 +229,12 @@ def _without_overlap(frames: Integers) -> Integers:
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
     start, end = frames[:, 0].tolist(), frames[:, 1].tolist()
-    keep, reached, starts = [], 0, {*start}
+    keep, end_reached, starts = [], 0, {*start}
     for row, begin in enumerate(start):
-        next_to = reached, reached + STAMP
-        if begin >= reached and (begin in next_to or starts.isdisjoint(next_to)):
+        next_starts = end_reached, end_reached + STAMP_BYTES
+        if begin >= end_reached and (begin in next_starts or starts.isdisjoint(next_starts)):
             keep.append(row)
-            reached = end[row]
+            end_reached = end[row]
     return frames[keep]
 
 
@@ -241,32 +243,41 @@ def _candidates(source: NDArray[np.uint8], low: int) -> tuple[Integers, Integers
 
     And where its checksum stands.
     """
-    block = source[low : low + BLOCK]
+    block = source[low : low + BLOCK_BYTES]
     start = np.flatnonzero((block == MAGIC_1) | (block == MAGIC_2)).astype(np.int64) + low
     header = np.where(source[start] == MAGIC_2, HEADER_2, HEADER_1)
-    whole = start + header + CHECKSUM <= len(source)
-    start, header = start[whole], header[whole]
-    second = header == HEADER_2
-    at = start[second]
+    has_whole_header = start + header + CHECKSUM <= len(source)
+    start, header = start[has_whole_header], header[has_whole_header]
+    is_version_2 = header == HEADER_2
+    at = start[is_version_2]
     number = source[start + 5].astype(np.int64)
-    number[second] = source[at + 7] | source[at + 8].astype(np.int64) << 8
-    known = _SEEDS[number] >= 0
-    known[second] &= (source[at + 9] == 0) & (source[at + 2] <= SIGNED)
+    number[is_version_2] = source[at + 7] | source[at + 8].astype(np.int64) << 8
+    is_known = _SEEDS[number] >= 0
+    is_known[is_version_2] &= (source[at + 9] == 0) & (source[at + 2] <= SIGNED)
     crc_end = start + source[start + 1] + header
     end = crc_end + CHECKSUM
-    end[second] += SIGNATURE * (source[at + 2] & SIGNED).astype(np.int64)
-    known &= end <= len(source)
-    return np.stack([start, end, number], axis=1)[known], crc_end[known]
+    end[is_version_2] += SIGNATURE * (source[at + 2] & SIGNED).astype(np.int64)
+    is_known &= end <= len(source)
+    return np.stack([start, end, number], axis=1)[is_known], crc_end[is_known]
 
 
-def _is_stamped(start: Integers, end: Integers) -> bool:
+def _has_receive_stamps(start: Integers, end: Integers) -> bool:
     """Whether a stamp stands before each frame: eight bytes between neighbours instead of none."""
-    apart = start[1:] - end[:-1]
-    stamped, bare = np.count_nonzero(apart == STAMP), np.count_nonzero(apart == 0)
-    return bool(stamped > bare) if stamped + bare else bool(start[0] == STAMP)
+    gap_bytes = start[1:] - end[:-1]
+    stamped_count, bare_count = (
+        np.count_nonzero(gap_bytes == STAMP_BYTES),
+        np.count_nonzero(gap_bytes == 0),
+    )
+    return (
+        bool(stamped_count > bare_count)
+        if stamped_count + bare_count
+        else bool(start[0] == STAMP_BYTES)
+    )
 
 
-def _between(content: bytes, start: Integers, end: Integers, stamp: int) -> tuple[int, int, bool]:
+def _count_other_bytes(
+    content: bytes, start: Integers, end: Integers, stamp: int
+) -> tuple[int, int, bool]:
     """What lies between the good frames, of which ``start`` is with the stamp.
 
     Returns
@@ -278,17 +289,17 @@ def _between(content: bytes, start: Integers, end: Integers, stamp: int) -> tupl
     bool
         Whether the last of them begin one.
     """
-    passed_over, bad, rest = 0, 0, b""
+    unknown_frame_count, bad, rest = 0, 0, b""
     lows, highs = np.append(0, end), np.append(start, len(content))
     for low, high in np.column_stack([lows, highs])[lows < highs].tolist():
         at = low
         for size in _unknown_frames(content, low, high, stamp):
-            passed_over += 1
+            unknown_frame_count += 1
             at += size
         bad += high - at
         rest = content[at:high] if high == len(content) else b""
-    begun = rest[stamp : stamp + 1] in (b"", bytes([MAGIC_1]), bytes([MAGIC_2]))
-    return passed_over, bad, 0 < len(rest) < stamp + LONGEST_FRAME and begun
+    begins_frame = rest[stamp : stamp + 1] in (b"", bytes([MAGIC_1]), bytes([MAGIC_2]))
+    return unknown_frame_count, bad, 0 < len(rest) < stamp + LONGEST_FRAME and begins_frame
 
 
 def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[int]:
@@ -307,11 +318,11 @@ def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[
 
 def _stamps(source: NDArray[np.uint8], start: Integers, end: Integers) -> tuple[Integers, int]:
     """Time of receipt (µs), and how many stamps were damaged."""
-    usable = start >= STAMP
-    usable[1:] &= start[1:] - end[:-1] >= STAMP
-    windows = np.lib.stride_tricks.sliding_window_view(source, STAMP)
+    usable = start >= STAMP_BYTES
+    usable[1:] &= start[1:] - end[:-1] >= STAMP_BYTES
+    windows = np.lib.stride_tricks.sliding_window_view(source, STAMP_BYTES)
     # the first frame may stand at the very beginning
-    stamp = np.ascontiguousarray(windows[np.maximum(start - STAMP, 0)]).view(">u8")[:, 0]
+    stamp = np.ascontiguousarray(windows[np.maximum(start - STAMP_BYTES, 0)]).view(">u8")[:, 0]
     received = stamp.astype(np.int64)  # beyond 1 << 63: negative
     usable &= (received >= 0) & (received < 1 << 62)
     middle = int(np.median(received[usable])) if np.any(usable) else 0

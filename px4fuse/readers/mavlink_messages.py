@@ -11,23 +11,31 @@ import msgspec
 
 from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
 from px4fuse.origin import Origin, find_origin
-from px4fuse.readers.layouts import Layout, one_by_one
-from px4fuse.record import lacking, table
+from px4fuse.readers.layouts import Layout, expand_layouts
+from px4fuse.record import missing_data, table
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
 GROUND_STATION = 6  # MAV_TYPE_GCS
 LANDED = 1  # MAV_LANDED_STATE_ON_GROUND
 AUTO_MODE = 4  # PX4_CUSTOM_MAIN_MODE_AUTO
-NO_MODES = lacking("modes_not_sent")
-ARDUPILOT_REPLAY = lacking("replay_of_ardupilot")
+NO_MODES = missing_data("modes_not_sent")
+ARDUPILOT_REPLAY = missing_data("replay_of_ardupilot")
 # Messages whose time_usec is the autopilot's boot clock; GPS_RAW_INT's, say, is the receiver's
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
 # What an autopilot sends of itself, and nobody else
 OWN_MESSAGES = (
-    "HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "RAW_IMU", "ATTITUDE_QUATERNION",
-    "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "SYS_STATUS", "ESTIMATOR_STATUS",
-)  # fmt: skip
+    "HIGHRES_IMU",
+    "SCALED_IMU",
+    "SCALED_IMU2",
+    "SCALED_IMU3",
+    "RAW_IMU",
+    "ATTITUDE_QUATERNION",
+    "LOCAL_POSITION_NED",
+    "GLOBAL_POSITION_INT",
+    "SYS_STATUS",
+    "ESTIMATOR_STATUS",
+)
 
 
 @dataclass(frozen=True)
@@ -75,7 +83,7 @@ class FrameOfReference:
 
 
 _ROWS = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
-LAYOUTS = one_by_one(_ROWS["layouts"])
+LAYOUTS = expand_layouts(_ROWS["layouts"])
 _INPUTS = msgspec.convert(_ROWS["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_ROWS["frames"], dict[int, FrameOfReference], strict=False)
 AUTOPILOTS, VEHICLE_TYPES, MAIN_MODES, AUTO_MODES = (
@@ -95,7 +103,7 @@ TRUTH = (LAYOUTS["truth"], LAYOUTS["sim_state"])
 GNSS_INPUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
 
 
-def remedies_of(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
+def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
     """What would have recorded each part, and why EKF2 is not replayed; PX4's but for ArduPilot."""
     if autopilot == "ArduPilot":
         return _ROWS["remedies"][autopilot], ARDUPILOT_REPLAY

@@ -9,18 +9,18 @@ import pandas as pd
 from msgspec import structs
 from scipy import constants
 
-from px4fuse.flight import Columns, PositionTrack, Truth, Unavailable, best_first
+from px4fuse.flight import Columns, PositionTrack, Truth, Unavailable, sort_by_preference
 from px4fuse.origin import GNSS, with_orientation
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
 from px4fuse.readers.layouts import GLOBAL_COLUMNS, Layout
-from px4fuse.readers.mavlink_clocks import Mapped
+from px4fuse.readers.mavlink_clocks import ClockMapping
 from px4fuse.readers.mavlink_frames import Address
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recording
 from px4fuse.readers.mavlink_senders import senders_of
-from px4fuse.readers.parts import attitude_of, orientation_of, with_nearest
-from px4fuse.readers.px4_positions import Place, projected, unproject
-from px4fuse.record import lacking
+from px4fuse.readers.parts import join_nearest, read_attitude, read_orientation
+from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
+from px4fuse.record import missing_data
 
 # A boot clock's stamp is no further from its receipt
 OWN_CLOCK_S = 5.0
@@ -29,13 +29,13 @@ SAME_STATE_S = 0.05
 
 
 def read_positions(
-    recording: Recording, mapped: dict[Address, Mapped], remedy: str, delay_s: float
+    recording: Recording, clocks: dict[Address, ClockMapping], remedy: str, delay_s: float
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Every external position that was sent to the autopilot, the best first.
 
     Parameters
     ----------
-    mapped : mapping from address to Mapped
+    clocks : mapping from address to Mapped
         Clock of every sender.
     remedy : str
         What would have recorded one that is missing.
@@ -50,21 +50,21 @@ def read_positions(
             for sender in senders
             for source in messages.POSITION_INPUTS
             if source.message == message
-            if (track := _read_track(recording, source, sender, mapped[sender], remedy, senders))
+            if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
         ]
-        lacking = f"no {message} to the autopilot in the recording"
-        found += tracks or [px4_positions.unavailable(message, lacking, remedy)]
+        reason = f"no {message} to the autopilot in the recording"
+        found += tracks or [px4_positions.unavailable(message, reason, remedy)]
     fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_INPUTS)
     found += [track for track in fixes if track]
     missing = tuple(part for part in found if isinstance(part, Unavailable))
-    return best_first(part for part in found if isinstance(part, PositionTrack)), missing
+    return sort_by_preference(part for part in found if isinstance(part, PositionTrack)), missing
 
 
 def _read_track(
     recording: Recording,
     source: messages.PositionInput,
     sender: Address,
-    clock: Mapped,
+    clock: ClockMapping,
     remedy: str,
     senders: list[Address],
 ) -> PositionTrack | Unavailable | None:
@@ -72,8 +72,8 @@ def _read_track(
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
-        own = table["estimator_type"] == source.estimator
-        rows, table = rows[own], table[own]
+        is_of_estimator = table["estimator_type"] == source.estimator
+        rows, table = rows[is_of_estimator], table[is_of_estimator]
     if not len(rows):
         return None
     name = source.name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
@@ -89,9 +89,13 @@ def _read_track(
         frame = "unknown" if reference is None else reference.name
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
-    orientation = orientation_of(samples)
-    told = clock.statement
-    mapped = "" if told.method == "boot clock" else f", mapped to boot time by {told.method}"
+    orientation = read_orientation(samples)
+    clock_statement = clock.statement
+    mapped_words = (
+        ""
+        if clock_statement.method == "boot clock"
+        else f", mapped to boot time by {clock_statement.method}"
+    )
     return px4_positions.make_track(
         name,
         samples,
@@ -99,10 +103,10 @@ def _read_track(
         remedy=remedy,
         description=source.description,
         frame=frame,
-        clock=told.clock + mapped,
+        clock=clock_statement.clock + mapped_words,
         topics=(source.message,),
         log=recording.frames.name,
-        clock_map=told,
+        clock_map=clock_statement,
         orientation=orientation,
     )
 
@@ -126,13 +130,13 @@ def _read_gnss(
     fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
         return None
-    samples = projected(fixes, local_origin(recording))
+    samples = project_to_ned(fixes, local_origin(recording))
     accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
-    automatic = bool(recording.read(messages.LAYOUTS["global_state"])["latitude_deg"].any())
+    is_automatic = bool(recording.read(messages.LAYOUTS["global_state"])["latitude_deg"].any())
     return px4_positions.make_track(
         layout.topic,
         samples.join(accuracy),
-        structs.replace(GNSS, automatic=automatic),
+        structs.replace(GNSS, is_automatic=is_automatic),
         description="GNSS position",
         frame="NED",
         clock=f"{BOOT_CLOCK}, less {1e3 * delay_s:g} ms",
@@ -148,21 +152,21 @@ def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
     return 288.15 / 0.0065 * (1.0 - (pressure_hpa / 1013.25) ** exponent)
 
 
-def local_origin(recording: Recording) -> Place | None:
+def local_origin(recording: Recording) -> GeodeticPosition | None:
     """The autopilot's origin on the globe (degrees, degrees, m), None where it does not tell.
 
     As it is sent, or else by its global and its local position.
     """
-    sent = recording.read(messages.LAYOUTS["origin"]).dropna()
-    if len(sent):
-        return tuple(sent[GLOBAL_COLUMNS].iloc[-1].tolist())
+    sent_origin = recording.read(messages.LAYOUTS["origin"]).dropna()
+    if len(sent_origin):
+        return tuple(sent_origin[GLOBAL_COLUMNS].iloc[-1].tolist())
     state = recording.read(messages.STATES[-1])[Columns.POSITION]
-    there = recording.read(messages.LAYOUTS["global_state"])
-    both = with_nearest(there, state, SAME_STATE_S).dropna()
-    both = both[both["latitude_deg"] != 0.0]
-    if both.empty:
+    global_state = recording.read(messages.LAYOUTS["global_state"])
+    joined = join_nearest(global_state, state, SAME_STATE_S).dropna()
+    joined = joined[joined["latitude_deg"] != 0.0]
+    if joined.empty:
         return None
-    geo, local = both[GLOBAL_COLUMNS].to_numpy(), both[Columns.POSITION].to_numpy()
+    geo, local = joined[GLOBAL_COLUMNS].to_numpy(), joined[Columns.POSITION].to_numpy()
     pairs = zip(geo, local, strict=True)
     places = [(*unproject(-n, -e, tuple(at[:2])), at[2] + d) for at, (n, e, d) in pairs]
     return tuple(np.median(places, axis=0).tolist())
@@ -189,12 +193,12 @@ def read_truth(
         if not samples[Columns.VELOCITY].to_numpy().any():
             # not sent: a vehicle that never moves has no use for truth
             samples[Columns.VELOCITY] = np.nan
-        recording.came_from("truth", layout.topic, clock=RECEIPT_CLOCK)
+        recording.record_stream("truth", layout.topic, clock=RECEIPT_CLOCK)
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
-        state = pd.concat([projected(samples, origin), samples[Columns.VELOCITY]], axis=1)
-        return Truth(layout.topic, state[Columns.STATE], attitude_of(samples))
-    captured = px4_positions.motion_capture(positions, "ATT_POS_MOCAP")
+        state = pd.concat([project_to_ned(samples, origin), samples[Columns.VELOCITY]], axis=1)
+        return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
+    mocap_truth = px4_positions.motion_capture(positions, "ATT_POS_MOCAP")
     for track in positions:
-        if captured and track.name == captured.name:
-            recording.came_from("truth", *track.topics, clock=track.clock)
-    return captured or lacking("truth_not_recorded", remedy=remedies["truth"])
+        if mocap_truth and track.name == mocap_truth.name:
+            recording.record_stream("truth", *track.topics, clock=track.clock)
+    return mocap_truth or missing_data("truth_not_recorded", remedy=remedies["truth"])

@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 from px4fuse.arrays import IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.readers import mavlink_messages as messages
-from px4fuse.readers.mavlink_clocks import OTHER_SPEED, Line, Mapped, map_clock, tells_time
+from px4fuse.readers.mavlink_clocks import (
+    MAX_SPEED_DIFFERENCE,
+    ClockMapping,
+    Line,
+    is_running_clock,
+    map_clock,
+)
 from px4fuse.readers.mavlink_frames import Address, Frames
 from px4fuse.readers.mavlink_recording import RESTART_S, Recording, unix_of_boot
 from px4fuse.recording import ClockMap, Sender
@@ -17,20 +23,20 @@ from px4fuse.recording import ClockMap, Sender
 # Senders beyond the busiest ones are not described, and their positions are not read
 MAX_SENDERS = 32
 # A sender that seems to lose more than this does not count its messages
-SEQUENCE_MEANS_NOTHING = 0.9
+MAX_LOST_SHARE = 0.9
 # A message that comes after so many later ones of its sender came over a slower link
-MOST_LATE = 16
+MAX_LATE_MESSAGES = 16
 # Stamps of one sender further apart than this are of two clocks
 OTHER_CLOCK_S = 1e5
 
 
-def _vehicles(frames: Frames) -> dict[Address, tuple[int, int]]:
+def _vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
     """Type and autopilot that each sender gave in its first heartbeat."""
     rows = frames.rows("HEARTBEAT")
     beats = frames.table("HEARTBEAT", rows)
-    given = zip(beats["type"].tolist(), beats["autopilot"].tolist(), strict=True)
-    said = [*zip(_addresses(frames, rows), given, strict=True)]
-    return dict(said[::-1])
+    types = zip(beats["type"].tolist(), beats["autopilot"].tolist(), strict=True)
+    types_by_sender = [*zip(_addresses(frames, rows), types, strict=True)]
+    return dict(types_by_sender[::-1])
 
 
 def _addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
@@ -38,13 +44,15 @@ def _addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
     return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
 
 
-def _counts(frames: Frames, rows: IntArray | slice = slice(None)) -> list[tuple[Address, int]]:
+def _count_frames(
+    frames: Frames, rows: IntArray | slice = slice(None)
+) -> list[tuple[Address, int]]:
     """Senders of frames and how many each sent, most first."""
     counts = Counter(_addresses(frames, rows))
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
 
-def _flies(kind: int, autopilot: int) -> bool:
+def _is_vehicle(kind: int, autopilot: int) -> bool:
     return autopilot != messages.NO_AUTOPILOT and kind != messages.GROUND_STATION
 
 
@@ -56,11 +64,11 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     SettingsError
         No autopilot has the system id that was asked for.
     """
-    counts = dict(_counts(frames))
-    vehicles = _vehicles(frames)
-    flying = [s for s in counts if s in vehicles and _flies(*vehicles[s])]
+    counts = dict(_count_frames(frames))
+    vehicles = _vehicle_types(frames)
+    flying = [s for s in counts if s in vehicles and _is_vehicle(*vehicles[s])]
     rows = np.concatenate([frames.rows(name) for name in messages.OWN_MESSAGES])
-    own = dict(_counts(frames, rows))
+    own = dict(_count_frames(frames, rows))
     # a companion may call itself an autopilot; one without a heartbeat is known by what it sends,
     # or else by its component
     candidates = [s for s in flying if s in own] or [s for s in own if s not in vehicles] or flying
@@ -80,54 +88,60 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 def senders_of(recording: Recording, message: str) -> list[Address]:
     """Senders of one message that may speak to this vehicle: not it, nor another vehicle's."""
     frames, own = recording.frames, recording.address
-    others = {s[0] for s, seen in _vehicles(frames).items() if _flies(*seen)} - {own[0]}
-    counts = _counts(frames, recording.of_anybody(message))
+    others = {
+        s[0] for s, vehicle_type in _vehicle_types(frames).items() if _is_vehicle(*vehicle_type)
+    } - {own[0]}
+    counts = _count_frames(frames, recording.rows_of_all_senders(message))
     return [s for s, _ in counts if s != own and s[0] not in others][:MAX_SENDERS]
 
 
-def map_senders(recording: Recording) -> dict[Address, Mapped]:
+def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
     """Clock of every sender of an external position."""
-    named = {source.message for source in messages.POSITION_INPUTS}
-    found = {s for message in named for s in senders_of(recording, message)}
+    message_names = {source.message for source in messages.POSITION_INPUTS}
+    senders = {s for message in message_names for s in senders_of(recording, message)}
     unix = unix_of_boot(recording)
-    return {sender: _map_sender(recording, sender, unix) for sender in sorted(found)}
+    return {sender: _map_sender(recording, sender, unix) for sender in sorted(senders)}
 
 
-def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Mapped:
+def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> ClockMapping:
     frames = recording.frames
     stamps, received = [], []
     for source in messages.POSITION_INPUTS:
         rows = recording.rows(source.message, sender)
         stamps.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
         received.append(recording.received_s[rows])
-    about = float(np.median(np.concatenate(stamps)))
-    clock_runs = tells_time(np.concatenate(stamps))
+    median_stamp_s = float(np.median(np.concatenate(stamps)))
+    clock_runs = is_running_clock(np.concatenate(stamps))
     rows = recording.rows("TIMESYNC", sender)
     sync = frames.table("TIMESYNC", rows)
-    replied, asked = sync["tc1"] * 1e-9, sync["ts1"] * 1e-9
+    replied_s, sync_asked_s = sync["tc1"] * 1e-9, sync["ts1"] * 1e-9
     # the reply to somebody else's question carries another clock
-    replies = (replied != 0.0) & (np.abs(asked - recording.receipt_boot_s(rows)) <= RESTART_S)
+    replies = (replied_s != 0.0) & (
+        np.abs(sync_asked_s - recording.receipt_boot_s(rows)) <= RESTART_S
+    )
     # a question is stamped as it is sent: hardly delayed
-    questions = clock_runs & (replied == 0.0) & (np.abs(asked - about) < OTHER_CLOCK_S)
-    stamps.append(asked[questions])
+    questions = (
+        clock_runs & (replied_s == 0.0) & (np.abs(sync_asked_s - median_stamp_s) < OTHER_CLOCK_S)
+    )
+    stamps.append(sync_asked_s[questions])
     received.append(recording.received_s[rows][questions])
     own = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
-    answered, question = own["tc1"] * 1e-9, own["ts1"] * 1e-9
-    answers = (answered != 0.0) & (np.abs(question - about) < OTHER_CLOCK_S)
-    answers &= ~np.isin(own["ts1"], _questions_of_others(recording, sender))
+    answered_s, question_s = own["tc1"] * 1e-9, own["ts1"] * 1e-9
+    answers = (answered_s != 0.0) & (np.abs(question_s - median_stamp_s) < OTHER_CLOCK_S)
+    answers &= ~np.isin(own["ts1"], _other_sync_questions(recording, sender))
     return map_clock(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(stamps),
         np.concatenate(received),
         recording.boot_of_receipt,
-        (asked[replies], replied[replies]),
-        (question[answers], answered[answers]),
+        (sync_asked_s[replies], replied_s[replies]),
+        (question_s[answers], answered_s[answers]),
         unix,
         has_receipt=frames.received_us is not None,
     )
 
 
-def _questions_of_others(recording: Recording, sender: Address) -> NDArray[np.int64]:
+def _other_sync_questions(recording: Recording, sender: Address) -> NDArray[np.int64]:
     """``ts1`` of the TIMESYNC questions of everybody but one sender."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
@@ -135,14 +149,16 @@ def _questions_of_others(recording: Recording, sender: Address) -> NDArray[np.in
     return np.asarray(sync["ts1"][sync["tc1"] == 0])
 
 
-def clock_maps(recording: Recording, mapped: dict[Address, Mapped]) -> tuple[ClockMap, ...]:
+def clock_maps(
+    recording: Recording, clock_mappings: dict[Address, ClockMapping]
+) -> tuple[ClockMap, ...]:
     """How the senders' clocks and the time of receipt were mapped to the boot clock."""
-    clocks = [sender.statement for sender in mapped.values()]
+    clocks = [sender.statement for sender in clock_mappings.values()]
     received_us, line = recording.frames.received_us, recording.boot_of_receipt
     if received_us is not None and line.pairs:
         name = "time of receipt (the recording computer's UNIX time)"
         note = "the recording did not run at the flight's own speed (a replay?)"
-        if abs(line.slope - 1.0) < OTHER_SPEED:
+        if abs(line.slope - 1.0) < MAX_SPEED_DIFFERENCE:
             note = "by the least delayed messages; used only to order messages and to map clocks"
         offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
         numbers = line.pairs, offset_s, (line.slope - 1.0) * 1e6, line.jitter
@@ -152,29 +168,29 @@ def clock_maps(recording: Recording, mapped: dict[Address, Mapped]) -> tuple[Clo
 
 def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Senders that the recording heard, most messages first."""
-    frames, vehicles = recording.frames, _vehicles(recording.frames)
-    described = []
-    for address, count in _counts(frames)[:MAX_SENDERS]:
-        word = "no heartbeat"
+    frames, vehicles = recording.frames, _vehicle_types(recording.frames)
+    sender_rows = []
+    for address, count in _count_frames(frames)[:MAX_SENDERS]:
+        description = "no heartbeat"
         if address in vehicles:
             kind, autopilot = vehicles[address]
-            word = messages.VEHICLE_TYPES.get(kind, f"type {kind}")
+            description = messages.VEHICLE_TYPES.get(kind, f"type {kind}")
             if autopilot != messages.NO_AUTOPILOT:
-                word = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {word}"
-        lost, chosen = _lost_share(frames, address), address == recording.address
-        described.append(Sender(*address, word, count, lost, chosen))
-    return tuple(described)
+                description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
+        lost, chosen = _lost_share_of(frames, address), address == recording.address
+        sender_rows.append(Sender(*address, description, count, lost, chosen))
+    return tuple(sender_rows)
 
 
-def _lost_share(frames: Frames, address: Address) -> float | None:
+def _lost_share_of(frames: Frames, address: Address) -> float | None:
     """Share of a sender's messages that its sequence numbers say are not here.
 
     A message that came again, or a little late, is not lost. None where the sender does not count
     its messages, or counts them apart on each of two links.
     """
     number = frames.sequence[frames.sent_by(address)].astype(np.int64)
-    step = np.mod(np.diff(number) + MOST_LATE, 256) - MOST_LATE
+    step = np.mod(np.diff(number) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
     place = np.append(0, np.cumsum(step))
     share = float(1.0 - len(np.unique(place)) / (np.ptp(place) + 1))
     counts = len(place) == 1 or bool(place.any())
-    return share if counts and share < SEQUENCE_MEANS_NOTHING else None
+    return share if counts and share < MAX_LOST_SHARE else None

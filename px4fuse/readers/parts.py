@@ -15,48 +15,54 @@ BEYOND_IMU = 1e4
 MIN_NORM = 0.5  # a zero quaternion is no attitude
 
 
-def missing_parts(*parts: object) -> tuple[Unavailable, ...]:
+def collect_unavailable(*flight_parts: object) -> tuple[Unavailable, ...]:
     """Those of some parts of a flight that its log lacks, with what it lacks of EKF2."""
-    for part in parts:
-        if isinstance(part, Ekf2):
-            parts += (part.variance, *part.innovations.values(), part.fusing)
-    return tuple(part for part in parts if isinstance(part, Unavailable))
+    for flight_part in flight_parts:
+        if isinstance(flight_part, Ekf2):
+            flight_parts += (
+                flight_part.variance,
+                *flight_part.innovations.values(),
+                flight_part.fusing,
+            )
+    return tuple(
+        flight_part for flight_part in flight_parts if isinstance(flight_part, Unavailable)
+    )
 
 
-def stretches(steps: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
+def constant_spans(steps: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
     """Stretches in which a step function of time keeps its value: start and end (s), value.
 
     None where it has no value.
     """
     changes = steps[steps.ne(steps.shift())]
     starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
-    every = zip(starts, [*starts[1:], end_s], changes, strict=False)
-    return [(start, end, value) for start, end, value in every if end > start]
+    spans = zip(starts, [*starts[1:], end_s], changes, strict=False)
+    return [(start, end, value) for start, end, value in spans if end > start]
 
 
-def stretches_of_flight(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
+def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
     """Stretches (s) in which a step function of time says "not landed" (0 or False)."""
-    return tuple((start, end) for start, end, on in stretches(landed, duration_s) if not on)
+    return tuple((start, end) for start, end, on in constant_spans(landed, duration_s) if not on)
 
 
 def ends_in_flight(
     airborne: tuple[tuple[float, float], ...] | Unavailable, duration_s: float
 ) -> bool:
     """Whether the last stretch of flight has no end but that of the data."""
-    flown = () if isinstance(airborne, Unavailable) else airborne[-1:]
-    return any(end >= duration_s for _, end in flown)
+    last_span = () if isinstance(airborne, Unavailable) else airborne[-1:]
+    return any(end >= duration_s for _, end in last_span)
 
 
-def cut_off(part: str, duration_s: float, in_flight: bool) -> str:
+def format_truncation(part: str, duration_s: float, in_flight: bool) -> str:
     """What is said of a file that ends in the middle of a part of it."""
     flying = ", in flight" if in_flight else ""
     end = f"the file ends in mid-{part} after {duration_s:.1f} s{flying}"
     return f"{end}: what came after is not in it"
 
 
-def stretches_of_modes(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
+def mode_spans(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
     """Stretches (s) of a step function of time whose values are names of flight modes."""
-    return tuple(FlightMode(*stretch) for stretch in stretches(names, end_s))
+    return tuple(FlightMode(*span) for span in constant_spans(names, end_s))
 
 
 def finite_rows(samples: pd.DataFrame, columns: list[str], limit: float = DAMAGED) -> pd.DataFrame:
@@ -68,12 +74,16 @@ def finite_rows(samples: pd.DataFrame, columns: list[str], limit: float = DAMAGE
     return samples[possible]
 
 
-def with_nearest(samples: pd.DataFrame, others: pd.DataFrame, within_s: float) -> pd.DataFrame:
+def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, within_s: float) -> pd.DataFrame:
     """Rows of a frame, each with the row of another that is nearest in time; NaN beyond."""
     return pd.merge_asof(
-        samples, others, left_index=True, right_index=True, direction="nearest",
+        samples,
+        others,
+        left_index=True,
+        right_index=True,
+        direction="nearest",
         tolerance=within_s,  # type: ignore[arg-type]
-    )  # fmt: skip
+    )
 
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
@@ -82,7 +92,7 @@ def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
     return samples[(norm > MIN_NORM) & (norm < DAMAGED)]
 
 
-def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
+def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
     """Orientations in a frame of samples; None where there are none, or all are the same.
 
     Parameters
@@ -99,7 +109,7 @@ def orientation_of(samples: pd.DataFrame) -> pd.DataFrame | None:
     return found.assign(**variances.where(variances > 0))
 
 
-def attitude_of(samples: pd.DataFrame | None) -> pd.DataFrame | None:
-    """Quaternions of :func:`orientation_of` alone."""
-    found = None if samples is None else orientation_of(samples)
+def read_attitude(samples: pd.DataFrame | None) -> pd.DataFrame | None:
+    """Quaternions of :func:`read_orientation` alone."""
+    found = None if samples is None else read_orientation(samples)
     return None if found is None else found[Columns.QUATERNION]

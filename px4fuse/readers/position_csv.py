@@ -21,10 +21,10 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.readers import position_names
-from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, Meaning, meaning
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote, text_of
-from px4fuse.readers.ulog_topics import increasing
-from px4fuse.reading import read_whole, shown
+from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, ColumnMeaning, read_column_name
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, decode_text, quote
+from px4fuse.readers.ulog_topics import longest_increasing_run
+from px4fuse.reading import display_name, read_bytes_limited
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
@@ -96,12 +96,12 @@ class _Table:
 
     def label(self, *columns: int | None) -> str:
         """Names of some columns for a person, each once."""
-        some = dict.fromkeys(
+        used_labels = dict.fromkeys(
             quote(self.names[at]) if self.names[at] else f"column {at + 1}"
             for at in columns
             if at is not None
         )
-        return ", ".join([*some][:12]) + (", ..." if len(some) > 12 else "")
+        return ", ".join([*used_labels][:12]) + (", ..." if len(used_labels) > 12 else "")
 
     def texts(self, columns: Iterable[int]) -> pd.DataFrame:
         """Texts of some columns, without rows that have none."""
@@ -158,34 +158,40 @@ def read_position_csv(
     """
     _check_options(columns, time_unit, length_unit)
     path = Path(path)
-    content = read_whole(path, LogError, MAX_FILE_BYTES, again="Copy it again")
-    table, notes = _find_table(shown(path), content, columns)
-    meanings = [meaning(name) for name in table.names]
-    told = _resolve(table, columns or ())
-    texts = table.texts([*told, *(at for at, m in enumerate(meanings) if m.kind)])
+    content = read_bytes_limited(path, LogError, MAX_FILE_BYTES, empty_remedy="Copy it again")
+    table, notes = _find_table(display_name(path), content, columns)
+    meanings = [read_column_name(name) for name in table.names]
+    chosen_columns = _column_indices(table, columns or ())
+    texts = table.texts([*chosen_columns, *(at for at, m in enumerate(meanings) if m.kind)])
     numbers = texts.apply(pd.to_numeric, errors="coerce").astype(np.float64)
-    time, position, sigma, frame, time_words = _choose(table, meanings, told, numbers)
+    time, position, sigma, frame, time_words = _choose_columns(
+        table, meanings, chosen_columns, numbers
+    )
     axes = [at for at in position if at is not None]
     # 1e999 reads as infinity
     is_usable = np.isfinite(numbers[time])
     is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
-    if missing := int(np.count_nonzero(~is_usable)):
-        notes.insert(0, f"{_count(missing)} dropped: without a usable time or position")
+    if unusable_count := int(np.count_nonzero(~is_usable)):
+        notes.insert(
+            0, f"{_count_words(unusable_count)} dropped: without a usable time or position"
+        )
     for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
             notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
     numbers = numbers[is_usable]
     ticks = numbers[time].to_numpy()
-    named = meanings[time].unit
-    unit, unit_words = _time_unit(ticks, named if named in TIME_UNITS else "", time_unit)
+    name_unit = meanings[time].unit
+    unit, unit_words = _time_unit(ticks, name_unit if name_unit in TIME_UNITS else "", time_unit)
     seconds = ticks / round(1.0 / TIME_UNITS[unit])
     usable = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
     # by rank: they may be before zero
     ranks = np.unique(seconds[usable], return_inverse=True)[1].astype(np.int64)
-    keep = usable[increasing(ranks + 1)]
+    keep = usable[longest_increasing_run(ranks + 1)]
     if dropped := len(seconds) - len(keep):
-        notes.append(f"{_count(dropped)} dropped: their time stamps repeat, go back or are absurd")
+        notes.append(
+            f"{_count_words(dropped)} dropped: their time stamps repeat, go back or are absurd"
+        )
     if len(keep) < MIN_ROWS:
         raise LogError(
             f"{table.file}: usable rows: {len(keep)}, at least {MIN_ROWS} are needed"
@@ -198,14 +204,16 @@ def read_position_csv(
         rate = f"one sample in {step:.3g} s (median)"
         notes.append(f"{rate} is not a rate of a UWB: check --position-time-unit")
     scales, length_words = _length_units(numbers, axes, meanings, length_unit)
-    chosen = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
-    lengths = {name: np.nan if at is None else numbers[at] * scales[at] for name, at in chosen}
+    column_of_name = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
+    lengths = {
+        name: np.nan if at is None else numbers[at] * scales[at] for name, at in column_of_name
+    }
     samples = pd.DataFrame(lengths, index=numbers.index)
     samples = samples.where(np.isfinite(samples))
-    wrong = samples[SIGMA_COLUMNS] <= 0.0
-    if rows := int(wrong.any(axis=1).sum()):
+    is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
+    if rows := int(is_not_positive.any(axis=1).sum()):
         notes.append(f"sigma is not above zero in {rows} rows and was left out there")
-        samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(wrong)
+        samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
     names = frame.upper() if frame else "x, y, z"
@@ -239,16 +247,16 @@ def _check_options(
     ):
         if value is not None and value not in units:
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
-    given = columns or ("1", "2", "3")
-    if "" in given or not 3 <= len({*given}) == len(given) <= 5:
-        raise SettingsError.of("columns_wrong", option=_COLUMNS, given=",".join(given))
+    titles = columns or ("1", "2", "3")
+    if "" in titles or not 3 <= len({*titles}) == len(titles) <= 5:
+        raise SettingsError.of("columns_wrong", option=_COLUMNS, titles=",".join(titles))
 
 
-def _count(rows: int) -> str:
+def _count_words(rows: int) -> str:
     return "1 row was" if rows == 1 else f"{rows} rows were"
 
 
-def _split(line: str, separator: str) -> list[str]:
+def _split_line(line: str, separator: str) -> list[str]:
     """Fields of one line."""
     if separator == " ":  # "x [mm]" is one name
         return re.sub(r" +(?=[\[(])", "", line.strip()).split()
@@ -259,32 +267,37 @@ def _find_table(
     file: str, content: bytes, columns: tuple[str, ...] | None
 ) -> tuple[_Table, list[str]]:
     """Find separator, header and first row, and say whether a last line was left out."""
-    text = text_of(content)
+    text = decode_text(content)
     if text is None:
         raise LogError.of("binary_table", file=file)
     notes = []
-    whole, _, last = text.replace('"', "").rpartition("\n")
-    text = f"{whole}\n"
+    whole_lines, _, last = text.replace('"', "").rpartition("\n")
+    text = f"{whole_lines}\n"
     if last.strip():
         notes.append("the last line was dropped: it may be cut, as it has no end")
     lines = text[: text.rfind("\n", 0, HEAD_CHARS) + 1].split("\n")[:HEAD_LINES]
-    wanted = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
+    wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     headers = (
         (at + 1, separator, names)
         for at, line in enumerate(lines)
         for separator in _SEPARATORS
-        for names in [_split(line.strip("#% "), separator)]
-        if len(names) <= MAX_COLUMNS and _is_header(names, wanted)
+        for names in [_split_line(line.strip("#% "), separator)]
+        if len(names) <= MAX_COLUMNS and _is_header(names, wanted_names)
     )
     line, separator, names = next(headers, (0, "", []))
     if not names:
-        told = ", ".join(map(quote, sorted(wanted))) or "time, x, y, z"
+        titles = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError.of(
-            "no_header", file=file, told=told, n=len(lines), first=quote(lines[0]), option=_COLUMNS
+            "no_header",
+            file=file,
+            titles=titles,
+            n=len(lines),
+            first=quote(lines[0]),
+            option=_COLUMNS,
         )
     body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", line)[line])
     head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
-    width = len(_split(head, separator))
+    width = len(_split_line(head, separator))
     if width > len(names):
         raise LogError.of("header_short", file=file, count=len(names), width=width)
     return _Table(file, separator, names, body, line), notes
@@ -294,12 +307,12 @@ def _is_header(fields: list[str], wanted: set[str]) -> bool:
     """Whether these are names of columns: those that were asked for, or of time and position."""
     if wanted:
         return wanted <= {name.casefold() for name in fields}
-    meanings = [meaning(name) for name in fields]
+    meanings = [read_column_name(name) for name in fields]
     has_time = any(column.kind == "time" for column in meanings)
     return has_time and position_names.find_position(meanings) is not None
 
 
-def _resolve(table: _Table, columns: tuple[str, ...]) -> list[int]:
+def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
     """Columns that the option names, by index."""
     names = [name.casefold() for name in table.names]
     numbers = [str(at + 1) for at in range(len(names))]
@@ -318,43 +331,52 @@ def _resolve(table: _Table, columns: tuple[str, ...]) -> list[int]:
     return found
 
 
-def _choose(
-    table: _Table, meanings: Sequence[Meaning], told: list[int], numbers: pd.DataFrame
+def _choose_columns(
+    table: _Table,
+    meanings: Sequence[ColumnMeaning],
+    chosen_columns: list[int],
+    numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
     """Columns of time, position and sigma, the frame, and the words on the time.
 
     They are those that the option tells, else by name. Of several times that of measurement goes
     before that of recording, if it is filled.
     """
-    if told:
-        time, words = told[0], table.label(told[0])
+    if chosen_columns:
+        time, words = chosen_columns[0], table.label(chosen_columns[0])
         # the names may tell the frame, and with it the order of the axes
-        own = [m if at in told[1:4] else Meaning() for at, m in enumerate(meanings)]
-        found = position_names.find_position(own)
-        position: _Columns = (*told[1:4], None)[:3]
+        chosen_meanings = [
+            m if at in chosen_columns[1:4] else ColumnMeaning() for at, m in enumerate(meanings)
+        ]
+        found = position_names.find_position(chosen_meanings)
+        position: _Columns = (*chosen_columns[1:4], None)[:3]
         frame, position = found if found and {*found[1]} == {*position} else (None, position)
     else:
         times = [at for at, column in enumerate(meanings) if column.kind == "time"]
         empty = numbers[times].fillna(0.0).eq(0.0).mean() >= 0.5
         rank = position_names.TIME_KINDS.index
-        time, *others = sorted(times, key=lambda at: (bool(empty[at]), rank(meanings[at].key)))
+        time, *other_times = sorted(times, key=lambda at: (bool(empty[at]), rank(meanings[at].key)))
         words = table.label(time)
-        if others:
-            words += f", the {meanings[time].key} (not used: {table.label(*others)})"
+        if other_times:
+            words += f", the {meanings[time].key} (not used: {table.label(*other_times)})"
         frame, position = position_names.find_position(meanings) or (None, ())
     if position[2] is not None and numbers[position[2]].isna().all():
         position = (*position[:2], None)
-    sigma = (told[4],) * 3 if len(told) > 4 else position_names.find_sigma(meanings, frame)
+    sigma = (
+        (chosen_columns[4],) * 3
+        if len(chosen_columns) > 4
+        else position_names.find_sigma(meanings, frame)
+    )
     return time, position, sigma, frame, words
 
 
-def _time_unit(ticks: Array, named: str, option: str | None) -> tuple[str, str]:
+def _time_unit(ticks: Array, name_unit: str, option: str | None) -> tuple[str, str]:
     """Unit of the time column, and the words on it."""
     if option is not None:
         return option, f"{option} as --position-time-unit says"
     middle = float(np.median(ticks)) if len(ticks) else 0.0
-    if named and abs(middle) * TIME_UNITS[named] < UNIX_END_S:
-        return named, f"{named} from its name"
+    if name_unit and abs(middle) * TIME_UNITS[name_unit] < UNIX_END_S:
+        return name_unit, f"{name_unit} from its name"
     steps = np.diff(ticks)
     steps = steps[steps > 0]
     step = float(np.median(steps)) if len(steps) else 0.0
@@ -374,24 +396,24 @@ def _time_unit(ticks: Array, named: str, option: str | None) -> tuple[str, str]:
 
 
 def _length_units(
-    numbers: pd.DataFrame, axes: list[int], meanings: Sequence[Meaning], option: str | None
+    numbers: pd.DataFrame, axes: list[int], meanings: Sequence[ColumnMeaning], option: str | None
 ) -> tuple[dict[int, float], str]:
     """Metres per unit of each column of numbers, and the words on those of position."""
-    named = {at: m.unit for at, m in enumerate(meanings) if m.unit in LENGTH_UNITS}
+    name_units = {at: m.unit for at, m in enumerate(meanings) if m.unit in LENGTH_UNITS}
     # outliers must not decide
     spreads = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
     spread = float(spreads.max())
     unit, reason = "m", "no unit in the names"
     if option is not None:
-        unit, named, reason = option, {}, "as --position-unit says"
-    elif some := [named[at] for at in axes if at in named]:
-        unit, reason = some[0], "from the names"
+        unit, name_units, reason = option, {}, "as --position-unit says"
+    elif used_labels := [name_units[at] for at in axes if at in name_units]:
+        unit, reason = used_labels[0], "from the names"
     elif MAX_SPREAD_M < spread <= MAX_SPREAD_M / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = f"as {spread:.0f} m is not an indoor flight; if cm, give --position-unit"
     elif spread > MAX_SPREAD_M:
         reason = "assumed, as no unit gives an indoor flight: else give --position-unit"
-    units = {at: named.get(at, unit) for at in map(int, numbers.columns)}
+    units = {at: name_units.get(at, unit) for at in map(int, numbers.columns)}
     scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
     span = max(float(spreads[at]) * scales[at] for at in axes)
     used = ", ".join(dict.fromkeys(units[at] for at in axes))

@@ -15,14 +15,18 @@ Position = tuple[int, int, int | None]
 
 _WORDS = table(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
-    {word: meaning for meaning, words in _WORDS[group].items() for word in words.split()}
+    {
+        word: read_column_name
+        for read_column_name, words in _WORDS[group].items()
+        for word in words.split()
+    }
     for group in ("units", "axes")
 )
 _ROLES = {role: {*words.split()} for role, words in _WORDS["roles"].items()}
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
 # Whose time it is, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
-_GLUED = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
+_GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
 # Frame, and the names of its axes in order; the first whose horizontal names are there is taken
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
@@ -34,7 +38,7 @@ _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
 
 
 @dataclass(frozen=True)
-class Meaning:
+class ColumnMeaning:
     """What one column's name says; all "" where it says nothing."""
 
     kind: str = ""  # "time", "position", "sigma" or "tag"
@@ -43,33 +47,45 @@ class Meaning:
     group: str = ""  # what else a position's name holds, which its x, y and z share
 
 
-def meaning(name: str) -> Meaning:
+def read_column_name(name: str) -> ColumnMeaning:
     """Read a column's name."""
-    plain = unicodedata.normalize("NFKC", name).replace("μ", "u")
-    plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain).lower()
-    words = re.findall(r"[^\W_]+", plain)
+    plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
+    plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
+    words = re.findall(r"[^\W_]+", plain_name)
     unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
     words = words[:-1] if unit else words
-    told = {*words}
-    if told & _ROLES["time"] and told <= _TIME_ROLES and unit not in LENGTH_UNITS:
-        kinds = [bool(told & _ROLES["measured"]), not told & _ROLES["recorded"], True]
-        return Meaning("time", TIME_KINDS[kinds.index(True)], unit)
-    if told and told <= _ROLES["tag"]:
-        return Meaning("tag")
-    parts: list[str] = []
+    word_set = {*words}
+    if word_set & _ROLES["time"] and word_set <= _TIME_ROLES and unit not in LENGTH_UNITS:
+        kinds = [bool(word_set & _ROLES["measured"]), not word_set & _ROLES["recorded"], True]
+        return ColumnMeaning("time", TIME_KINDS[kinds.index(True)], unit)
+    if word_set and word_set <= _ROLES["tag"]:
+        return ColumnMeaning("tag")
+    name_parts: list[str] = []
     for word in words:
-        glued = None if word in _ROLES["sigma"] | _ROLES["context"] else _GLUED.fullmatch(word)
-        parts += [part for part in glued.groups() if part] if glued else [word]
-    axes = [_AXES[part] for part in parts if part in _AXES]
-    rest = [part for part in parts if part not in _AXES]
-    if unit in TIME_UNITS or len(axes) > 1 or not {*rest} <= _ROLES["sigma"] | _ROLES["context"]:
-        return Meaning()
-    if {*rest} & _ROLES["sigma"]:
-        return Meaning("sigma", "".join(axes), unit)
-    return Meaning("position", axes[0], unit, ".".join(rest)) if axes else Meaning()
+        glued_match = (
+            None if word in _ROLES["sigma"] | _ROLES["context"] else _GLUED_NAMES.fullmatch(word)
+        )
+        name_parts += (
+            [name_part for name_part in glued_match.groups() if name_part]
+            if glued_match
+            else [word]
+        )
+    axes = [_AXES[name_part] for name_part in name_parts if name_part in _AXES]
+    other_parts = [name_part for name_part in name_parts if name_part not in _AXES]
+    if (
+        unit in TIME_UNITS
+        or len(axes) > 1
+        or not {*other_parts} <= _ROLES["sigma"] | _ROLES["context"]
+    ):
+        return ColumnMeaning()
+    if {*other_parts} & _ROLES["sigma"]:
+        return ColumnMeaning("sigma", "".join(axes), unit)
+    return (
+        ColumnMeaning("position", axes[0], unit, ".".join(other_parts)) if axes else ColumnMeaning()
+    )
 
 
-def find_position(meanings: Sequence[Meaning]) -> tuple[str | None, Position] | None:
+def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Position] | None:
     """Frame and columns of the first track that has two horizontal axes, best all three."""
     groups: dict[str, dict[str, int]] = {}
     for index, column in enumerate(meanings):
@@ -83,7 +99,7 @@ def find_position(meanings: Sequence[Meaning]) -> tuple[str | None, Position] | 
     return None
 
 
-def find_sigma(meanings: Sequence[Meaning], frame: str | None) -> tuple[int | None, ...]:
+def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
     """Columns of sigma of the frame's axes; one without an axis is for all of them."""
     # of several with one meaning the first is kept, as of positions
     sigmas = {m.key: at for at, m in [*enumerate(meanings)][::-1] if m.kind == "sigma"}

@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, Aid
-from px4fuse.flight import AidLog, at_times
+from px4fuse.flight import AidLog, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout
-from px4fuse.readers.parts import with_nearest
+from px4fuse.readers.parts import join_nearest
 from px4fuse.readers.ulog_topics import Topics
 
 # innovations and variances are logged by separate rate limiters, up to one interval of the default
@@ -24,106 +24,113 @@ from px4fuse.readers.ulog_topics import Topics
 JOIN_TOLERANCE_S = 0.6
 
 
-def read_aids(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> dict[str, AidLog]:
+def read_aids(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> dict[str, AidLog]:
     """Every aid of which the log has innovations, by PX4's name.
 
-    ``meant`` is what :func:`intentions` says.
+    ``enabled`` is what :func:`read_enabled_aids` says.
 
     Of several topics the aid's own is taken: it has each attempt to fuse, with its time, and what
     came of it. The others repeat a value until the next one, which counts once.
     """
     found = {}
     for name, aid in AIDS.items():
-        told = meant.get(name)
-        log = _own_topic(topics, aid, told)
+        aid_enabled = enabled.get(name)
+        log = _read_own_topic(topics, aid, aid_enabled)
         # an aid that was never meant to be fused stands at its last value, or is another's
-        if log is None and (name.startswith("ev_") if told is None else told.any()):
-            log = _snapshots(topics, aid, told)
+        if log is None and (name.startswith("ev_") if aid_enabled is None else aid_enabled.any()):
+            log = _read_last_values(topics, aid, aid_enabled)
         if log is not None:
-            found[name] = replace(log, parameters=aid.in_log(topics.ekf2_parameters))
+            found[name] = replace(log, parameters=aid.logged_parameters(topics.ekf2_parameters))
     return found
 
 
-def intentions(topics: Topics) -> dict[str, pd.Series[float]]:
+def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """By aid, a step function: 1 while EKF2 means to fuse it, 0 while it does not.
 
     By its flags, or else by the bits of the older topic.
     """
-    meant, tables = {}, topics.of(px4.STATUS_FLAGS)
+    enabled, tables = {}, topics.of(px4.STATUS_FLAGS)
     every = (*AIDS.values(), *DISTURBANCES.values())
     named = {flag for aid in every for group in aid.flags for flag in group}
     known = sorted(named.intersection(*tables)) if tables else []
     if known:
-        flags = topics.of_primary(Layout(px4.STATUS_FLAGS, dict(zip(known, known, strict=True))),
-                                  step=True)  # fmt: skip
-        for aid in every:
+        flags = topics.primary_samples(
+            Layout(px4.STATUS_FLAGS, dict(zip(known, known, strict=True))), step=True
+        )
+        for aid in every if len(flags) else ():
             group = next((group for group in aid.flags if {*group} <= {*known}), None)
             if group is not None:
-                meant[aid.name] = flags[list(group)].max(axis=1)
+                enabled[aid.name] = flags[list(group)].max(axis=1)
     if not known and topics.find(px4.LAYOUTS["control_bits"]) is not None:
-        bits = topics.of_primary(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
-        for aid in every:
+        bits = topics.primary_samples(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
+        for aid in every if len(bits) else ():
             if aid.bit is not None:
                 on = bits.to_numpy().astype(np.int64) >> aid.bit & 1
-                meant[aid.name] = pd.Series(on.astype(float), index=bits.index)
-    return meant
+                enabled[aid.name] = pd.Series(on.astype(float), index=bits.index)
+    return enabled
 
 
-def _own_topic(topics: Topics, aid: Aid, meant: pd.Series[float] | None) -> AidLog | None:
+def _read_own_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
     """An aid by its ``estimator_aid_src`` topic."""
     count = len(aid.axes)
     at = [""] if count == 1 else [f"[{number}]" for number in range(count)]
     columns = {
-        f"{ours}_{axis}": theirs + element
+        f"{column_prefix}_{axis}": field_name + element
         for axis, element in zip(aid.axes, at, strict=True)
-        for ours, theirs in (
+        for column_prefix, field_name in (
             *((("observation", "observation"),) if aid.name in px4.WITH_OBSERVATION else ()),
-            ("innovation", "innovation"), ("variance", "innovation_variance"),
-            ("noise", "observation_variance"), ("ratio", "test_ratio"),
+            ("innovation", "innovation"),
+            ("variance", "innovation_variance"),
+            ("noise", "observation_variance"),
+            ("ratio", "test_ratio"),
         )
-    }  # fmt: skip
+    }
     columns |= {"fused": "fused", "rejected": "innovation_rejected"}
     layout = Layout(f"estimator_aid_src_{aid.name}", columns)
     if topics.find(layout) is None:  # most aids of most logs: an empty table takes its time
         return None
-    frame = topics.of_primary(layout).dropna()
-    if meant is not None and aid.name in px4.FLAG_ALWAYS_SET:
-        frame["fused"] = at_times(meant, frame.index)
-    return _log((layout.topic,), aid, frame, meant)
+    frame = topics.primary_samples(layout).dropna()
+    if enabled is not None and aid.name in px4.FLAG_ALWAYS_SET:
+        frame["fused"] = step_values_at(enabled, frame.index)
+    return _aid_log((layout.topic,), aid, frame, enabled)
 
 
-def _snapshots(topics: Topics, aid: Aid, meant: pd.Series[float] | None) -> AidLog | None:
+def _read_last_values(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
     """An aid by the topics that hold the last value of every aid."""
     gauss = aid.name == "mag_heading" and any(
         "cs_mag" in one for one in topics.of(px4.STATUS_FLAGS)
     )
-    layouts = [] if gauss or not aid.fields else [
-        tuple(
-            Layout(topic, _columns(what, aid, aid.fields))
-            for topic, what in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
-        )
-    ]  # fmt: skip
+    layouts = (
+        []
+        if gauss or not aid.fields
+        else [
+            tuple(
+                Layout(topic, _columns(what, aid, aid.fields))
+                for topic, what in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
+            )
+        ]
+    )
     if aid.before:
         both = _columns("innovation", aid, aid.before)
         squares = (field.replace("innov", "innov_var") for field in aid.before)
         both |= _columns("variance", aid, squares)
         layouts.append((Layout(px4.OLD_INNOVATIONS, both),) * 2)
     for values, variances in layouts:
-        frame = topics.of_primary(values, select=_fresh)
+        frame = topics.primary_samples(values, select=_drop_repeats)
         if variances is not values:
             # each topic is thinned by itself; S changes slowly
-            known = topics.of_primary(variances).dropna()
-            frame = with_nearest(frame, known, JOIN_TOLERANCE_S)
-        left_out = len(frame) - len(frame := frame.dropna())
-        if meant is not None:
-            frame = frame[at_times(meant, frame.index) > 0.0]
+            known = topics.primary_samples(variances).dropna()
+            frame = join_nearest(frame, known, JOIN_TOLERANCE_S)
+        excluded_count = len(frame) - len(frame := frame.dropna())
+        if enabled is not None:
+            frame = frame[step_values_at(enabled, frame.index) > 0.0]
         used = tuple(dict.fromkeys((values.topic, variances.topic)))
-        if (log := _log(used, aid, frame, meant, left_out)) is not None:
+        if (log := _aid_log(used, aid, frame, enabled, excluded_count)) is not None:
             return log
     return None
 
 
-def _fresh(frame: pd.DataFrame) -> pd.DataFrame:
+def _drop_repeats(frame: pd.DataFrame) -> pd.DataFrame:
     """Without repeats and without zeros, the value before any fusion."""
     known = frame.dropna()
     first = known.iloc[:, 0]
@@ -134,15 +141,17 @@ def _columns(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, str]:
     return {f"{name}_{axis}": field for axis, field in zip(aid.axes, fields, strict=True)}
 
 
-def _log(
+def _aid_log(
     topics: tuple[str, ...],
     aid: Aid,
     frame: pd.DataFrame,
-    meant: pd.Series[float] | None,
-    left_out: int = 0,
+    enabled: pd.Series[float] | None,
+    excluded_count: int = 0,
 ) -> AidLog | None:
     """The record of what has a variance, with the sign that everyone else gives an innovation."""
     frame = frame[(frame[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
-    turned = {one: -frame[one] for one in _columns("innovation", aid, aid.axes)}
-    made = AidLog(topics, aid.axes, frame.assign(**turned), meant, left_out=left_out)
-    return made if len(frame) else None
+    negated = {one: -frame[one] for one in _columns("innovation", aid, aid.axes)}
+    aid_log = AidLog(
+        topics, aid.axes, frame.assign(**negated), enabled, excluded_count=excluded_count
+    )
+    return aid_log if len(frame) else None

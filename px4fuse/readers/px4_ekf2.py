@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike
 from px4fuse import flight
 from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, settings_in_force
-from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, at_times
+from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, step_values_at
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import Layout, columns_of
-from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, intentions, read_aids
+from px4fuse.readers.layouts import Layout, expand_columns
+from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids, read_enabled_aids
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 
 VISION = "vehicle_visual_odometry"
 STATES = 22  # attitude, velocity, position, biases, magnetic fields; the rest is wind and terrain
@@ -34,7 +34,7 @@ HALF = 0.05
 MAX_FLOW_S = 0.5
 # Horizontal aiding besides vision position
 OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
-VARIANCES_NOT_LOGGED = lacking("variances_not_logged")
+VARIANCES_NOT_LOGGED = missing_data("variances_not_logged")
 _RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
     ("position", "z_reset_counter", ("", "", "delta_down_m")),
@@ -49,21 +49,21 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     if parameters.get("EKF2_EN") == 0.0:
         return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
     if (group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
-        return lacking("other_estimator", group=group)
+        return missing_data("other_estimator", group=group)
     local = topics.read(px4.LOCAL_POSITION)
     if topics.find(px4.LOCAL_POSITION) is None:
         return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
     state = local[Columns.STATE].dropna()
     if state.empty:
-        return lacking("state_not_finite")
-    topics.came_from("ekf2_state", px4.LOCAL_POSITION.topic)
-    meant = intentions(topics)
-    fusing = _fusing(topics, meant)
+        return missing_data("state_not_finite")
+    topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
+    enabled = read_enabled_aids(topics)
+    fusing = _read_fusing(topics, enabled)
     gate = settings_in_force(parameters)[EV_POS.gate]
-    aids = read_aids(topics, meant)
+    aids = read_aids(topics, enabled)
     innovations, innovation_topics = innovations_of(aids, fusing, gate)
     if innovation_topics:
-        topics.came_from("ekf2_innovations", *innovation_topics)
+        topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
         f"{topic} has no time of measurement in this release: EKF2's innovations carry the time of "
         "their publication, up to 0.2 s later"
@@ -71,16 +71,16 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         if not any("timestamp_sample" in table for table in topics.of(topic))
     ]
     notes += [
-        f"{log.left_out} samples of {log.topics[0]} ({', '.join(log.axes)}) have no "
+        f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) have no "
         f"{log.topics[-1]} within {JOIN_TOLERANCE_S:g} s and were left out"
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
-        if log.left_out
+        if log.excluded_count
     ]
     step_s = _step_s(topics)
-    delayed = _read_delayed(topics, step_s)
+    delayed = _read_delayed_state(topics, step_s)
     variance = _variance(delayed)
     if not isinstance(variance, Unavailable):
-        topics.came_from("ekf2_variance", _state_vector(topics)[0])
+        topics.record_stream("ekf2_variance", _state_vector(topics)[0])
     return Ekf2(
         state=state,
         variance=variance,
@@ -94,7 +94,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         accelerometer_bias=_accelerometer_bias(topics, delayed),
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
-        record=_read_record(topics, delayed, local, meant, step_s),
+        record=_read_record(topics, delayed, local, enabled, step_s),
         aids=aids,
     )
 
@@ -113,7 +113,7 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
     return "", 0
 
 
-def _read_delayed(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
+def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
     """EKF2's state and variances at its fusion horizon, in one layout and unit for all releases.
 
     ``step_s`` is the time between two predictions, for releases that keep biases per prediction.
@@ -122,10 +122,12 @@ def _read_delayed(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
     if not topic:
         return VARIANCES_NOT_LOGGED
     if not attitude:
-        return lacking("states_unknown", topic=topic)
+        return missing_data("states_unknown", topic=topic)
     states = [f"states[{i}]" for i in range(STATES)]
     variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
-    raw = topics.of_primary(Layout(topic, {name: name for name in states + variances})).dropna()
+    raw = topics.primary_samples(
+        Layout(topic, {name: name for name in states + variances})
+    ).dropna()
     state, variance = raw[states].to_numpy(copy=True), raw[variances].to_numpy(copy=True)
     if attitude == px4.QUATERNION_FILTER:
         state[:, 10:16] /= step_s
@@ -139,9 +141,9 @@ def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable
     """Variances of position and velocity."""
     if isinstance(delayed, Unavailable):
         return delayed
-    found = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
-    found = found[(found > 0.0).all(axis=1)]
-    return found if len(found) else VARIANCES_NOT_LOGGED
+    variance = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
+    variance = variance[(variance > 0.0).all(axis=1)]
+    return variance if len(variance) else VARIANCES_NOT_LOGGED
 
 
 def target_step_s(topics: Topics) -> float:
@@ -160,11 +162,11 @@ def _step_s(topics: Topics) -> float:
     if interval >= target:
         return target
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    known = topics.of_primary(layout).index
-    return samples_per_step(target, interval, same_stamps(time, known)) * interval
+    known = topics.primary_samples(layout).index
+    return samples_per_step(target, interval, rows_of_stamps(time, known)) * interval
 
 
-def same_stamps(times_s: Array, known_s: ArrayLike) -> IntArray:
+def rows_of_stamps(times_s: Array, known_s: ArrayLike) -> IntArray:
     """Rows of the times that are among the known ones, to a microsecond."""
     wanted = np.rint(np.asarray(known_s, dtype=float) * 1e6)
     return np.flatnonzero(np.isin(np.rint(times_s * 1e6), wanted))
@@ -195,8 +197,8 @@ def _accelerometer_bias(
     topics: Topics, delayed: pd.DataFrame | Unavailable
 ) -> pd.DataFrame | Unavailable:
     """Accelerometer bias from its own topic, or else from the state vector."""
-    if len(own := topics.of_primary(px4.LAYOUTS["sensor_bias"]).dropna()):
-        return own
+    if len(bias_topic := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
+        return bias_topic
     if isinstance(delayed, Unavailable) or delayed.empty:
         return flight.BIAS_NOT_LOGGED
     return delayed[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
@@ -208,13 +210,13 @@ def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
     Releases before v1.13 stamp it with the newest IMU sample instead, so that what is left is less
     than a prediction step.
     """
-    age = _age_s(topics, _state_vector(topics)[0])
-    if len(age) and (lag := float(age.median())) > step_s:
+    age_s = _publication_age_s(topics, _state_vector(topics)[0])
+    if len(age_s) and (lag := float(age_s.median())) > step_s:
         return lag
     return flight.HORIZON_NOT_LOGGED
 
 
-def _age_s(topics: Topics, topic: str) -> pd.Series:
+def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     """How long after its measurement each message of a topic was published, by that stamp (s)."""
     for table in topics.of(topic)[:1]:
         if "timestamp_sample" in table:
@@ -225,16 +227,18 @@ def _age_s(topics: Topics, topic: str) -> pd.Series:
     return pd.Series(dtype=np.float64)
 
 
-def _fusing(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFrame | Unavailable:
+def _read_fusing(
+    topics: Topics, enabled: Mapping[str, pd.Series[float]]
+) -> pd.DataFrame | Unavailable:
     """What EKF2 means to fuse of external vision."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
-    if not {*vision.values()} <= meant.keys():
-        return lacking("fusion_not_logged")
-    frame = pd.DataFrame({group: meant[aid] for group, aid in vision.items()}).dropna()
+    if not {*vision.values()} <= enabled.keys():
+        return missing_data("fusion_not_logged")
+    frame = pd.DataFrame({group: enabled[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
     if frame.empty:
         return Unavailable("EKF2 fusion flags", f"{topic} holds no usable sample", "Record again.")
-    topics.came_from("ekf2_fusing", topic)
+    topics.record_stream("ekf2_fusing", topic)
     return frame
 
 
@@ -257,7 +261,7 @@ def _read_record(
     topics: Topics,
     delayed: pd.DataFrame | Unavailable,
     local: pd.DataFrame,
-    meant: Mapping[str, pd.Series[float]],
+    enabled: Mapping[str, pd.Series[float]],
     step_s: float,
 ) -> FusionRecord | Unavailable:
     """What the log tells of the inside of EKF2's filter; ``local`` is the published position."""
@@ -265,43 +269,43 @@ def _read_record(
     if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed, Unavailable):
         return flight.RECORD_NOT_LOGGED
     norm = np.linalg.norm(delayed[Columns.QUATERNION], axis=1)
-    inside = delayed[np.abs(norm - 1.0) < 0.01].copy()
-    if inside.empty:
+    usable_state = delayed[np.abs(norm - 1.0) < 0.01].copy()
+    if usable_state.empty:
         return flight.RECORD_NOT_LOGGED
     horizontal, altitude_m = Columns.POSITION[:2], 0.0
-    if not inside[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
-        inside[horizontal] = np.nan
+    if not usable_state[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
+        usable_state[horizontal] = np.nan
         # and its height, where there is an origin, as altitude above the sea (ekf_helper.cpp)
         altitude_m = _last(local, "ref_alt", 0.0)
-        inside["down_m"] += altitude_m
-    age = _age_s(topics, VISION).sort_index()
+        usable_state["down_m"] += altitude_m
+    age_s = _publication_age_s(topics, VISION).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,
-        delayed=inside,
+        delayed=usable_state,
         per_step_biases=attitude == px4.QUATERNION_FILTER,
         other_aiding=tuple(
             AIDS[name].label.replace("external vision,", "vision")
             for name in OTHER_AIDING
-            if name in meant and meant[name].any()
+            if name in enabled and enabled[name].any()
         ),
-        vision_age_s=age[~age.index.duplicated()],
+        vision_age_s=age_s[~age_s.index.duplicated()],
         field_gauss=_read_field(topics, step_s),
-        flow=_read_flow(topics, meant),
+        flow=_read_flow(topics, enabled),
         latitude_deg=_last(local, "ref_lat", np.nan),
         altitude_m=altitude_m,
-        states={one: meant[one] for one in DISTURBANCES if one in meant},
+        states={one: enabled[one] for one in DISTURBANCES if one in enabled},
         height_bias={
-            name: topics.of_primary(layout).dropna()
+            name: topics.primary_samples(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS.items()
             if topics.find(layout) is not None
         },
     )
 
 
-def _last(frame: pd.DataFrame, column: str, otherwise: float) -> float:
+def _last(frame: pd.DataFrame, column: str, default: float) -> float:
     """The last finite value of a column, where there is one."""
     known = frame[column].dropna().to_numpy() if column in frame else np.zeros(0)
-    return float(known[-1]) if len(known) else otherwise
+    return float(known[-1]) if len(known) else default
 
 
 def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
@@ -309,29 +313,31 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
     The one with all samples, else the one that tells of those between its rows, else with more.
     """
-    found = []
+    fields_found = []
     for topic, name in px4.MAGNETOMETER:
-        measured = columns_of({"forward_gauss right_gauss down_gauss": f"{name}[]"})
-        own = columns_of({"FIELD_INNOVATION": "innovation_filtered[]"})
-        frame = topics.of_primary(Layout(topic, measured, own)).dropna()
+        measured = expand_columns({"forward_gauss right_gauss down_gauss": f"{name}[]"})
+        bias_topic = expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"})
+        frame = topics.primary_samples(Layout(topic, measured, bias_topic)).dropna()
         if name == "observation":  # by the time that EKF2 takes it to be of
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
             frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
-        found.append(frame)
-    all_of_it = [one for one in found if len(one) > ALL_FIELD_HZ * topics.log.duration_s]
-    means = [one for one in found if Columns.FIELD_INNOVATION[0] in one]
-    used = max(all_of_it or means or found, key=len)
+        fields_found.append(frame)
+    complete_fields = [
+        one for one in fields_found if len(one) > ALL_FIELD_HZ * topics.log.duration_s
+    ]
+    filtered_fields = [one for one in fields_found if Columns.FIELD_INNOVATION[0] in one]
+    field_used = max(complete_fields or filtered_fields or fields_found, key=len)
     bits = topics.read(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
-    if used.empty or bits.empty:
+    if field_used.empty or bits.empty:
         return pd.DataFrame()
-    flags = at_times(bits, used.index).astype(np.int64)
-    return used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
+    flags = step_values_at(bits, field_used.index).astype(np.int64)
+    return field_used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
-def _read_flow(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
+def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
     """What optical flow measured: of the samples between two rows the mean, by the low pass."""
     speed, interval, noise = (
-        topics.of_primary(px4.LAYOUTS[f"flow_{part}"]).dropna()
+        topics.primary_samples(px4.LAYOUTS[f"flow_{part}"]).dropna()
         for part in ("velocity", "interval", "noise")
     )
     interval_s = float(interval["interval_us"].median()) * 1e-6
@@ -340,21 +346,29 @@ def _read_flow(topics: Topics, meant: Mapping[str, pd.Series[float]]) -> pd.Data
     times = speed.index.to_numpy()
     # of more samples the low pass has forgotten too many
     row = np.flatnonzero((np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_S)) + 1
-    if FLOW.name in meant:
-        row = row[at_times(meant[FLOW.name], times[row]) > 0.0]
+    if FLOW.name in enabled:
+        row = row[step_values_at(enabled[FLOW.name], times[row]) > 0.0]
     samples = np.rint((times[row] - times[row - 1]) / interval_s)
-    kept = ((1.0 - flight.FLOW_SHARE) ** samples)[:, None]
+    filter_memory = ((1.0 - flight.FLOW_SHARE) ** samples)[:, None]
     low_passed = speed[["forward_m_s", "right_m_s"]].to_numpy()
-    forward, right = ((low_passed[row] - kept * low_passed[row - 1]) / (1.0 - kept)).T
+    forward, right = (
+        (low_passed[row] - filter_memory * low_passed[row - 1]) / (1.0 - filter_memory)
+    ).T
     now = speed.iloc[row]
     range2 = (now["newest_forward_m_s"] ** 2 + now["newest_right_m_s"] ** 2) / (
         now["x_rad_s"] ** 2 + now["y_rad_s"] ** 2
     )
-    found = pd.DataFrame({
-        "forward_m_s": forward, "right_m_s": right, "samples": samples, "interval_s": interval_s,
-        "noise_m2_s2": range2 * np.interp(times[row], noise.index, noise["noise"]),
-    }, index=now.index)  # fmt: skip
-    return found.replace(np.inf, np.nan).dropna()
+    flow = pd.DataFrame(
+        {
+            "forward_m_s": forward,
+            "right_m_s": right,
+            "samples": samples,
+            "interval_s": interval_s,
+            "noise_m2_s2": range2 * np.interp(times[row], noise.index, noise["noise"]),
+        },
+        index=now.index,
+    )
+    return flow.replace(np.inf, np.nan).dropna()
 
 
 def _attitude_variance(quaternion: Array, variance: Array) -> Array:

@@ -6,7 +6,7 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.flight import Columns, Ekf2, Unavailable
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.px4_innovations import with_gnss
+from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
 # Fixes are 0.05 s apart and more
@@ -19,12 +19,14 @@ PERIODS_S = np.arange(0.05, 0.26, 0.0005)
 ON_GRID_S = 0.006
 MIN_KNOWN = 10
 # Intervals of one and of the next multiple, before the receiver's own is known
-MIN_ALIKE = 3
+MIN_REPEATED_INTERVALS = 3
 # RMS of what is rebuilt, by fixes that are logged too
 EXACT_M = 0.1
 
 
-def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) -> pd.DataFrame:
+def read_unlogged_fixes(
+    topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable
+) -> pd.DataFrame:
     """Fixes that EKF2 took and the log lacks, from the rows of its innovations (from v1.16).
 
     The logger keeps every fix only where it comes slower than its limit of 10 a second.
@@ -32,27 +34,32 @@ def left_out_fixes(topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable) 
     layouts = px4.LAYOUTS["fused_position"], px4.LAYOUTS["fused_velocity"]
     if isinstance(ekf2, Unavailable) or not all(map(topics.find, layouts)):
         return pd.DataFrame()
-    position, velocity = map(topics.of_primary, layouts)
+    position, velocity = map(topics.primary_samples, layouts)
     # what a receiver sends without a fix has a row too
-    taken = position[["fused", "rejected"]].any(axis=1)
-    position = position.loc[taken].drop(columns=["fused", "rejected"])
+    is_fix = position[["fused", "rejected"]].any(axis=1)
+    position = position.loc[is_fix].drop(columns=["fused", "rejected"])
     # rows are of half a prediction step before (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
     # of the reference; else it has EKF2's bias in it
     height, reference = px4.LAYOUTS["fused_height"], topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0)
     if topics.find(height) and reference == 1.0:
-        fixes = fixes.join(topics.of_primary(height))
+        fixes = fixes.join(topics.primary_samples(height))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
-    apart = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))
-    inside = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
-    known, lacking = fixes[apart <= SAME_FIX_S], fixes[(apart > SAME_FIX_S) & inside]
+    distance_s = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))
+    is_between_fixes = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
+    known, unlogged_fixes = (
+        fixes[distance_s <= SAME_FIX_S],
+        fixes[(distance_s > SAME_FIX_S) & is_between_fixes],
+    )
     # before v1.16 their position is local, in m
-    degrees = known["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median() < NEAR_DEG
-    return lacking if degrees else pd.DataFrame()
+    is_in_degrees = (
+        known["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median() < NEAR_DEG
+    )
+    return unlogged_fixes if is_in_degrees else pd.DataFrame()
 
 
-def rebuilt_fixes(
+def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
     """Fixes between the logged ones as EKF2's position plus its innovation, where those are exact.
@@ -76,41 +83,54 @@ def rebuilt_fixes(
         Those that are not among ``fixes``, without height where EKF2 has none of GNSS, and what
         was done.
     """
-    nothing = pd.DataFrame(columns=fixes.columns)
+    no_fixes = pd.DataFrame(columns=fixes.columns)
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
-        return nothing, ()
-    found = with_gnss(ekf2).innovations
+        return no_fixes, ()
+    found = with_gnss_innovations(ekf2).innovations
     north, east = found["north"], found["east"]
     interval_s = _interval_s(fixes.index.to_numpy())
     if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
-        return nothing, ()
-    late_s = max(0.0, delay_s - ekf2.horizon_s)
+        return no_fixes, ()
+    delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     times, rows = fixes.index.to_numpy(), north.index.to_numpy()
-    before = np.searchsorted(times, rows - late_s) - 1
-    inside = (before >= 0) & (before < len(times) - 1)
-    rows, before = rows[inside], before[inside]
-    passed = (rows - late_s - times[before]) / interval_s
+    before = np.searchsorted(times, rows - delay_beyond_horizon_s) - 1
+    is_between_fixes = (before >= 0) & (before < len(times) - 1)
+    rows, before = rows[is_between_fixes], before[is_between_fixes]
+    intervals_passed = (rows - delay_beyond_horizon_s - times[before]) / interval_s
     # of a row in the step of the fusion it is open which fix it is of
-    clear = passed % 1.0 > ekf2.step_s / interval_s
-    rows, before, passed = rows[clear], before[clear], np.floor(passed[clear])
-    taken_s = times[before] + passed * interval_s
-    made = pd.DataFrame({
-        column: np.interp(taken_s + late_s, ekf2.state.index, ekf2.state[column], np.nan, np.nan)
-        + innovations["innovation_m"].to_numpy()[inside][clear]
-        for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
-    }, index=pd.Index(taken_s, name="time_s"))  # fmt: skip
-    known = passed == 0.0
-    error = (made - fixes[made.columns].to_numpy()[before])[known].dropna()
+    is_unambiguous = intervals_passed % 1.0 > ekf2.step_s / interval_s
+    rows, before, intervals_passed = (
+        rows[is_unambiguous],
+        before[is_unambiguous],
+        np.floor(intervals_passed[is_unambiguous]),
+    )
+    fix_time_s = times[before] + intervals_passed * interval_s
+    fixes_found = pd.DataFrame(
+        {
+            column: np.interp(
+                fix_time_s + delay_beyond_horizon_s,
+                ekf2.state.index,
+                ekf2.state[column],
+                np.nan,
+                np.nan,
+            )
+            + innovations["innovation_m"].to_numpy()[is_between_fixes][is_unambiguous]
+            for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
+        },
+        index=pd.Index(fix_time_s, name="time_s"),
+    )
+    known = intervals_passed == 0.0
+    error = (fixes_found - fixes[fixes_found.columns].to_numpy()[before])[known].dropna()
     exact_m = float(np.sqrt(np.mean(error.to_numpy() ** 2))) if len(error) >= MIN_KNOWN else np.inf
-    made = made[~known].dropna()
-    made = made[~made.index.duplicated()]
-    if exact_m > EXACT_M or made.empty:
-        return nothing, ()
+    fixes_found = fixes_found[~known].dropna()
+    fixes_found = fixes_found[~fixes_found.index.duplicated()]
+    if exact_m > EXACT_M or fixes_found.empty:
+        return no_fixes, ()
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
-            made[column] = np.interp(made.index, times, fixes[column])
-    return made, (
-        f"{len(made)} positions of GNSS that the logger left out are EKF2's position plus its "
+            fixes_found[column] = np.interp(fixes_found.index, times, fixes[column])
+    return fixes_found, (
+        f"{len(fixes_found)} positions of GNSS that the logger left out are EKF2's position plus its "
         f"innovation, to within {exact_m:.2f} m (RMS along each axis, by {len(error)} that are "
         "logged too); their heights are interpolated",
     )
@@ -123,18 +143,18 @@ def _interval_s(times: Array) -> float | None:
     sixth. None where all are alike, which leaves it open into how many parts they fall.
     """
     gaps = np.diff(times)[:, None]
-    off = np.abs(gaps / PERIODS_S - np.round(gaps / PERIODS_S)) * PERIODS_S
-    worst = np.percentile(off, 98, axis=0)
-    fits = np.flatnonzero(worst <= ON_GRID_S)
+    grid_error_s = np.abs(gaps / PERIODS_S - np.round(gaps / PERIODS_S)) * PERIODS_S
+    worst_error_s = np.percentile(grid_error_s, 98, axis=0)
+    fits = np.flatnonzero(worst_error_s <= ON_GRID_S)
     if not len(fits):
         return None
-    longest = PERIODS_S[fits[-1]]
+    longest_period_s = PERIODS_S[fits[-1]]
     # the best of those next to it
-    near = np.flatnonzero(np.abs(PERIODS_S - longest) < 0.1 * longest)
-    about = PERIODS_S[near[np.argmin(worst[near])]]
-    times_over = np.round(gaps[:, 0] / about)
-    counts = np.bincount(times_over.astype(int))
-    often = counts >= MIN_ALIKE
-    if not np.any(often[1:] & often[:-1]):
+    near_periods = np.flatnonzero(np.abs(PERIODS_S - longest_period_s) < 0.1 * longest_period_s)
+    best_period_s = PERIODS_S[near_periods[np.argmin(worst_error_s[near_periods])]]
+    interval_multiples = np.round(gaps[:, 0] / best_period_s)
+    counts = np.bincount(interval_multiples.astype(int))
+    is_frequent = counts >= MIN_REPEATED_INTERVALS
+    if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None
-    return float(np.median(gaps[:, 0] / times_over))
+    return float(np.median(gaps[:, 0] / interval_multiples))

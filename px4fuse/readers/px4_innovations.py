@@ -9,13 +9,13 @@ import pandas as pd
 
 from px4fuse.ekf2_parameters import GNSS_POS, TABLE
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 
 Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
 
 @dataclass(frozen=True)
-class Fused:
+class FusedSource:
     """A position source as EKF2 knows it: its name, its aids, and what has EKF2 fuse them.
 
     ``height`` is the name of what its height is from, where that is something else.
@@ -30,30 +30,32 @@ class Fused:
 
 
 VISION, GNSS, GNSS_AND_BAROMETER = (
-    msgspec.convert(TABLE["sources"][name], Fused)
+    msgspec.convert(TABLE["sources"][name], FusedSource)
     for name in ("vision", "gnss", "gnss_and_barometer")
 )
 
 
-def fuses(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
+def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
     """Whether EKF2 fused an aid, or meant to fuse it, at any time."""
     log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(aid)
     if log is None:
         return False
-    return bool(log.samples["fused"].any() if "fused" in log.samples else log.meant is not None)
+    return bool(log.samples["fused"].any() if "fused" in log.samples else log.enabled is not None)
 
 
-def with_gnss(ekf2: Ekf2, source: Fused = GNSS) -> Ekf2:
+def with_gnss_innovations(ekf2: Ekf2, source: FusedSource = GNSS) -> Ekf2:
     """EKF2 with its innovations of GNSS in place of those of external vision."""
-    meant = {
-        group: log.meant
+    enabled = {
+        group: log.enabled
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
-        if (log := ekf2.aids.get(name)) is not None and log.meant is not None
+        if (log := ekf2.aids.get(name)) is not None and log.enabled is not None
     }
-    fusing: pd.DataFrame | Unavailable = lacking("fusion_of_gnss_not_logged", remedy=GNSS.to_log)
-    if meant:
+    fusing: pd.DataFrame | Unavailable = missing_data(
+        "fusion_of_gnss_not_logged", remedy=GNSS.to_log
+    )
+    if enabled:
         columns = ["horizontal", "vertical", "yaw"]
-        fusing = pd.DataFrame(meant).ffill().bfill().reindex(columns=columns, fill_value=0.0)
+        fusing = pd.DataFrame(enabled).ffill().bfill().reindex(columns=columns, fill_value=0.0)
     log = ekf2.aids.get("gnss_pos")
     logged = {} if log is None else log.parameters
     gate = logged.get(GNSS_POS.gate, GNSS_POS.default_gate)
@@ -65,7 +67,7 @@ def innovations_of(
     aids: Mapping[str, AidLog],
     fusing: pd.DataFrame | Unavailable,
     gate: float,
-    source: Fused = VISION,
+    source: FusedSource = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
     """Innovations per axis, and their topics.
 
@@ -79,7 +81,7 @@ def innovations_of(
     source : Fused
     """
     found: Innovations = {}
-    used: dict[str, None] = {}
+    used_topics: dict[str, None] = {}
     for axis in AXIS_NAMES:
         group = "vertical" if axis == "down" else "horizontal"
         sensor = (axis == "down" and source.height) or source.name
@@ -98,17 +100,17 @@ def innovations_of(
             remedy = source.to_log
         else:
             found[axis] = frame
-            used |= dict.fromkeys(log.topics)
+            used_topics |= dict.fromkeys(log.topics)
             continue
         found[axis] = Unavailable(f"EKF2 innovations, {axis}", reason, remedy)
-    return found, tuple(used)
+    return found, tuple(used_topics)
 
 
 def along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
     """One axis of what was fused or rejected; a rejection is of all axes of the aid."""
     samples = log.samples
     nis = {one: samples[f"innovation_{one}"] ** 2 / samples[f"variance_{one}"] for one in log.axes}
-    beyond = pd.DataFrame(nis).max(axis=1) > gate**2
+    is_beyond_gate = pd.DataFrame(nis).max(axis=1) > gate**2
     frame = pd.DataFrame(
         {
             "innovation_m": samples[f"innovation_{axis}"],
@@ -116,7 +118,7 @@ def along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
             "observation_variance_m2": samples.get(f"noise_{axis}", np.nan),
             "test_ratio": nis[axis] / gate**2,
             "fused": samples.get("fused", np.nan),
-            "rejected": samples.get("rejected", beyond.astype(float)),
+            "rejected": samples.get("rejected", is_beyond_gate.astype(float)),
         }
     )
     return frame[(frame["fused"] > 0.0) | (frame["rejected"] > 0.0) | frame["fused"].isna()]

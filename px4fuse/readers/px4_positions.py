@@ -11,16 +11,24 @@ from msgspec import structs
 
 from px4fuse.arrays import Array
 from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, settings_in_force
-from px4fuse.flight import Columns, Ekf2, PositionTrack, Truth, Unavailable, best_first, sample_rate
+from px4fuse.flight import (
+    Columns,
+    Ekf2,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    sample_rate,
+    sort_by_preference,
+)
 from px4fuse.origin import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import GLOBAL_COLUMNS
-from px4fuse.readers.parts import attitude_of, finite_rows, orientation_of, with_nearest
+from px4fuse.readers.parts import finite_rows, join_nearest, read_attitude, read_orientation
 from px4fuse.readers.px4_ekf2 import target_step_s
-from px4fuse.readers.px4_fixes import left_out_fixes, rebuilt_fixes
-from px4fuse.readers.px4_innovations import fuses
+from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
+from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.readers.ulog_topics import Topics
-from px4fuse.record import lacking
+from px4fuse.record import missing_data
 from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
@@ -32,10 +40,10 @@ ARRIVAL_SHARE = 0.9
 # Heights this far from a position may be joined to it: 2.5 cm at a climb of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
 # Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
-THINNED_HZ = 4.0
+MAX_THINNED_HZ = 4.0
 AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
 # Latitude and longitude in degrees, and perhaps altitude in m
-Place = tuple[float, ...]
+GeodeticPosition = tuple[float, ...]
 
 
 def read_positions(
@@ -47,12 +55,12 @@ def read_positions(
     turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
     found = [
         *(_read_logged(topics, name) for name in px4.LOGGED),
-        _read_kept(topics, turns),
-        _rebuild(topics, ekf2, turns),
+        _read_ev_pos_aid(topics, turns),
+        _reconstruct(topics, ekf2, turns),
         _read_gps(topics, ekf2),
     ]
     missing = tuple(track for track in found if isinstance(track, Unavailable))
-    return best_first(track for track in found if isinstance(track, PositionTrack)), missing
+    return sort_by_preference(track for track in found if isinstance(track, PositionTrack)), missing
 
 
 def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
@@ -66,9 +74,9 @@ def make_track(
     samples: pd.DataFrame,
     origin: Origin,
     *,
-    needed: list[str] = Columns.POSITION,
+    needed_columns: list[str] = Columns.POSITION,
     remedy: str = "",
-    **more: Any,
+    **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """A track of the samples that have a position; unavailable where they are too few.
 
@@ -77,18 +85,18 @@ def make_track(
     samples : DataFrame
         With the columns of a track's, as far as there are such. A variance of 0 becomes NaN: PX4
         reads it as not given (``EKF2.cpp``).
-    needed : list of str
+    needed_columns : list of str
         What a sample must have.
-    more
+    track_fields
         Of :class:`~px4fuse.flight.PositionTrack`.
     """
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
-    samples = finite_rows(samples, needed)
+    samples = finite_rows(samples, needed_columns)
     if len(samples) < MIN_TRACK_SAMPLES:
         return unavailable(name, f"{len(samples)} finite samples are too few", remedy)
-    given = samples[Columns.POSITION_VARIANCE]
-    samples = samples.assign(**given.where(given > 0))
-    return PositionTrack(name=name, samples=samples, origin=origin, **more)
+    variance = samples[Columns.POSITION_VARIANCE]
+    samples = samples.assign(**variance.where(variance > 0))
+    return PositionTrack(name=name, samples=samples, origin=origin, **track_fields)
 
 
 def _track(
@@ -110,31 +118,37 @@ def _track(
         "log": topics.log.name,
         "frame": "NED",
         "clock": AUTOPILOT_CLOCK,
-        "place_m": tuple(float(topics.ekf2_parameters.get(place, 0.0)) for place in places),
+        "lever_arm_m": tuple(float(topics.ekf2_parameters.get(place, 0.0)) for place in places),
     }
     return make_track(name, samples, origin, **(known | more))
 
 
 def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
-    layout = topics.find(*px4.layouts_of(name))
+    layout = topics.find(*px4.layouts_of_track(name))
     if layout is None:
         return unavailable(name, f"no topic {name} in the log")
     is_ekf2 = layout.topic.startswith("estimator_")  # only EKF2's own topics have its instances
-    samples = topics.of_primary(layout) if is_ekf2 else topics.frame(layout)
+    samples = topics.primary_samples(layout) if is_ekf2 else topics.frame(layout)
     frame = "unknown"
     for field, names in px4.FRAMES.items():
         if field in samples and len(samples):
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
         frame = "NED"  # rotated by EKF2 itself, whatever the field still says
-    orientation = orientation_of(samples)
+    orientation = read_orientation(samples)
     return _track(
-        topics, name, samples, (layout.topic,), turns=orientation is not None, frame=frame,
-        clock_map=_arrival(topics, layout.topic), orientation=orientation,
-    )  # fmt: skip
+        topics,
+        name,
+        samples,
+        (layout.topic,),
+        turns=orientation is not None,
+        frame=frame,
+        clock_map=_arrival_clock_map(topics, layout.topic),
+        orientation=orientation,
+    )
 
 
-def _arrival(topics: Topics, topic: str) -> ClockMap | None:
+def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     """Whether a topic's times of measurement are in truth the times of arrival.
 
     PX4 takes the time of arrival until 500 answers to TIMESYNC have come (``Timesync.cpp``).
@@ -146,31 +160,41 @@ def _arrival(topics: Topics, topic: str) -> ClockMap | None:
     if len(age_us) < MIN_TRACK_SAMPLES or np.mean(np.abs(age_us) <= SAME_TIME_US) < ARRIVAL_SHARE:
         return None
     return ClockMap(
-        "the sender's stamps", "arrival time", len(age_us), 0.0, 0.0, 0.0,
+        "the sender's stamps",
+        "arrival time",
+        len(age_us),
+        0.0,
+        0.0,
+        0.0,
         "PX4 replaced them by the time of arrival, since the clocks were not synchronised",
-    )  # fmt: skip
+    )
 
 
-def _read_kept(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
+def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.LAYOUTS["kept_horizontal"])
     if layout is None:
         return unavailable(px4.KEPT_OBSERVATION, f"no topic {px4.KEPT_OBSERVATION} in the log")
-    samples, used = topics.of_primary(layout), [layout.topic]
+    samples, used = topics.primary_samples(layout), [layout.topic]
     notes: tuple[str, ...] = ()
     vertical = topics.find(px4.LAYOUTS["kept_vertical"])
     if vertical is not None:
-        samples, notes = _with_height(samples, topics.of_primary(vertical))
+        samples, notes = _with_height(samples, topics.primary_samples(vertical))
         used.append(vertical.topic)
     # EKF2 stamps its buffer entries earlier than the sender did: by its delay and by half its
     # update period (estimator_interface.cpp)
-    samples = _later(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
+    samples = _shift_times(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
     return _track(
-        topics, px4.KEPT_OBSERVATION, samples, tuple(used),
-        turns=turns, needed=Columns.POSITION[:2], notes=notes,
-    )  # fmt: skip
+        topics,
+        px4.KEPT_OBSERVATION,
+        samples,
+        tuple(used),
+        turns=turns,
+        needed_columns=Columns.POSITION[:2],
+        notes=notes,
+    )
 
 
-def _later(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
+def _shift_times(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
     return samples.set_axis(pd.Index(samples.index.to_numpy() + by_s, name="time_s"))
 
 
@@ -181,11 +205,11 @@ def _with_height(
 
     EKF2 stamps both with one external vision sample, but the logger thins each topic by itself.
     """
-    joined = with_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
-    without = int(joined.pop("_found").isna().sum())
+    joined = join_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
+    without_height = int(joined.pop("_found").isna().sum())
     within = f"within {1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
-    note = f"{without} of {len(joined)} positions of external vision have no height {within}"
-    return joined, (note,) if without else ()
+    note = f"{without_height} of {len(joined)} positions of external vision have no height {within}"
+    return joined, (note,) if without_height else ()
 
 
 def _delay_s(topics: Topics) -> float:
@@ -193,7 +217,9 @@ def _delay_s(topics: Topics) -> float:
     return topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
 
 
-def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionTrack | Unavailable:
+def _reconstruct(
+    topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool
+) -> PositionTrack | Unavailable:
     """Position = EKF2's state + innovation (measurement - state), at the innovation's time.
 
     The innovation may be as old as one interval of the source, so the times are late by up to
@@ -214,14 +240,20 @@ def _rebuild(topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool) -> PositionT
     if "down_m" in tracks:
         samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
     return _track(
-        topics, px4.RECONSTRUCTION, _later(samples, _delay_s(topics)),
+        topics,
+        px4.RECONSTRUCTION,
+        _shift_times(samples, _delay_s(topics)),
         ("vehicle_local_position", *ekf2.innovation_topics),
-        turns=turns, needed=Columns.POSITION[:2], notes=notes,
+        turns=turns,
+        needed_columns=Columns.POSITION[:2],
+        notes=notes,
         clock=f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
-    )  # fmt: skip
+    )
 
 
-def project(latitude_deg: Array, longitude_deg: Array, origin: Place) -> tuple[Array, Array]:
+def project(
+    latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition
+) -> tuple[Array, Array]:
     """North and east (m) of an origin by the azimuthal equidistant projection that PX4 uses.
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
@@ -238,7 +270,7 @@ def project(latitude_deg: Array, longitude_deg: Array, origin: Place) -> tuple[A
     return north * EARTH_RADIUS_M, east * EARTH_RADIUS_M
 
 
-def unproject(north_m: Array, east_m: Array, origin: Place) -> tuple[Array, Array]:
+def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[Array, Array]:
     """Latitude and longitude (degrees) of what :func:`project` gives.
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
@@ -254,7 +286,7 @@ def unproject(north_m: Array, east_m: Array, origin: Place) -> tuple[Array, Arra
     return np.degrees(latitude), np.degrees(longitude)
 
 
-def _local_origin(topics: Topics) -> Place | None:
+def _local_origin(topics: Topics) -> GeodeticPosition | None:
     """EKF2's geographic origin (degrees, degrees, m), where it had one."""
     local = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
@@ -267,7 +299,7 @@ def _local_origin(topics: Topics) -> Place | None:
     return tuple(origin.iloc[-1].tolist())
 
 
-def projected(geo: pd.DataFrame, origin: Place | None) -> pd.DataFrame:
+def project_to_ned(geo: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Latitude, longitude and altitude as north, east, down (m).
 
     About an origin, or where there is none about their own first sample.
@@ -285,7 +317,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     Those are the stamps less EKF2_GPS_DELAY, and since main of 2026 the driver's own times of
     measurement where those differ (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
-    layout = topics.find(*px4.layouts_of(px4.GPS_POSITION))
+    layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
         return unavailable(px4.GPS_POSITION, f"no topic {px4.GPS_POSITION} in the log")
     gps = topics.frame(layout)
@@ -295,19 +327,21 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         return unavailable(px4.GPS_POSITION, "the receiver never had a 3D fix")
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
-    own = GNSS_MODE in parameters and bool(np.any(published_s - gps.index > SAME_TIME_US * 1e-6))
-    delay_ms = 0.0 if own else settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
+    has_driver_times = GNSS_MODE in parameters and bool(
+        np.any(published_s - gps.index > SAME_TIME_US * 1e-6)
+    )
+    delay_ms = 0.0 if has_driver_times else settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, the receiver driver's times of measurement"
-    if not own:
+    if not has_driver_times:
         gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
         clock = f"autopilot boot clock, less {delay_ms:g} ms ({GNSS_POS.delay})"
-    left_out = left_out_fixes(topics, gps, ekf2)
-    if len(left_out):
-        gps = pd.concat([gps, left_out]).sort_index()
+    unlogged_fixes = read_unlogged_fixes(topics, gps, ekf2)
+    if len(unlogged_fixes):
+        gps = pd.concat([gps, unlogged_fixes]).sort_index()
         interpolated = int(gps["altitude_m"].isna().sum())
         # what their rows do not have is as in the fix before
         gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
-    samples = projected(gps, _local_origin(topics))
+    samples = project_to_ned(gps, _local_origin(topics))
     if {"eph_m", "epv_m"} <= set(gps.columns):
         # EKF2 takes the horizontal accuracy for each axis (gps_control.cpp)
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
@@ -316,31 +350,41 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     samples = samples.assign(**_velocity(gps).set_axis(samples.index))
     samples = finite_rows(samples, Columns.POSITION)
     rate_hz, notes = sample_rate(samples), tuple[str, ...]()
-    if rate_hz < THINNED_HZ and not len(left_out):
-        made, notes = rebuilt_fixes(samples, ekf2, delay_ms * 1e-3)
-        samples = pd.concat([samples, made]).sort_index() if len(made) else samples
-    if rate_hz < THINNED_HZ:
+    if rate_hz < MAX_THINNED_HZ and not len(unlogged_fixes):
+        reconstructed_fixes, notes = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
+        samples = (
+            pd.concat([samples, reconstructed_fixes]).sort_index()
+            if len(reconstructed_fixes)
+            else samples
+        )
+    if rate_hz < MAX_THINNED_HZ:
         notes = (
             f"the log holds {rate_hz:.1f} positions of GNSS a second, fewer than receivers "
             "give: the logger left out the others (SDLOG_PROFILE bit 1 keeps them)",
             *notes,
         )
-    if len(left_out):
+    if len(unlogged_fixes):
         notes += (
-            f"{len(left_out)} positions of GNSS that the logger left out are from "
+            f"{len(unlogged_fixes)} positions of GNSS that the logger left out are from "
             f"estimator_aid_src_gnss_pos, {interpolated} of their heights are interpolated",
         )
     more: dict[str, Any] = {}
     if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
-        more["place_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
+        more["lever_arm_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     found = _track(
-        topics, px4.GPS_POSITION, samples, (layout.topic,), clock=clock, notes=notes,
-        velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE], age_s=delay_ms * 1e-3,
+        topics,
+        px4.GPS_POSITION,
+        samples,
+        (layout.topic,),
+        clock=clock,
+        notes=notes,
+        velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
+        age_s=delay_ms * 1e-3,
         **more,
-    )  # fmt: skip
+    )
     if isinstance(found, Unavailable):
         return found
-    return replace(found, origin=structs.replace(found.origin, automatic=fuses(ekf2)))
+    return replace(found, origin=structs.replace(found.origin, is_automatic=fused_aid(ekf2)))
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
@@ -348,7 +392,7 @@ def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFram
     heights = altitude_m[np.isfinite(altitude_m)]
     if len(heights) < MIN_TRACK_SAMPLES:
         return None
-    return _later(-heights.to_frame("down_m"), -delay_s)
+    return _shift_times(-heights.to_frame("down_m"), -delay_s)
 
 
 def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
@@ -367,28 +411,32 @@ def read_truth(
     home. Where EKF2 fused GNSS, its origin is where its first fix put it, which the simulation's
     is not: the truth is moved there.
     """
-    attitude = attitude_of(topics.read(px4.LAYOUTS["truth_attitude"]))
-    local = topics.read(px4.LAYOUTS["truth_local"]).dropna()
+    attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
+    logged = topics.read(px4.LAYOUTS["truth_local"])
+    local = finite_rows(logged, logged.columns.tolist())
     geo = finite_rows(topics.read(px4.LAYOUTS["truth_global"]), GLOBAL_COLUMNS[:2])
     if len(local):
-        if len(geo) and fuses(ekf2):
-            local = _about_origin(local, projected(geo, _local_origin(topics)))
+        if len(geo) and fused_aid(ekf2):
+            local = _move_to_origin(local, project_to_ned(geo, _local_origin(topics)))
         return Truth(px4.LAYOUTS["truth_local"].topic, local, attitude)
     if len(geo):
         velocity = geo.reindex(columns=Columns.VELOCITY)
-        samples = projected(geo, _local_origin(topics)).join(velocity)
+        samples = project_to_ned(geo, _local_origin(topics)).join(velocity)
         return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
-    return motion_capture(positions, "vehicle_mocap_odometry") or lacking("truth_not_logged")
+    captured = motion_capture(positions, "vehicle_mocap_odometry")
+    if captured is None and len(logged):
+        return missing_data("truth_unusable", topic=px4.LAYOUTS["truth_local"].topic)
+    return captured or missing_data("truth_not_logged")
 
 
-def _about_origin(local: pd.DataFrame, there: pd.DataFrame) -> pd.DataFrame:
+def _move_to_origin(local: pd.DataFrame, global_samples: pd.DataFrame) -> pd.DataFrame:
     """Local positions about the origin of others of the same path (median of what they differ)."""
-    moved = local.copy()
+    moved_samples = local.copy()
     for column in Columns.POSITION:
-        at = np.interp(there.index, local.index, local[column], left=np.nan, right=np.nan)
-        shift = (there[column] - at).median()
-        moved[column] += shift if np.isfinite(shift) else 0.0
-    return moved
+        at = np.interp(global_samples.index, local.index, local[column], left=np.nan, right=np.nan)
+        shift = (global_samples[column] - at).median()
+        moved_samples[column] += shift if np.isfinite(shift) else 0.0
+    return moved_samples
 
 
 def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
@@ -397,5 +445,5 @@ def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | 
         for track in positions:
             if track.topics[0] == topic:
                 state = track.samples.reindex(columns=Columns.STATE)
-                return Truth(track.name, state, attitude_of(track.orientation))
+                return Truth(track.name, state, read_attitude(track.orientation))
     return None

@@ -14,7 +14,7 @@ import msgspec
 
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.origin import Origin, find_origin
-from px4fuse.readers.layouts import Layout, one_by_one
+from px4fuse.readers.layouts import Layout, expand_layouts
 from px4fuse.record import table
 
 
@@ -39,7 +39,7 @@ class TrackSource:
 
 
 _ROWS = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
-LAYOUTS = one_by_one(_ROWS["layouts"])
+LAYOUTS = expand_layouts(_ROWS["layouts"])
 TRACKS = msgspec.convert(_ROWS["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_ROWS["frames"], dict[str, dict[int, str]], strict=False)
 NAV_STATES = msgspec.convert(_ROWS["nav_states"], dict[int, str], strict=False)
@@ -52,8 +52,9 @@ DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
 ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
 # The magnetic field: what was measured, and what EKF2 has kept of it (from v1.14)
 MAGNETOMETER = (
-    ("vehicle_magnetometer", "magnetometer_ga"), ("estimator_aid_src_mag", "observation"),
-)  # fmt: skip
+    ("vehicle_magnetometer", "magnetometer_ga"),
+    ("estimator_aid_src_mag", "observation"),
+)
 # (number of states, number of variances) -> how many variances attitude has; velocity and position
 # follow it. 4: of the quaternion filter, whose biases are increments per prediction; 3: of the
 # error-state filter (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)
@@ -82,7 +83,7 @@ INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATIONS = "ekf2_innovations"
 
 
-def layouts_of(track: str) -> list[Layout]:
+def layouts_of_track(track: str) -> list[Layout]:
     """How a track may be logged, best first; a row that names no topic is of the track's own."""
     rows = [LAYOUTS[name] for name in TRACKS[track].layouts]
     return [replace(row, topic=row.topic or track) for row in rows]
@@ -90,8 +91,10 @@ def layouts_of(track: str) -> list[Layout]:
 
 def topics() -> list[str]:
     """Every topic named in this table, sorted: all that a reader needs to decode."""
-    named = {row.topic for track in TRACKS for row in layouts_of(track)}
-    named |= {row.topic for row in LAYOUTS.values() if row.topic}
-    named |= {f"estimator_aid_src_{name}" for name in AIDS}
-    of_aids = {STATUS_FLAGS, *INNOVATIONS, OLD_INNOVATIONS}
-    return sorted(named | UNUSED.keys() | of_aids | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]})
+    named_topics = {row.topic for track in TRACKS for row in layouts_of_track(track)}
+    named_topics |= {row.topic for row in LAYOUTS.values() if row.topic}
+    named_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
+    aid_topics = {STATUS_FLAGS, *INNOVATIONS, OLD_INNOVATIONS}
+    return sorted(
+        named_topics | UNUSED.keys() | aid_topics | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]}
+    )

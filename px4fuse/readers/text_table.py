@@ -23,14 +23,14 @@ _NUMBER = re.compile(
 )
 
 
-def text_of(content: bytes) -> str | None:
+def decode_text(content: bytes) -> str | None:
     """Text with line feeds between lines; None where the bytes are no text.
 
     UTF-8, UTF-16 with its mark, or else Latin-1, as in comments of old programs.
     """
     if content.startswith(_UTF_16):
-        even = content[: len(content) // 2 * 2]
-        text = even.decode("utf-16", errors="replace")
+        even_bytes = content[: len(content) // 2 * 2]
+        text = even_bytes.decode("utf-16", errors="replace")
     else:
         content = content.rstrip(b"\0\x1a")  # what a power cut, or DOS, leaves at the end
         try:
@@ -52,13 +52,13 @@ def quote(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def at_line(name: str, number: int, what: str, remedy: str) -> str:
+def format_line_error(name: str, number: int, description: str, remedy: str) -> str:
     """Message on one line of a file.
 
-    >>> at_line("uwb.csv", 7, "'x' is not a number", "Correct or remove that line.")
+    >>> format_line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove that line.")
     "uwb.csv, line 7: 'x' is not a number. Correct or remove that line."
     """
-    return f"{name}, line {number}: {what}. {remedy}"
+    return f"{name}, line {number}: {description}. {remedy}"
 
 
 @dataclass(frozen=True)
@@ -76,20 +76,22 @@ class Rows:
     file: str
     lines: list[tuple[int, str]] = field(default_factory=list)
 
-    def refuse(self, row: int, what: str, remedy: str) -> TrajectoryError:
+    def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
         """Error that names the line of a row."""
-        return TrajectoryError(at_line(self.file, self.lines[row][0], what, remedy))
+        return TrajectoryError(
+            format_line_error(self.file, self.lines[row][0], description, remedy)
+        )
 
-    def refuse_where(self, bad: BoolArray, what: str, remedy: str) -> None:
+    def raise_where(self, bad: BoolArray, description: str, remedy: str) -> None:
         """Refuse the first row with something bad, shape (n,) or (n, k).
 
         Raises
         ------
         TrajectoryError
         """
-        places = np.argwhere(bad)
-        if len(places):
-            raise self.refuse(int(places[0, 0]), what, remedy)
+        bad_places = np.argwhere(bad)
+        if len(bad_places):
+            raise self.row_error(int(bad_places[0, 0]), description, remedy)
 
     def parse(
         self, words: int, values: int, separator: str | None = None
@@ -118,12 +120,13 @@ class Rows:
         try:
             table = np.loadtxt(texts, dtype=columns, delimiter=separator, ndmin=1)
         except ValueError as error:
-            parts = (text.partition("#")[0].split(separator) for text in texts)
-            well = (
-                len(part) == words + values and all(is_number(one.strip()) for one in part[words:])
-                for part in parts
-            )  # fmt: skip
-            row = next((row for row, good in enumerate(well) if not good), 0)
-            what = f"{quote(texts[row])} is not {words + values} columns of numbers"
-            raise self.refuse(row, what, "Correct or remove that line.") from error
+            row_fields = (text.partition("#")[0].split(separator) for text in texts)
+            is_valid = (
+                len(fields) == words + values
+                and all(is_number(field_text.strip()) for field_text in fields[words:])
+                for fields in row_fields
+            )
+            row = next((row for row, good in enumerate(is_valid) if not good), 0)
+            description = f"{quote(texts[row])} is not {words + values} columns of numbers"
+            raise self.row_error(row, description, "Correct or remove that line.") from error
         return table["words"], np.ascontiguousarray(table["values"])

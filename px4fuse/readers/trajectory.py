@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, Rows, is_number, quote, text_of
-from px4fuse.reading import read_whole, shown
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, Rows, decode_text, is_number, quote
+from px4fuse.reading import display_name, read_bytes_limited
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
@@ -70,34 +70,41 @@ def read_trajectory(path: str | Path) -> Trajectory:
         back, numbers that are not finite, or quaternions that are far from unit length.
     """
     path = Path(path)
-    name = shown(path)
-    content = read_whole(path, TrajectoryError, MAX_FILE_BYTES, again="Export it again")
-    rows, comments, cut = _rows(name, content)
+    name = display_name(path)
+    content = read_bytes_limited(
+        path, TrajectoryError, MAX_FILE_BYTES, empty_remedy="Export it again"
+    )
+    rows, comments, truncation_note = _rows(name, content)
     first = rows.lines[0][1].partition("#")[0]
     separator, columns = ("," if "," in first else None), len(_fields(first))
     if columns not in ((COLUMNS,) if separator is None else EUROC_COLUMNS):
-        raise rows.refuse(
+        raise rows.row_error(
             0,
             f"{columns} columns; TUM has {COLUMNS} between blanks, EuRoC {EUROC_COLUMNS[0]} or "
             f"{EUROC_COLUMNS[1]} between commas",
             _REMEDY,
         )
-    w_first, words = _order(rows, separator, comments)
+    w_first, words = _quaternion_order(rows, separator, comments)
     stamps, values = rows.parse(1, columns - 1, separator)
-    time, time_words = _seconds(rows, stamps[:, 0].tolist())
-    what = f"a value that is not finite, or beyond {MAX_VALUE:.0e}"
-    rows.refuse_where(~(np.abs(values[:, :7]) < MAX_VALUE), what, "Remove that line.")
-    position, rotation = values[:, :3], _rotation(rows, values[:, 3:7], w_first)
-    keep, dropped = _increasing(rows, time)
+    time, time_words = _stamps_in_seconds(rows, stamps[:, 0].tolist())
+    problem = f"a value that is not finite, or beyond {MAX_VALUE:.0e}"
+    rows.raise_where(~(np.abs(values[:, :7]) < MAX_VALUE), problem, "Remove that line.")
+    position, rotation = values[:, :3], _read_rotation(rows, values[:, 3:7], w_first)
+    keep, dropped = _increasing_rows(rows, time)
     time, position, rotation = time[keep], position[keep], rotation[keep]
-    kind, kind_words = _kind(path, columns, comments, position, rotation)
-    frame, frame_words = _frame(kind, position)
+    kind, kind_words = _detect_kind(path, columns, comments, position, rotation)
+    frame, frame_words = _detect_frame(kind, position)
     is_unix = UNIX_START_S <= time[0] < UNIX_END_S
     clock = "its stamps are UNIX time" if is_unix else "its clock is its own, not UNIX time"
-    said = (
-        f"Recognised as {words}; {clock}.", time_words, kind_words, frame_words, dropped,
-        _gaps(time, kind), cut,
-    )  # fmt: skip
+    reader_notes = (
+        f"Recognised as {words}; {clock}.",
+        time_words,
+        kind_words,
+        frame_words,
+        dropped,
+        _gap_words(time, kind),
+        truncation_note,
+    )
     return Trajectory(
         name=name,
         kind=kind,
@@ -108,7 +115,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
         unix_offset_s=0.0 if is_unix else None,
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
-        notes=tuple(note for note in said if note),
+        notes=tuple(note for note in reader_notes if note),
     )
 
 
@@ -135,7 +142,7 @@ def tum_text(trajectory: Trajectory) -> str:
 
 def _rows(name: str, content: bytes) -> tuple[Rows, str, str]:
     """Rows of numbers, comments and header in one text, and the words on a row that is cut."""
-    text = text_of(content)
+    text = decode_text(content)
     if text is None:
         is_ulog = content.startswith(b"ULog")
         what = "a PX4 log" if is_ulog else "a binary file"
@@ -144,19 +151,19 @@ def _rows(name: str, content: bytes) -> tuple[Rows, str, str]:
     lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     comments = [line for _, line in lines if line.lstrip().startswith("#")]
     data = [row for row in lines if not row[1].lstrip().startswith("#")]
-    if len(data) > 1 and not _numeric(data[0][1]) and _numeric(data[1][1]):
+    if len(data) > 1 and not _is_numeric_row(data[0][1]) and _is_numeric_row(data[1][1]):
         comments.append(data.pop(0)[1])  # a header that is no comment
-    if data and not _numeric(data[0][1]):
+    if data and not _is_numeric_row(data[0][1]):
         what = f"not a trajectory file: its first line is {quote(data[0][1])}"
         raise TrajectoryError(f"{name}: {what}", _REMEDY)
-    cut = ""
-    short = len(data) > 1 and len(_fields(data[-1][1])) < len(_fields(data[0][1]))
-    if short and not text.endswith("\n"):
-        cut = f"Line {data[-1][0]}, the last one, was dropped: it is cut."
+    truncation_note = ""
+    is_short = len(data) > 1 and len(_fields(data[-1][1])) < len(_fields(data[0][1]))
+    if is_short and not text.endswith("\n"):
+        truncation_note = f"Line {data[-1][0]}, the last one, was dropped: it is cut."
         data.pop()
     if len(data) < MIN_POSES:
         raise TrajectoryError.of("poses_few", name=name, count=len(data), least=MIN_POSES)
-    return Rows(name, data), "\n".join(comments), cut
+    return Rows(name, data), "\n".join(comments), truncation_note
 
 
 def _fields(line: str) -> list[str]:
@@ -165,11 +172,11 @@ def _fields(line: str) -> list[str]:
     return line.split("," if "," in line else None)
 
 
-def _numeric(line: str) -> bool:
+def _is_numeric_row(line: str) -> bool:
     return all(is_number(field.strip()) for field in _fields(line))
 
 
-def _order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]:
+def _quaternion_order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]:
     """Whether the quaternion's w comes first, and what such a table is called.
 
     Without a header, blanks mean TUM, and commas with nanoseconds EuRoC.
@@ -181,7 +188,7 @@ def _order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]
         has_header = any(len(line.split(",")) == len(first) for line in comments.split("\n"))
         w_first = not has_header and float(first[0]) * 1e-9 >= UNIX_START_S
         if not w_first:
-            raise rows.refuse(
+            raise rows.row_error(
                 0,
                 "the place of the quaternion's w is not known, as no header names it",
                 "Add the line '#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z' with the columns in "
@@ -193,15 +200,17 @@ def _order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]
     return w_first, f"columns between {between}, by its header"
 
 
-def _seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
+def _stamps_in_seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
     """Stamps in seconds, and the words on their unit where it is not seconds."""
     bad = np.array([not is_number(one.strip()) or not np.isfinite(float(one)) for one in stamps])
-    rows.refuse_where(bad, "column 1 is not a time", "Correct or remove that line.")
+    rows.raise_where(bad, "column 1 is not a time", "Correct or remove that line.")
     values = np.array(stamps, dtype=np.float64)
     step = float(np.median(np.abs(np.diff(values))))
     if step <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
-        apart = f"Poses are {step:.0f} s apart, read as seconds: are the stamps in milliseconds?"
-        return values, apart if step >= MAX_USUAL_STEP_S else ""
+        interval_question = (
+            f"Poses are {step:.0f} s apart, read as seconds: are the stamps in milliseconds?"
+        )
+        return values, interval_question if step >= MAX_USUAL_STEP_S else ""
     for unit, per_second in PER_SECOND.items():
         first, last = float(values[0]) / per_second, float(np.abs(values).max()) / per_second
         # on a clock of its own only ORB-SLAM3's nanoseconds are known to occur
@@ -214,31 +223,31 @@ def _seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
     raise TrajectoryError.of("stamps_apart", rows=rows, step=step)
 
 
-def _increasing(rows: Rows, time: Array) -> tuple[BoolArray, str]:
+def _increasing_rows(rows: Rows, time: Array) -> tuple[BoolArray, str]:
     """Rows whose stamps increase: of those that repeat the first, and the words on the others."""
     steps = np.diff(time, prepend=-np.inf)
     remedy = "Sort the lines by time, or separate the recordings."
-    rows.refuse_where(steps < 0.0, "its time is before that of the line above", remedy)
+    rows.raise_where(steps < 0.0, "its time is before that of the line above", remedy)
     repeated = int((steps == 0.0).sum())
     if repeated > MAX_REPEATED * len(steps):
         what = f"its time is that of the line above, as in {repeated} of {len(steps)} lines"
         remedy = "Export the stamps with all their digits (%.9f)."
-        rows.refuse_where(steps == 0.0, what, remedy)
+        rows.raise_where(steps == 0.0, what, remedy)
     note = f"Dropped poses with the stamp of the one before: {repeated}." if repeated else ""
     return steps > 0.0, note
 
 
-def _rotation(rows: Rows, quaternion: Array, w_first: bool) -> Rotation:
+def _read_rotation(rows: Rows, quaternion: Array, w_first: bool) -> Rotation:
     norms = np.linalg.norm(quaternion, axis=1)
     what = "columns 5 to 8 are not a quaternion: its norm is not 1"
     remedy = f"Remove that line, or check the order of the columns. {_REMEDY}"
-    rows.refuse_where(np.abs(norms - 1.0) > MAX_NORM_ERROR, what, remedy)
+    rows.raise_where(np.abs(norms - 1.0) > MAX_NORM_ERROR, what, remedy)
     norms[np.abs(norms - 1.0) < UNIT_NORM] = 1.0
     quaternion = np.roll(quaternion, -1, axis=1) if w_first else quaternion
     return Rotation(quaternion / norms[:, None], normalize=False)
 
 
-def _kind(
+def _detect_kind(
     path: Path, columns: int, comments: str, position: Array, rotation: Rotation
 ) -> tuple[Kind, str]:
     """What made it, and the words on that."""
@@ -246,8 +255,8 @@ def _kind(
         return "truth", "Ground truth, as its 17 columns are those of EuRoC's."
     # EuRoC's file is called data.csv; its folder says what it is
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
-    said = {"comments say": comments, "name says": path.name, "folder says": folder}
-    for words, text in said.items():
+    text_by_source = {"comments say": comments, "name says": path.name, "folder says": folder}
+    for words, text in text_by_source.items():
         if _TRUTH.search(text):
             return "truth", f"Ground truth, as its {words}."
     if np.abs(position[0]).max() < IDENTITY_M and rotation[0].magnitude() < IDENTITY_RAD:
@@ -255,7 +264,7 @@ def _kind(
     return "unknown", ""
 
 
-def _frame(kind: Kind, position: Array) -> tuple[Frame, str]:
+def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     """Axes of the world, and the words on them."""
     if kind != "slam":
         return "unknown", ""
@@ -273,14 +282,16 @@ def _frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     )
 
 
-def _gaps(time: Array, kind: Kind) -> str:
+def _gap_words(time: Array, kind: Kind) -> str:
     """Words on missing frames, or on poses that are key frames."""
     steps = np.diff(time)
     median = float(np.median(steps))
     near: BoolArray = np.abs(steps - median) <= REGULAR_WITHIN * median
     if near.mean() < REGULAR_SHARE:
-        apart = f"every {median:.3g} s in the median, {steps.max():.3g} s apart at most"
-        return f"Poses come at no rate ({apart}): key frames, or a recording that lost many."
+        format_interval = f"every {median:.3g} s in the median, {steps.max():.3g} s apart at most"
+        return (
+            f"Poses come at no rate ({format_interval}): key frames, or a recording that lost many."
+        )
     gaps = np.flatnonzero(steps > max(GAP_INTERVALS * median, GAP_S))
     if not len(gaps):
         return ""

@@ -11,13 +11,13 @@ from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.layouts import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
-from px4fuse.readers.ulog_topics import Topics, dropped_note, increasing, read_topics
-from px4fuse.record import lacking
+from px4fuse.readers.ulog_topics import Topics, dropped_note, longest_increasing_run, read_topics
+from px4fuse.record import missing_data
 from px4fuse.recording import Unused
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# A message that is cut off and no more is no loss besides; a silent IMU is one from here on
-LEAST_LOST, LOST_FROM_S = 65_538, 0.2
+# Longer steps between IMU samples count as missing (s)
+IMU_GAP_S = 0.2
 # A receiver's UTC outside these is not valid: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
@@ -31,16 +31,16 @@ def read_ulog(name: str, content: bytes) -> Flight:
         It is no ULog, or holds no usable data.
     """
     topics = read_topics(name, content)
-    running = "Check that the logger ran while the sensors did."
-    imu = _enough(topics, _read_imu(topics), "IMU", px4.IMU, running)
+    remedy = "Check that the logger ran while the sensors did."
+    imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU, remedy)
     logged = parts.with_attitude(topics.read(px4.LAYOUTS["attitude"]))
-    running = "Check that the estimator ran while the logger did."
-    attitude = _enough(topics, logged, "attitude", px4.LAYOUTS["attitude"], running)
+    remedy = "Check that the estimator ran while the logger did."
+    attitude = _require_samples(topics, logged, "attitude", px4.LAYOUTS["attitude"], remedy)
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions, ekf2)
     if isinstance(truth, Truth):
-        topics.came_from("truth", truth.name)
+        topics.record_stream("truth", truth.name)
     airborne = _read_airborne(topics)
     altitude_m = topics.read(px4.LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
@@ -53,7 +53,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
             notes=(*topics.log.notes, *notes),
             dropped=dict(dropped),
             start_unix_s=_start_unix(topics),
-            damage=(*_lost(topics, imu, in_flight), *topics.log.damage),
+            damage=_damage(topics, imu, in_flight),
             ends_in_flight=in_flight,
         ),
         imu=imu,
@@ -63,9 +63,9 @@ def read_ulog(name: str, content: bytes) -> Flight:
         truth=truth,
         airborne=airborne,
         modes=_read_modes(topics),
-        tumbled=_read_tumbled(topics),
+        tumble_spans=_read_tumbled(topics),
         barometer=barometer(altitude_m, delay_s),
-        missing=(*parts.missing_parts(imu, attitude, ekf2, truth), *missing_positions),
+        missing=(*parts.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=topics.streams,
         unused=tuple(
             Unused(name, len(table["timestamp"]), reason)
@@ -75,26 +75,25 @@ def read_ulog(name: str, content: bytes) -> Flight:
     )
 
 
-def _lost(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> tuple[str, ...]:
-    """How much of the file is no whole message, in sentences."""
-    framing, log = topics.framing, topics.log
-    said = []
-    if framing.in_message:
-        said.append(parts.cut_off("message", log.duration_s, in_flight))
-    if framing.lost_bytes > LEAST_LOST * framing.in_message:
-        steps = np.array([]) if isinstance(imu, Unavailable) else np.diff(imu.index.to_numpy())
-        silent_s = float(steps[steps > LOST_FROM_S].sum())
-        where = "in one place" if framing.places == 1 else f"in {framing.places} places"
-        missing = f"; {silent_s:.1f} s of the IMU are missing" if silent_s else ""
-        share = f"{framing.lost_bytes / log.bytes:.2%}"
-        lost = f"{framing.lost_bytes:,} of its {log.bytes:,} bytes ({share})"
-        said.append(f"{lost} could not be read, {where}{missing}")
-    return tuple(said)
+def _damage(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> tuple[str, ...]:
+    """Sentences about the missing parts of the file."""
+    end_s = topics.log.duration_s
+    damage_sentences = []
+    if topics.is_cut:
+        damage_sentences.append(parts.format_truncation("message", end_s, in_flight))
+    if topics.is_damaged:
+        missing = "the IMU is missing"
+        if not isinstance(imu, Unavailable):
+            steps_s = np.diff(imu.index.to_numpy())
+            missing_s = float(steps_s[steps_s > IMU_GAP_S].sum())
+            missing = f"{missing_s:.1f} s of the IMU are missing before the end at {end_s:.1f} s"
+        damage_sentences.append(f"the file is damaged: {missing}; invalid messages were skipped")
+    return tuple(damage_sentences)
 
 
 def _start_unix(topics: Topics) -> float | None:
     """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
-    gps = topics.read(*px4.layouts_of(px4.GPS_POSITION))
+    gps = topics.read(*px4.layouts_of_track(px4.GPS_POSITION))
     if "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
@@ -104,7 +103,7 @@ def _start_unix(topics: Topics) -> float | None:
     return float((utc_s - gps.index)[known].median()) if known.any() else None
 
 
-def _enough(
+def _require_samples(
     topics: Topics, samples: pd.DataFrame, what: str, layout: Layout, remedy: str
 ) -> pd.DataFrame | Unavailable:
     """The usable samples of a topic, or why there are none."""
@@ -113,7 +112,7 @@ def _enough(
         return Unavailable(what, f"no topic {topic}", px4.DEFAULT_PROFILE)
     if len(samples) < 2:
         return Unavailable(what, f"{topic} holds {len(samples)} usable samples", remedy)
-    topics.came_from(what.lower(), topic)
+    topics.record_stream(what.lower(), topic)
     return samples
 
 
@@ -123,7 +122,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
         offset_us = imu.pop("accelerometer_offset_us")
         imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
         time_us = np.rint(imu.index.to_numpy() * 1e6 + offset_us[imu.index].to_numpy())
-        keep = increasing(time_us.astype(np.int64) + topics.zero_us)
+        keep = longest_increasing_run(time_us.astype(np.int64) + topics.zero_us)
         imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
     columns = Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
     return parts.finite_rows(imu, columns, parts.BEYOND_IMU)
@@ -133,15 +132,15 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
     """Stretches of flight by the land detector, each from take-off to touch-down."""
     detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
     if detected.empty:
-        return lacking("landing_not_logged")
-    topics.came_from("airborne", px4.LAYOUTS["land_detected"].topic)
-    return parts.stretches_of_flight(detected["landed"], topics.log.duration_s)
+        return missing_data("landing_not_logged")
+    topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
+    return parts.flight_spans(detected["landed"], topics.log.duration_s)
 
 
 def _read_tumbled(topics: Topics) -> tuple[tuple[float, float], ...]:
     """Stretches in which PX4's failure detector finds roll or pitch beyond their limits."""
     upright = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
-    return parts.stretches_of_flight(upright, topics.log.duration_s)
+    return parts.flight_spans(upright, topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
@@ -149,4 +148,4 @@ def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
     if states.empty:
         return MODES_NOT_LOGGED
     names = states.map(lambda state: px4.NAV_STATES.get(int(state), f"mode {state:.0f}"))
-    return parts.stretches_of_modes(names, topics.log.duration_s)
+    return parts.mode_spans(names, topics.log.duration_s)

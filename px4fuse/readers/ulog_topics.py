@@ -11,7 +11,7 @@ import struct
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -22,12 +22,11 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import REPORTED
+from px4fuse.ekf2_parameters import REPORTED, valid_parameters
 from px4fuse.errors import LogError
-from px4fuse.plain import few_words
-from px4fuse.readers.layouts import Layout
+from px4fuse.plain import join_first
+from px4fuse.readers.layouts import IMPOSSIBLE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
-from px4fuse.readers.ulog_framing import Framing, whole_messages
 from px4fuse.recording import Dropout, LogInfo, Stream
 
 _MICROSECOND = 1e-6
@@ -41,17 +40,120 @@ RELEASE = 255
 NOTE_KEY = "px4fuse_note"
 # A gap longer than this in the IMU's stamps is no dropout: what lies beyond is another boot.
 MAX_DATA_GAP_S = 600.0
-# pyulog walks damaged bytes as though they were messages; these are what that can raise
+# Fields of all subscriptions together, about 300 bytes of memory each; real logs have up to 3,300
+MAX_FIELDS = 200_000
+HEADER_BYTES = 3
+# pyulog reads damaged bytes as messages; these are the exceptions that this can raise
 _PARSE_ERRORS = (
-    ULogException, struct.error, IndexError, KeyError, ValueError, TypeError, AttributeError,
-    OverflowError, UnicodeError, EOFError, MemoryError, AssertionError, RecursionError,
-)  # fmt: skip
+    ULogException,
+    struct.error,
+    IndexError,
+    KeyError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    UnicodeError,
+    EOFError,
+    MemoryError,
+    AssertionError,
+    RecursionError,
+)
 
 
 # Primary EKF2 instance from each time on
 Instances = tuple[tuple[float, int], ...]
 # One EKF2 instance alone publishes no selector
 NO_SELECTOR: Instances = ((-np.inf, 0),)
+
+
+class _Content(io.BytesIO):
+    """Content of a ULog; counts the bytes that pyulog skips.
+
+    pyulog reads a header of 3 bytes, then the message. It moves on by one byte, or to the next
+    synchronisation message, where the header is invalid.
+
+    Attributes
+    ----------
+    skipped_bytes : int
+    start, end, position : int
+        Offsets of the last header, of the end of the last read, and of the next one. The last two
+        can be beyond the end of the file.
+    """
+
+    skipped_bytes = start = end = position = 0
+
+    def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
+        at = self.position
+        if size == HEADER_BYTES:
+            if at != self.end:
+                self.skipped_bytes += at - self.start
+            self.start = at
+        self.end = self.position = at + size
+        return io.BytesIO.read(self, size)
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        # pyulog moves back by the length it asked for: without this it never ends where a damaged
+        # definition is longer than the rest of the file
+        if whence == io.SEEK_CUR:
+            offset += self.position
+        self.position = super().seek(offset)
+        return self.position
+
+
+def _skip_if_short(read: Callable[..., Any]) -> Callable[..., Any]:
+    """Raise ValueError where a message is too short for its kind.
+
+    pyulog skips such a message. At struct.error it takes the end of the file as reached.
+    """
+
+    def checked(*arguments: Any, **named: Any) -> Any:
+        try:
+            return read(*arguments, **named)
+        except struct.error as error:
+            raise ValueError(str(error)) from error
+
+    return checked
+
+
+class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no types
+    initialize = _skip_if_short(ULog._MessageData.initialize)
+
+
+class _Reader(ULog):  # type: ignore[misc]
+    """pyulog that loses less of a damaged file, with a limit on the fields of all subscriptions.
+
+    A format of 20 bytes can declare 65,535 fields, and nested formats multiply.
+    """
+
+    fields = 0
+    _MessageData = _MessageData
+    _MessageInfo = staticmethod(_skip_if_short(ULog._MessageInfo))
+    _MessageParameterDefault = staticmethod(_skip_if_short(ULog._MessageParameterDefault))
+    MessageDropout = staticmethod(_skip_if_short(ULog.MessageDropout))
+    MessageLogging = staticmethod(_skip_if_short(ULog.MessageLogging))
+    MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
+
+    def _check_packet_corruption(self, header: Any) -> bool:
+        # pyulog skips up to 10,000 bytes as a message of a later PX4; its kind is a capital letter
+        is_corrupt: bool = super()._check_packet_corruption(header)
+        if not ord("A") <= header.msg_type <= ord("Z"):
+            self._file_corrupt = is_corrupt = True
+        return is_corrupt
+
+    @_skip_if_short
+    def _MessageAddLogged(self, data: bytes, header: Any, formats: Any) -> Any:  # noqa: N802
+        @cache
+        def count(name: str) -> int:
+            fields: list[tuple[str, int, str]] = formats[name].fields
+            return 1 + sum(
+                max(size, 1) * (count(kind) if kind in formats else 1) for kind, size, _ in fields
+            )
+
+        self.fields += count(self.parse_string(data[3:]))
+        if self.fields > MAX_FIELDS:
+            raise ULogException(f"its topics have more than {MAX_FIELDS:,} fields")
+        return ULog._MessageAddLogged(data, header, formats)
 
 
 @dataclass(frozen=True)
@@ -70,10 +172,12 @@ class Topics:
         it.
     ekf2_parameters : mapping
         Every EKF2_ parameter, by PX4 name; ``log`` holds only those that enter the results.
-    framing : Framing
-        How much of the file is whole messages.
+    is_cut : bool
+        The file ends inside a message.
+    is_damaged : bool
+        pyulog skipped invalid bytes or messages.
     streams : dict
-        Where each part of the flight came from; :meth:`came_from` fills it.
+        Where each part of the flight came from; :meth:`record_stream` fills it.
     """
 
     log: LogInfo
@@ -81,7 +185,8 @@ class Topics:
     zero_us: int
     dropped: dict[tuple[str, int], int]
     ekf2_parameters: Mapping[str, float]
-    framing: Framing
+    is_cut: bool
+    is_damaged: bool
     streams: dict[str, Stream] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
@@ -129,21 +234,26 @@ class Topics:
         """
         available = self.instances(layout.topic)
         table = self.tables[layout.topic, instance if instance in available else available[0]]
-        optional = {ours: px4 for ours, px4 in layout.optional.items() if px4 in table}
+        optional = {
+            column: field_name
+            for column, field_name in layout.optional.items()
+            if field_name in table
+        }
         columns = {**layout.columns, **optional}
         time_us = measurement_time_us(table)
-        keep = increasing(time_us)
+        keep = longest_increasing_run(time_us)
         if len(keep) < len(time_us):
             self.dropped[layout.topic, instance] = len(time_us) - len(keep)
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
             frame = pd.DataFrame(
                 {
-                    ours: table[px4][keep].astype(np.float64) * layout.scale.get(ours, 1.0)
-                    for ours, px4 in columns.items()
+                    column: table[field_name][keep].astype(np.float64)
+                    * layout.scale.get(column, 1.0)
+                    for column, field_name in columns.items()
                 },
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
-        frame = frame.where(np.isfinite(frame))  # an infinite value is as unusable as NaN
+        frame = frame.where(np.abs(frame) < IMPOSSIBLE)  # such a value is as unusable as NaN
         # what lies outside the span of the data by more than the margin is dropped
         end = self.log.duration_s + WINDOW_MARGIN_S
         return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
@@ -151,9 +261,9 @@ class Topics:
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
         """:meth:`frame` of the first layout that this log holds; empty where it holds none."""
         layout = self.find(*layouts)
-        return _nothing(layouts[0]) if layout is None else self.frame(layout, step=step)
+        return _empty_frame(layouts[0]) if layout is None else self.frame(layout, step=step)
 
-    def of_primary(
+    def primary_samples(
         self,
         layout: Layout,
         *,
@@ -172,20 +282,20 @@ class Topics:
             Which rows of an instance count; all by default.
         """
         if self.find(layout) is None:
-            return _nothing(layout)
+            return _empty_frame(layout)
         available = self.instances(layout.topic)
-        alone = self.primary == NO_SELECTOR
+        is_single = self.primary == NO_SELECTOR
         starts, numbers = (np.array(part) for part in zip(*self.primary, strict=True))
-        parts: list[pd.DataFrame] = []
-        for number in available[:1] if alone else available:
+        primary_frames: list[pd.DataFrame] = []
+        for number in available[:1] if is_single else available:
             frame = self.frame(layout, number, step=step)
             frame = frame if select is None else select(frame)
             at = np.searchsorted(starts, frame.index.to_numpy(), side="right") - 1
-            parts.append(frame if alone else frame[numbers[at] == number])
-        joined = pd.concat(parts).sort_index()
-        return joined[~joined.index.duplicated()]
+            primary_frames.append(frame if is_single else frame[numbers[at] == number])
+        joined_frames = pd.concat(primary_frames).sort_index()
+        return joined_frames[~joined_frames.index.duplicated()]
 
-    def came_from(self, part: str, *topics: str) -> None:
+    def record_stream(self, part: str, *topics: str) -> None:
         """Note where a part of the flight came from, and which moment its times are."""
         # of sensor_combined the stamp is the gyro's, to which the accelerometer's offset is added
         measured = part == "imu" or any(
@@ -196,7 +306,7 @@ class Topics:
         self.streams[part] = Stream(topics, clock, self.log.name)
 
 
-def _nothing(layout: Layout) -> pd.DataFrame:
+def _empty_frame(layout: Layout) -> pd.DataFrame:
     """What a log without a topic has of it."""
     times = pd.Index([], dtype=np.float64, name="time_s")
     return pd.DataFrame(columns=list(layout.columns), index=times, dtype=np.float64)
@@ -220,7 +330,7 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     return np.where(plausible, sampled, published)
 
 
-def increasing(time_us: NDArray[np.int64]) -> IntArray:
+def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     """Indices of the longest strictly increasing run of positive time stamps.
 
     A stamp hours ahead must cost one sample, not all that follow it, so the longest increasing
@@ -266,33 +376,33 @@ def read_topics(name: str, content: bytes) -> Topics:
     LogError
         It is no ULog, or holds no data with usable time stamps.
     """
-    chatter = io.StringIO()
-    framing = whole_messages(content)
+    source, size = _Content(content), len(content)
     try:
-        with contextlib.redirect_stdout(chatter):  # pyulog prints its warnings
-            ulog = ULog(io.BytesIO(framing.content), message_name_filter_list=topics())
+        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints its warnings
+            ulog = _Reader(source, message_name_filter_list=topics())
             tables = _tables(ulog)
             # a log of other topics can still be placed in time, by all that it holds
-            placed = tables or _tables(ULog(io.BytesIO(framing.content)))
+            time_tables = tables or _tables(_Reader(_Content(content)))
     except _PARSE_ERRORS as error:
         raise LogError.of(
             "ulog_unreadable", name=name, why=str(error) or type(error).__name__
         ) from error
     notes: tuple[str, ...] = ()
-    if not placed:
+    if not time_tables:
         raise LogError.of("ulog_empty", name=name)
     if not tables:
-        names = sorted({topic for topic, _ in placed})
-        notes += (f"none of its topics is one that px4fuse uses (it holds {few_words(names, 5)})",)
+        names = sorted({topic for topic, _ in time_tables})
+        notes += (f"none of its topics is one that px4fuse uses (it holds {join_first(names, 5)})",)
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
-    zero_us, end_us = _data_span(placed, name)
-    every = ulog.initial_parameters.items()
-    given = {of: float(v) for of, v in every if isinstance(v, int | float) and np.isfinite(v)}
+    zero_us, end_us = _data_span(time_tables, name)
+    parameter_items = ulog.initial_parameters.items()
+    numbers = {name: float(v) for name, v in parameter_items if isinstance(v, int | float)}
+    parameter_values, faults = valid_parameters(numbers)
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
-        bytes=len(content),
+        bytes=size,
         format="ULog",
         firmware=_firmware(ulog.msg_info_dict),
         firmware_hash=_text(ulog.msg_info_dict, "ver_sw", "unknown"),
@@ -303,15 +413,21 @@ def read_topics(name: str, content: bytes) -> Topics:
             Dropout((d.timestamp - zero_us) * _MICROSECOND, d.duration * 1e-3)
             for d in ulog.dropouts
         ),
-        parameters=MappingProxyType({name: given[name] for name in REPORTED if name in given}),
-        notes=notes,
-        damage=_corruption(ulog, chatter.getvalue()),
-        bytes_read=len(content) - framing.lost_bytes,
+        parameters=MappingProxyType(
+            {name: parameter_values[name] for name in REPORTED if name in parameter_values}
+        ),
+        notes=(*notes, *faults),
+        bytes_read=source.start - source.skipped_bytes,
         autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),
     )
-    parameters = {name: value for name, value in given.items() if name.startswith("EKF2_")}
-    return Topics(log, tables, zero_us, {}, MappingProxyType(parameters), framing)
+    parameters = {
+        name: value for name, value in parameter_values.items() if name.startswith("EKF2_")
+    }
+    is_cut = source.start < size < source.end
+    return Topics(
+        log, tables, zero_us, {}, MappingProxyType(parameters), is_cut, ulog.file_corruption
+    )
 
 
 def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
@@ -337,11 +453,11 @@ def _data_span(
     """First and last time (µs) of the IMU, or else of the topic with most samples."""
     for key in sorted(tables, key=lambda of: (of[0] != IMU.topic, -len(tables[of]["timestamp"]))):
         time_us = tables[key]["timestamp"].astype(np.int64)
-        kept = time_us[increasing(time_us)]
-        if len(kept):
+        increasing_us = time_us[longest_increasing_run(time_us)]
+        if len(increasing_us):
             # a stamp hours away from the others is a leftover: the longest stretch counts
-            breaks = np.flatnonzero(np.diff(kept) > MAX_DATA_GAP_S / _MICROSECOND) + 1
-            stretch = max(np.split(kept, breaks), key=len)
+            breaks = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND) + 1
+            stretch = max(np.split(increasing_us, breaks), key=len)
             return int(stretch[0]), int(stretch[-1])
     raise LogError.of("stamps_zero", name=name)
 
@@ -350,15 +466,6 @@ def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
     """A text from the log, without a terminal's control characters."""
     text = str(info.get(key, otherwise))
     return "".join(c for c in text if c.isprintable()) or otherwise
-
-
-def _corruption(ulog: ULog, chatter: str) -> tuple[str, ...]:
-    """What pyulog says of whole messages that make no sense."""
-    if not ulog.file_corruption:
-        return ()
-    said = "; ".join(dict.fromkeys(line.strip() for line in chatter.splitlines() if line.strip()))
-    because = f" ({said})" if said else ""
-    return (f"the file is damaged: messages in it make no sense{because} and were passed over",)
 
 
 def _firmware(info: dict[str, Any]) -> str:

@@ -12,28 +12,38 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.interventions import Of
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
-from px4fuse.findings.since import change_words, share_words
+from px4fuse.findings.since import format_change, format_explained_share
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capital, number_words, p_words
+from px4fuse.plain import capitalise_first, format_number, format_p_value
 from px4fuse.report import marks, say
 from px4fuse.report.page import Cell, Page, halves, legend_above
-from px4fuse.report.style import DOTS, LINES, MUTED, OURS_BAND, Axes, curve, plain_ticks
-from px4fuse.report.words import VERDICT_HEAD, filters, verdict_rows, verdict_words
+from px4fuse.report.style import (
+    DOTS,
+    KF_BAND_COLOUR,
+    LINES,
+    MUTED_COLOUR,
+    Axes,
+    draw_curve,
+    set_plain_ticks,
+)
+from px4fuse.report.words import VERDICT_HEAD, filters_by_name, format_verdict, verdict_rows
 
-LAGS = 20
-WIDEST = 4.0
-BINS = np.linspace(-WIDEST, WIDEST, 33)
+MAX_LAG = 20
+MAX_NORMALISED = 4.0
+BINS = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
 # Of the normal curve's 0.4: higher bars are cut, so that the curve stays in sight
-HIGHEST = 1.6
+MAX_DENSITY = 1.6
 # p of "white" below which a word is said
 SMALL_P = 0.01
 # Heights of the axes in points
-RUNNING, BELOW, LEGEND = 140.0, 150.0, 14.0
+RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0
 GREY = "#dcdcdc"
 # What a cause explains: its name, and the power that is shown
-NUMBERS: Mapping[Of, tuple[str, float]] = {
-    "nis": ("mean NIS", 1.0), "nees": ("error (σ)", 0.5), "apart": ("apart (m)", 1.0),
-}  # fmt: skip
+CAUSE_STATISTICS: Mapping[Of, tuple[str, float]] = {
+    "nis": ("mean NIS", 1.0),
+    "nees": ("error (σ)", 0.5),
+    "apart": ("apart (m)", 1.0),
+}
 
 
 class Series(NamedTuple):
@@ -51,52 +61,69 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     page = Page("Appendix: consistency", say("consistency", along=along))
     series = _series(result)
     if series:
-        axes = marks.panel(page, analysis, "Mean NIS so far, log scale", _nis_words(series),
-                           RUNNING, above=LEGEND)  # fmt: skip
-        _running(axes, series)
+        axes = marks.panel(
+            page,
+            analysis,
+            "Mean NIS so far, log scale",
+            _nis_sentence(series),
+            RUNNING_HEIGHT,
+            above=LEGEND_HEIGHT,
+        )
+        _draw_running_nis(axes, series)
         legend_above(axes)
         first, second = halves()
-        left = first.panel("Size: ν / √S", _shape_words(series), BELOW, above=LEGEND, left=4.0)
-        right = second.panel("Autocorrelation", _white_words(series), BELOW, above=LEGEND)
-        _histogram(left, series)
-        _autocorrelation(right, series)
+        left = first.panel(
+            "Size: ν / √S", _shape_sentence(series), LOWER_HEIGHT, above=LEGEND_HEIGHT, left=4.0
+        )
+        right = second.panel(
+            "Autocorrelation", _whiteness_sentence(series), LOWER_HEIGHT, above=LEGEND_HEIGHT
+        )
+        _draw_histogram(left, series)
+        _draw_autocorrelation(right, series)
         for axes in (left, right):
             legend_above(axes, handlelength=1.4)
         page.beside(first, second)
     else:
-        ours = result.filters["kf"]
-        reason = ours.reason if isinstance(ours, Unavailable) else "too few innovations"
+        kf_summary = result.filters["kf"]
+        reason = kf_summary.reason if isinstance(kf_summary, Unavailable) else "too few innovations"
         page.write(f"Along {along}: {reason}.")
     page.heading("All axes", above=12.0)
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
-    page.table(head, verdict_rows(analysis.axes.values(), _cells), right=(2, 5, 6, 7, 8))
-    _tried(page, analysis)
+    page.table(head, verdict_rows(analysis.axes.values(), _statistic_cells), right=(2, 5, 6, 7, 8))
+    _write_causes(page, analysis)
     yield page
 
 
-def _tried(page: Page, analysis: Analysis) -> None:
+def _write_causes(page: Page, analysis: Analysis) -> None:
     """Write what each change would make of both filters along the axis of the lab."""
     axis = analysis.main.axis
     rows: list[list[Cell]] = []
-    for one in analysis.causes:
-        if one.axis == axis.name:
-            owner = "ours" if one.filter == "kf" else "EKF2"
-            what, power = NUMBERS[one.of]
-            ends = (number_words(number**power, 2) for number in (one.before, one.after))
-            rows.append([owner, change_words(analysis, one), what, *ends, share_words(one)])
+    for cause in analysis.causes:
+        if cause.axis == axis.name:
+            owner = "ours" if cause.filter == "kf" else "EKF2"
+            statistic, power = CAUSE_STATISTICS[cause.of]
+            values = (format_number(number**power, 2) for number in (cause.before, cause.after))
+            rows.append(
+                [
+                    owner,
+                    format_change(analysis, cause),
+                    statistic,
+                    *values,
+                    format_explained_share(cause),
+                ]
+            )
     if not rows:
         return
     page.heading(f"Causes that were tried along {axis.called}", above=12.0)
-    page.table(["filter", "cause", "number", "flown", "put right", "explains"], rows,
-               right=(3, 4))  # fmt: skip
-    page.write(say("causes"), size=7.5, colour=MUTED)
+    page.table(["filter", "cause", "number", "flown", "put right", "explains"], rows, right=(3, 4))
+    page.write(say("causes"), size=7.5, colour=MUTED_COLOUR)
 
 
 def _series(result: AxisComparison) -> list[Series]:
     """Of each filter that has enough innovations."""
     frames = {"ours": result.replay.updates, "EKF2": result.ekf2_innovations}
     series = []
-    for name, one in filters(result).items():
+    for name, one in filters_by_name(result).items():
         frame = frames[name]
         if isinstance(frame, pd.DataFrame) and isinstance(one, Consistency):
             values = frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])
@@ -106,104 +133,118 @@ def _series(result: AxisComparison) -> list[Series]:
     return series
 
 
-def _thin_line(one: Series) -> dict[str, Any]:
+def _thin_line_style(one: Series) -> dict[str, Any]:
     return {"color": LINES[one.name]["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
 
 
-def _running(axes: Axes, series: list[Series]) -> None:
+def _draw_running_nis(axes: Axes, series: list[Series]) -> None:
     lowest, highest = 0.5, 2.0
     for one in series:
         number = np.arange(1, len(one.values) + 1)
         running = (one.values**2).cumsum() / number
-        curve(axes, running[2:], **LINES[one.name], label=one.name)
-        shown = np.unique(np.geomspace(3, len(number), 60).astype(int))
-        low, high = np.array([nis_band(int(count)) for count in shown]).T
-        time = one.values.index[shown - 1]
+        draw_curve(axes, running[2:], **LINES[one.name], label=one.name)
+        drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
+        low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
+        time = one.values.index[drawn_counts - 1]
         if one.name == "ours":
             axes.fill_between(time, low, high, color=GREY, lw=0, label="95 % band of ours")
         else:
-            axes.plot(time, low, **_thin_line(one))
-            axes.plot(time, high, **_thin_line(one), label="of EKF2")
+            axes.plot(time, low, **_thin_line_style(one))
+            axes.plot(time, high, **_thin_line_style(one), label="of EKF2")
         settled = running[len(running) // 4 :]
         lowest, highest = min(lowest, 0.7 * settled.min()), max(highest, 1.4 * settled.max())
     axes.axhline(1.0, color="black", lw=0.5)
     axes.set(yscale="log", ylim=(lowest, highest))
-    plain_ticks(axes.yaxis)
+    set_plain_ticks(axes.yaxis)
 
 
-def _histogram(axes: Axes, series: list[Series]) -> None:
-    x = np.linspace(-WIDEST, WIDEST, 81)
+def _draw_histogram(axes: Axes, series: list[Series]) -> None:
+    x = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 81)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     axes.fill_between(x, normal, color=GREY, lw=0, label="normal")
     highest = 0.4
     for one in series:
-        density, _ = np.histogram(one.values.clip(-WIDEST, WIDEST), bins=BINS, density=True)
+        density, _ = np.histogram(
+            one.values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=BINS, density=True
+        )
         axes.stairs(density, BINS, **LINES[one.name], label=one.name)
         highest = max(highest, float(density.max()))
-    axes.set_xlim(-WIDEST, WIDEST)
-    axes.set_ylim(0.0, min(1.15 * highest, HIGHEST))
+    axes.set_xlim(-MAX_NORMALISED, MAX_NORMALISED)
+    axes.set_ylim(0.0, min(1.15 * highest, MAX_DENSITY))
     axes.set_yticks([])
     axes.set_xlabel("ν / √S")
 
 
-def _autocorrelation(axes: Axes, series: list[Series]) -> None:
+def _draw_autocorrelation(axes: Axes, series: list[Series]) -> None:
     for shift, one in zip((-0.18, 0.18), series, strict=False):
-        lags = min(LAGS, len(one.values) // 3)
+        lags = min(MAX_LAG, len(one.values) // 3)
         r = autocorrelation(np.asarray(one.values, np.float64), lags)
         at = np.arange(1, lags + 1) + shift
         axes.vlines(at, 0.0, r, color=LINES[one.name]["color"], lw=1.2)
         filled = {"mfc": LINES[one.name]["color"] if one.name == "ours" else "white"}
         axes.plot(at, r, **DOTS[one.name] | filled | {"ms": 3.0, "mew": 0.6}, label=one.name)
-        bound = _bound(one)
+        bound = _whiteness_bound(one)
         if one.name == "ours":
-            axes.axhspan(-bound, bound, color=OURS_BAND, lw=0, zorder=0.5, label="95 % of white")
+            axes.axhspan(
+                -bound, bound, color=KF_BAND_COLOUR, lw=0, zorder=0.5, label="95 % of white"
+            )
         else:
             for level in (-bound, bound):
-                axes.axhline(level, **_thin_line(one))
+                axes.axhline(level, **_thin_line_style(one))
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
-    axes.set_xlim(0.0, LAGS + 1)
+    axes.set_xlim(0.0, MAX_LAG + 1)
     axes.set_xlabel("lag (measurements)")
 
 
-def _bound(one: Series) -> float:
+def _whiteness_bound(one: Series) -> float:
     """How far the autocorrelation of white innovations goes, 95 %."""
     return float(1.96 / np.sqrt(len(one.values)))
 
 
-def _nis_words(series: list[Series]) -> str:
+def _nis_sentence(series: list[Series]) -> str:
     return " ".join(
-        f"{capital(one.name)} ends at {number_words(one.statement.nis_mean)} "
+        f"{capitalise_first(one.name)} ends at {format_number(one.statement.nis_mean)} "
         "({:.2f} to {:.2f} is consistent): ".format(*one.statement.nis_band)
-        + f"{verdict_words(one.statement)}."
+        + f"{format_verdict(one.statement)}."
         for one in series
     )
 
 
-def _shape_words(series: list[Series]) -> str:
-    said = [
-        say("beyond", who=capital(one.name), one=one, p=p_words(one.statement.bias_p))
+def _shape_sentence(series: list[Series]) -> str:
+    sentences = [
+        say(
+            "beyond",
+            who=capitalise_first(one.name),
+            one=one,
+            p=format_p_value(one.statement.bias_p),
+        )
         for one in series
     ]
-    return "\n".join([*said, "4.5% are expected there."])
+    return "\n".join([*sentences, "4.5% are expected there."])
 
 
-def _white_words(series: list[Series]) -> str:
-    said = []
+def _whiteness_sentence(series: list[Series]) -> str:
+    sentences = []
     for one in series:
         r, p = one.statement.lag1_autocorrelation, one.statement.ljung_box_p
         reading = "white" if p >= SMALL_P else "not white"
-        if p < SMALL_P and abs(r) > _bound(one):
+        if p < SMALL_P and abs(r) > _whiteness_bound(one):
             reading = "it follows too slowly" if r > 0.0 else "it jumps after every measurement"
-        said.append(f"{capital(one.name)}: lag 1 {r:+.2f}, Ljung-Box {p_words(p)}: {reading}.")
-    return "\n".join(said)
+        sentences.append(
+            f"{capitalise_first(one.name)}: lag 1 {r:+.2f}, Ljung-Box {format_p_value(p)}: {reading}."
+        )
+    return "\n".join(sentences)
 
 
-def _cells(_: AxisComparison, __: str, one: FilterSummary | UnjudgedFilter) -> list[str]:
+def _statistic_cells(_: AxisComparison, __: str, one: FilterSummary | UnjudgedFilter) -> list[str]:
     if isinstance(one, Unavailable):
         return [""] * 5
     return [
-        f"{one.count}", f"{one.outside_two_sigma:.1%}", f"{one.bias_t:+.1f}",
-        f"{one.lag1_autocorrelation:+.2f}", p_words(one.ljung_box_p),
-    ]  # fmt: skip
+        f"{one.count}",
+        f"{one.outside_two_sigma:.1%}",
+        f"{one.bias_t:+.1f}",
+        f"{one.lag1_autocorrelation:+.2f}",
+        format_p_value(one.ljung_box_p),
+    ]

@@ -14,49 +14,51 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.record import Span
 from px4fuse.report import marks, panels, say, style
-from px4fuse.report.page import WIDTH, Page
-from px4fuse.report.style import EKF2, LINES, OURS, Artist, Axes
-from px4fuse.report.why import nothing_concluded
-from px4fuse.report.words import filters, verdict_notes, verdict_words
+from px4fuse.report.page import PAGE_WIDTH, Page
+from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
+from px4fuse.report.why import unexplained_note
+from px4fuse.report.words import filters_by_name, format_verdict, verdict_notes
 
-GAP = 14.0  # points between columns
+COLUMN_GAP = 14.0  # points between columns
 ZOOM_UPDATES = 15
-ZOOM_LEAST_S = 1.0
-ZOOM = 125.0  # height of the axes in points
+MIN_ZOOM_S = 1.0
+ZOOM_HEIGHT = 125.0  # height of the axes in points
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page."""
     result = analysis.main
     page = Page(f"The flight along {result.axis.called}")
-    _legend(page, analysis)
+    _write_legend(page, analysis)
     reference = panels.error_reference(result)
-    shown = [panels.POSITION, panels.VELOCITY]
+    shown_panels = [panels.POSITION, panels.VELOCITY]
     if isinstance(reference, pd.DataFrame):
-        shown.append(panels.ERROR)
-    for panel in shown:
-        panel.put(page, analysis, result, last=panel is shown[-1], strip=panel is shown[0])
-    page.write(nothing_concluded(analysis), above=6.0)
+        shown_panels.append(panels.ERROR)
+    for panel in shown_panels:
+        panel.draw_on_page(
+            page, analysis, result, last=panel is shown_panels[-1], strip=panel is shown_panels[0]
+        )
+    page.write(unexplained_note(analysis), above=6.0)
     if isinstance(reference, Unavailable):
         page.write(f"No error is drawn: {reference.reason}. {reference.remedy}", above=6.0)
     yield page
 
 
-def _legend(page: Page, analysis: Analysis) -> None:
+def _write_legend(page: Page, analysis: Analysis) -> None:
     """Write the legend of lines and marks that holds for all pages."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
     result = analysis.main
     lines: list[Artist] = [
-        Line2D([], [], **{**style.MEASURED, "ms": 5.0}, label="measurement"),
+        Line2D([], [], **{**style.MEASUREMENT_DOTS, "ms": 5.0}, label="measurement"),
         Line2D([], [], **LINES["ours"], label="ours"),
-        Patch(facecolor=style.OURS_BAND, lw=0, label="ours ±2σ"),
+        Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="ours ±2σ"),
     ]
     for name, frame in (("EKF2", result.ekf2_state), ("truth", result.truth)):
         if isinstance(frame, pd.DataFrame):
             lines.append(Line2D([], [], **LINES[name], label=name))
-    page.legend(lines, marks.handles(analysis))
+    page.legend(lines, marks.legend_entries(analysis))
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -65,31 +67,36 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
     page = Page(f"Innovations and variances along {result.axis.called}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
         last, first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
-        panel.put(page, analysis, result, last=last, strip=first)
-    _zoom(page, analysis)
+        panel.draw_on_page(page, analysis, result, last=last, strip=first)
+    _draw_zoom(page, analysis)
     for note in verdict_notes(analysis):
         page.numbers(note)
     yield page
 
 
-def _zoom(page: Page, analysis: Analysis) -> None:
+def _draw_zoom(page: Page, analysis: Analysis) -> None:
     """Predict and update, seen near."""
     result = analysis.main
     start_s, end_s = window = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
-    axes = page.panel(title, zoom_words(result), ZOOM)
-    _sawtooth(axes, result, window)
+    axes = page.panel(title, zoom_sentence(result), ZOOM_HEIGHT)
+    _draw_sawtooth(axes, result, window)
     updates = result.replay.updates.loc[start_s:end_s].index
     axes.vlines(
-        updates, 0.0, 0.03, transform=axes.get_xaxis_transform(), color=style.MEASUREMENT, lw=1.2
+        updates,
+        0.0,
+        0.03,
+        transform=axes.get_xaxis_transform(),
+        color=style.MEASUREMENT_COLOUR,
+        lw=1.2,
     )
     axes.set_xlabel(style.TIME_LABEL)
-    shown = []
+    symbols = []
     if isinstance(result.ekf2_innovations, pd.DataFrame):
-        shown += ["triangle up just before an update", "down just after"]
+        symbols += ["triangle up just before an update", "down just after"]
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        shown.append("square as logged")
-    ekf2 = f" EKF2: {', '.join(shown)}." if shown else ""
+        symbols.append("square as logged")
+    ekf2 = f" EKF2: {', '.join(symbols)}." if symbols else ""
     page.numbers(f"Line: our filter, predict and update; grey ticks: measurements.{ekf2}")
 
 
@@ -100,9 +107,9 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     """
     times = result.replay.updates.index.to_numpy()
     if len(times) < 2:
-        return segment.start_s, min(segment.start_s + ZOOM_LEAST_S, segment.end_s)
+        return segment.start_s, min(segment.start_s + MIN_ZOOM_S, segment.end_s)
     interval = float(np.median(np.diff(times)))
-    count = min(max(ZOOM_UPDATES, round(ZOOM_LEAST_S / interval)), len(times) - 1)
+    count = min(max(ZOOM_UPDATES, round(MIN_ZOOM_S / interval)), len(times) - 1)
     spans = times[count:] - times[:-count]
     middle = float(times[len(times) // 2])
     if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
@@ -111,39 +118,41 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     return float(times[start]), float(times[start + count])
 
 
-def _sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
+def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
     """σ_p with both values at each update, just before and just after."""
     updates, steps = result.replay.updates, result.replay.steps
-    prior, after_each = updates["prior_position_variance_m2"], steps["position_variance_m2"]
+    prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
     # stable, so that the prior stands first at equal times
-    both = pd.concat([prior, after_each]).sort_index(kind="stable").loc[slice(*window)]
-    axes.plot(both.index, np.sqrt(both), color=OURS, lw=1.1, marker=".", ms=2.4, mew=0)
+    variances = pd.concat([prior, posterior]).sort_index(kind="stable").loc[slice(*window)]
+    axes.plot(
+        variances.index, np.sqrt(variances), color=KF_COLOUR, lw=1.1, marker=".", ms=2.4, mew=0
+    )
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         ekf2 = result.ekf2_innovations.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
         before, after = np.sqrt(ekf2["prior_variance_m2"]), np.sqrt(ekf2["posterior_variance_m2"])
-        axes.vlines(ekf2.index, after, before, color=EKF2, lw=1.0)
-        axes.plot(before, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2)
-        axes.plot(after, ls="none", marker="v", ms=3.6, mew=0, color=EKF2)
+        axes.vlines(ekf2.index, after, before, color=EKF2_COLOUR, lw=1.0)
+        axes.plot(before, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2_COLOUR)
+        axes.plot(after, ls="none", marker="v", ms=3.6, mew=0, color=EKF2_COLOUR)
     if isinstance(result.ekf2_variance, pd.DataFrame):
         logged = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[slice(*window)])
-        axes.plot(logged, ls="none", marker="s", ms=3.0, mew=0.7, mfc="white", color=EKF2)
+        axes.plot(logged, ls="none", marker="s", ms=3.0, mew=0.7, mfc="white", color=EKF2_COLOUR)
     axes.set_xlim(*window)
 
 
-def zoom_words(result: AxisComparison) -> str:
+def zoom_sentence(result: AxisComparison) -> str:
     """What to see in the zoom."""
-    said = []
-    for name, one in filters(result).items():
+    texts = []
+    for name, one in filters_by_name(result).items():
         before, after = one.sigma_p_before_update_m, one.sigma_p_after_update_m
         if before is None or after is None:
-            said += ["EKF2: S or R not logged, so no before and after"] if name == "EKF2" else []
+            texts += ["EKF2: S or R not logged, so no before and after"] if name == "EKF2" else []
             continue
         shrink = 1.0 - after**2 / before**2
         shrinks = f"{name} {before:.3f} to {after:.3f} m, {shrink:.0%} of the variance"
         if name == "ours":
             shrinks = say("predict_and_update", settings=result.replay.settings, shrinks=shrinks)
-        said.append(shrinks)
-    return f"{'; '.join(said)}." if said else ""
+        texts.append(shrinks)
+    return f"{'; '.join(texts)}." if texts else ""
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -152,21 +161,25 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     if not others:
         return
     page = Page("Appendix: other axes", say("other_axes"))
-    width = (WIDTH - GAP * (len(others) - 1)) / max(len(others), 3)
+    width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 3)
     columns = [Page(width=width) for _ in others]
     for column, result in zip(columns, others, strict=True):
-        said = ", ".join(f"{name} {verdict_words(one)}" for name, one in filters(result).items())
+        verdicts = ", ".join(
+            f"{name} {format_verdict(one)}" for name, one in filters_by_name(result).items()
+        )
         if isinstance(result.difference, Difference):
-            said += f"; {result.difference.position_rmse_m:.3f} m RMS apart"
+            verdicts += f"; {result.difference.position_rmse_m:.3f} m RMS apart"
         column.heading(result.axis.name)
-        column.write(f"Innovation variance: {said}.", size=7.5)
-    page.beside(*columns, gap=GAP)
-    shown = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
+        column.write(f"Innovation variance: {verdicts}.", size=7.5)
+    page.beside(*columns, gap=COLUMN_GAP)
+    shown_panels = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
     if any(isinstance(panels.error_reference(axis), pd.DataFrame) for axis in others):
-        shown.insert(2, panels.ERROR)
-    for panel in shown:
+        shown_panels.insert(2, panels.ERROR)
+    for panel in shown_panels:
         columns = [Page(width=width) for _ in others]
         for column, result in zip(columns, others, strict=True):
-            panel.put(column, analysis, result, last=panel is shown[-1], narrow=True)
-        page.beside(*columns, gap=GAP)
+            panel.draw_on_page(
+                column, analysis, result, last=panel is shown_panels[-1], narrow=True
+            )
+        page.beside(*columns, gap=COLUMN_GAP)
     yield page

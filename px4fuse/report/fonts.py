@@ -15,9 +15,9 @@ from px4fuse.report import say
 # Matplotlib's own, always there: Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
 # These have a box for every character
-BOXES = ("lastresort", "last resort", "blank", "notdef")
+BOX_FONTS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
-MOST_SHOWN = 12
+MAX_SHOWN = 12
 
 
 @cache
@@ -25,39 +25,41 @@ def font_of(character: str) -> str | None:
     """The font that draws a character: DejaVu Sans, else the first of the machine that has it."""
     if ord(character) in _characters(font_manager.findfont(FONT)):
         return FONT
-    return next((name for name, path in _others() if ord(character) in _characters(path)), None)
+    return next(
+        (name for name, path in _other_fonts() if ord(character) in _characters(path)), None
+    )
 
 
-def families(text: str) -> list[str]:
+def font_names(text: str) -> list[str]:
     """Fonts that draw a text, DejaVu Sans first."""
-    found = [font_of(character) for character in _foreign(text)]
-    return list(dict.fromkeys([FONT, *(name for name in found if name is not None)]))
+    names = [font_of(character) for character in _non_ascii(text)]
+    return list(dict.fromkeys([FONT, *(name for name in names if name is not None)]))
 
 
-def folders(names: tuple[str, ...]) -> list[str]:
+def font_folders(names: tuple[str, ...]) -> list[str]:
     """Folders that hold the files of some fonts."""
-    paths = {name: path for name, path in _others() if name in names} if len(names) > 1 else {}
-    found = [font_manager.findfont(FONT), *paths.values()]
-    return list(dict.fromkeys(str(Path(str(path)).parent) for path in found))
+    paths = {name: path for name, path in _other_fonts() if name in names} if len(names) > 1 else {}
+    font_files = [font_manager.findfont(FONT), *paths.values()]
+    return list(dict.fromkeys(str(Path(str(path)).parent) for path in font_files))
 
 
-def missing(text: str) -> str:
+def missing_characters(text: str) -> str:
     """Characters of a text that no font of this machine has, each once."""
-    return "".join(character for character in _foreign(text) if font_of(character) is None)
+    return "".join(character for character in _non_ascii(text) if font_of(character) is None)
 
 
-def advice(characters: str) -> str:
-    """What to install for :func:`missing` characters, as one sentence or two."""
-    shown = characters[:MOST_SHOWN] + ("…" if len(characters) > MOST_SHOWN else "")
+def font_advice(characters: str) -> str:
+    """What to install for :func:`missing_characters` characters, as one sentence or two."""
+    shown = characters[:MAX_SHOWN] + ("…" if len(characters) > MAX_SHOWN else "")
     return say("install_font", shown=shown, sign=NO_GLYPH)
 
 
-def _foreign(text: str) -> list[str]:
+def _non_ascii(text: str) -> list[str]:
     return [c for c in dict.fromkeys(text) if not c.isascii() and c.isprintable()]
 
 
 @cache
-def _others() -> tuple[tuple[str, FontPath], ...]:
+def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
     """Every other font of the machine, also those newer than matplotlib's own list."""
     manager = font_manager.fontManager
     known = {str(entry.fname) for entry in manager.ttflist}
@@ -67,15 +69,16 @@ def _others() -> tuple[tuple[str, FontPath], ...]:
         except (OSError, RuntimeError, NotImplementedError):
             continue  # what matplotlib cannot read draws nothing
     entries = [
-        entry for entry in manager.ttflist
-        if entry.style == "normal" and not any(word in entry.name.lower() for word in BOXES)
-    ]  # fmt: skip
+        entry
+        for entry in manager.ttflist
+        if entry.style == "normal" and not any(word in entry.name.lower() for word in BOX_FONTS)
+    ]
     return tuple(
-        (entry.name, FontPath(entry.fname, entry.index)) for entry in sorted(entries, key=_order)
+        (entry.name, FontPath(entry.fname, entry.index)) for entry in sorted(entries, key=_sort_key)
     )
 
 
-def _order(entry: FontEntry) -> tuple[object, ...]:
+def _sort_key(entry: FontEntry) -> tuple[object, ...]:
     """Those of Noto first, then without serifs, then the most regular.
 
     Those with PostScript outlines come late: they are embedded as if they were TrueType, and not

@@ -9,30 +9,41 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
-from px4fuse.report.style import EKF2_REJECTED, MUTED, Artist, Axes, time_axis
+from px4fuse.report.style import EKF2_REJECTED, MUTED_COLOUR, Artist, Axes, label_time_axis
 
 # Bands differ in grey by hatch and depth; marks stand on lines at the foot of the axes, resets
 # hang from their top
-GROUND: dict[str, Any] = {"facecolor": "#e4e4e4", "edgecolor": "none", "lw": 0.0}
-GAP: dict[str, Any] = {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "lw": 0.0, "hatch": "/////"}
-DROPOUT: dict[str, Any] = {"facecolor": "#a8a8a8", "edgecolor": "none", "lw": 0.0}
-MODE: dict[str, Any] = {"facecolor": "#f6f0e2", "edgecolor": "none", "lw": 0.0}
-RESET: dict[str, Any] = {"color": "#8a4508", "marker": 2, "ms": 6.0, "mew": 1.2, "ls": "none"}
-OUTLIER: dict[str, Any] = {"color": "black", "marker": "x", "ms": 3.0, "mew": 0.7, "ls": "none"}
-TAKE_OFF: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
-LANDING: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
-REJECTED_LINE, OUTLIER_LINE, RESET_LINE = 0.025, 0.075, 0.92
-STRIP = 12.0  # points for the names of flight modes
+GROUND_BAND: dict[str, Any] = {"facecolor": "#e4e4e4", "edgecolor": "none", "lw": 0.0}
+GAP_BAND: dict[str, Any] = {
+    "facecolor": "#fbfbfb",
+    "edgecolor": "#9a9a9a",
+    "lw": 0.0,
+    "hatch": "/////",
+}
+DROPOUT_BAND: dict[str, Any] = {"facecolor": "#a8a8a8", "edgecolor": "none", "lw": 0.0}
+MODE_BAND: dict[str, Any] = {"facecolor": "#f6f0e2", "edgecolor": "none", "lw": 0.0}
+RESET_MARK: dict[str, Any] = {"color": "#8a4508", "marker": 2, "ms": 6.0, "mew": 1.2, "ls": "none"}
+OUTLIER_MARK: dict[str, Any] = {
+    "color": "black",
+    "marker": "x",
+    "ms": 3.0,
+    "mew": 0.7,
+    "ls": "none",
+}
+TAKE_OFF_MARK: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
+LANDING_MARK: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
+REJECTED_HEIGHT, OUTLIER_HEIGHT, RESET_HEIGHT = 0.025, 0.075, 0.92
+STRIP_HEIGHT = 12.0  # points for the names of flight modes
 # Marks closer than this share of the segment fall on one another
-CLOSEST = 1.0 / 300.0
-STRIP_SIZE, STRIP_WIDTH = 6.5, 4.0  # of the letters, and of one of them, in points
+MIN_MARK_DISTANCE = 1.0 / 300.0
+STRIP_FONT_SIZE, STRIP_LETTER_WIDTH = 6.5, 4.0  # of the letters, and of one of them, in points
 
 
 class Mark(NamedTuple):
     """What happened: bands of the whole height, or signs at a height of the axes."""
 
     label: str
-    where: Sequence[Any] | Array
+    spans_or_times: Sequence[Any] | Array
     style: dict[str, Any]
     height: float | None = None
 
@@ -42,19 +53,21 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
     events = analysis.events
     modes = [(mode.start_s, mode.end_s) for mode in events.modes]
     return (
-        Mark("flight modes, in turn", modes[1::2], MODE),
-        Mark("on the ground", events.ground, GROUND),
-        Mark("source silent", events.gaps, GAP),
-        Mark("log dropout", events.dropouts, DROPOUT),
-        Mark("EKF2 rejected", rejected_s, EKF2_REJECTED, REJECTED_LINE),
-        Mark("outlier", outliers(analysis), OUTLIER, OUTLIER_LINE),
-        Mark("EKF2 reset", events.resets_s, RESET, RESET_LINE),
-        Mark("take-off", events.take_off_s, TAKE_OFF, 0.0),
-        Mark("landing", events.landing_s, LANDING, 0.0),
+        Mark("flight modes, in turn", modes[1::2], MODE_BAND),
+        Mark("on the ground", events.ground, GROUND_BAND),
+        Mark("source silent", events.gaps, GAP_BAND),
+        Mark("log dropout", events.dropouts, DROPOUT_BAND),
+        Mark("EKF2 rejected", rejected_s, EKF2_REJECTED, REJECTED_HEIGHT),
+        Mark("outlier", outlier_times(analysis), OUTLIER_MARK, OUTLIER_HEIGHT),
+        Mark("EKF2 reset", events.resets_s, RESET_MARK, RESET_HEIGHT),
+        Mark("take-off", events.take_off_s, TAKE_OFF_MARK, 0.0),
+        Mark("landing", events.landing_s, LANDING_MARK, 0.0),
     )
 
 
-def draw(axes: Axes, analysis: Analysis, *, axis: str | None = None, strip: bool = False) -> None:
+def draw_marks(
+    axes: Axes, analysis: Analysis, *, axis: str | None = None, strip: bool = False
+) -> None:
     """Mark what happened on a time axis, behind what is drawn there; it spans the segment.
 
     Parameters
@@ -71,31 +84,41 @@ def draw(axes: Axes, analysis: Analysis, *, axis: str | None = None, strip: bool
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
-    segment, across = analysis.segment, axes.get_xaxis_transform()
+    segment, x_transform = analysis.segment, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
     name = analysis.main.axis.name if axis is None else axis
     marks = _marks(analysis, analysis.events.rejected_s.get(name, ()))
-    for order, (_, where, style, height) in enumerate(marks, start=1):
-        if not len(where):
+    for order, (_, spans_or_times, style, height) in enumerate(marks, start=1):
+        if not len(spans_or_times):
             continue
         if height is None:
-            corners = [[(s, 0.0), (s, 1.0), (e, 1.0), (e, 0.0)] for s, e in where]
-            bands = PolyCollection(corners, transform=across, zorder=0.1 * order, **style)
+            corners = [[(s, 0.0), (s, 1.0), (e, 1.0), (e, 0.0)] for s, e in spans_or_times]
+            bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
-            shown = _apart(where, CLOSEST * (segment.end_s - segment.start_s))
-            look = {**style, "transform": across, "zorder": 2.6, "clip_on": height > 0.0}
-            signs = Line2D(shown, np.full(len(shown), height), **look)
-            axes.add_artist(signs)  # which leaves the limits alone
+            visible_times = _visible_times(
+                spans_or_times, MIN_MARK_DISTANCE * (segment.end_s - segment.start_s)
+            )
+            mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
+            markers = Line2D(visible_times, np.full(len(visible_times), height), **mark_style)
+            axes.add_artist(markers)  # which leaves the limits alone
     if strip:
-        _strip(axes, analysis)
+        _draw_mode_names(axes, analysis)
 
 
 def panel(
-    page: Page, analysis: Analysis, title: str, say: str, height: float, *, above: float = 4.0,
-    axis: str | None = None, strip: bool = False, last: bool = True,
-) -> Axes:  # fmt: skip
-    """A panel over the time of the flight, marked as by :func:`draw`.
+    page: Page,
+    analysis: Analysis,
+    title: str,
+    sentence: str,
+    height: float,
+    *,
+    above: float = 4.0,
+    axis: str | None = None,
+    strip: bool = False,
+    last: bool = True,
+) -> Axes:
+    """A panel over the time of the flight, marked as by :func:`draw_marks`.
 
     Parameters
     ----------
@@ -103,25 +126,25 @@ def panel(
         Whether it says what its x axis is; else another one below it does.
     """
     strip = strip and bool(analysis.events.modes)
-    axes = page.panel(title, say, height, above=max(above, STRIP if strip else 0.0))
-    draw(axes, analysis, axis=axis, strip=strip)
-    time_axis(axes, last)
+    axes = page.panel(title, sentence, height, above=max(above, STRIP_HEIGHT if strip else 0.0))
+    draw_marks(axes, analysis, axis=axis, strip=strip)
+    label_time_axis(axes, last)
     return axes
 
 
-def outliers(analysis: Analysis) -> Array:
+def outlier_times(analysis: Analysis) -> Array:
     """Times of the measurements that tuning takes for outliers, of all its axes together."""
     names = HORIZONTAL, analysis.main.axis.name
-    found = [
+    times_by_axis = [
         tuned.outlier_time_s
         for name, tuned in analysis.tuning.items()
         if isinstance(tuned, AxisTuning) and name in names
     ]
-    times: Array = np.unique(np.concatenate(found)) if found else np.empty(0)
+    times: Array = np.unique(np.concatenate(times_by_axis)) if times_by_axis else np.empty(0)
     return times
 
 
-def handles(analysis: Analysis) -> list[Artist]:
+def legend_entries(analysis: Analysis) -> list[Artist]:
     """Legend entries of the kinds of marks that this flight has."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
@@ -129,26 +152,32 @@ def handles(analysis: Analysis) -> list[Artist]:
     rejected = [time for times in analysis.events.rejected_s.values() for time in times]
     return [
         Patch(**style, label=label) if height is None else Line2D([], [], **style, label=label)
-        for label, where, style, height in _marks(analysis, rejected)
-        if len(where)
+        for label, spans_or_times, style, height in _marks(analysis, rejected)
+        if len(spans_or_times)
     ]
 
 
-def _apart(times: Any, least_s: float) -> Array:
+def _visible_times(times: Any, min_interval_s: float) -> Array:
     """Times without those that would be drawn on one another."""
     values = np.asarray(times, dtype=np.float64)
-    kept: Array = values[np.unique(np.floor(values / least_s), return_index=True)[1]]
-    return kept
+    visible: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]
+    return visible
 
 
-def _strip(axes: Axes, analysis: Analysis) -> None:
+def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:
     """Names of the flight modes above the axes, as far as each has room for its name."""
     low, high = axes.get_xlim()
     width = 72.0 * axes.bbox.width / axes.figure.dpi
     for mode in analysis.events.modes:
         start, end = max(mode.start_s, low), min(mode.end_s, high)
-        if (end - start) / (high - low) * width >= STRIP_WIDTH * len(mode.name):
+        if (end - start) / (high - low) * width >= STRIP_LETTER_WIDTH * len(mode.name):
             axes.text(
-                (start + end) / 2.0, 1.012, mode.name, transform=axes.get_xaxis_transform(),
-                ha="center", va="bottom", size=STRIP_SIZE, color=MUTED,
-            )  # fmt: skip
+                (start + end) / 2.0,
+                1.012,
+                mode.name,
+                transform=axes.get_xaxis_transform(),
+                ha="center",
+                va="bottom",
+                size=STRIP_FONT_SIZE,
+                color=MUTED_COLOUR,
+            )

@@ -10,40 +10,62 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from html.entities import html5
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from px4fuse.analysis import Analysis
 from px4fuse.answers import Answers, form_rows
+from px4fuse.errors import SettingsError
 from px4fuse.report.page import Page, appendix
-from px4fuse.report.style import MUTED
+from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
 if TYPE_CHECKING:
     from markdown_it.rules_inline import StateInline
+    from markdown_it.token import Token
     from markdown_it.tree import SyntaxTreeNode
 
 BODY_SIZE = 8.5
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # points
-MOST_INDENTS = 8
+MAX_INDENTS = 8
+# Levels of Markdown; each takes three levels of Python's stack, which has 1000
+MOST_NESTED = 100
 TABLE_SIZE = 8.0
 # $ opens before what is no space and closes after it, not before a digit: prices stay prices
-MATHS = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
-COMMAND = re.compile(r"\\([A-Za-z]+|.)")
-FRACTION = re.compile(r"\\frac\s*\{([^{}]*)\}\s*\{([^{}]*)\}")
-TAG = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
+MATHS_PATTERN = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
+COMMAND_PATTERN = re.compile(r"\\([A-Za-z]+|.)")
+FRACTION_PATTERN = re.compile(r"\\frac\s*\{([^{}]*)\}\s*\{([^{}]*)\}")
+TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 # Commands of TeX that HTML has no entity of the same name for, or another one
 SYMBOLS = {
-    "cdot": "·", "sqrt": "√", "to": "→", "neq": "≠", "infty": "∞", "circ": "°", "sim": "~",
-    "hat": "", "bar": "", "mathrm": "", "mathbf": "", "text": "", "left": "", "right": "",
-    "quad": " ", "ldots": "…", "degree": "°", ",": " ", ";": " ", "!": "",
-}  # fmt: skip
+    "cdot": "·",
+    "sqrt": "√",
+    "to": "→",
+    "neq": "≠",
+    "infty": "∞",
+    "circ": "°",
+    "sim": "~",
+    "hat": "",
+    "bar": "",
+    "mathrm": "",
+    "mathbf": "",
+    "text": "",
+    "left": "",
+    "right": "",
+    "quad": " ",
+    "ldots": "…",
+    "degree": "°",
+    ",": " ",
+    ";": " ",
+    "!": "",
+}
 
 
-def draw(found: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
+def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
     """Draw as many pages as the form and the notes need; none without both."""
     title, answers = "What the student found", results.student.answers
-    page = Page(appendix(title) if isinstance(found, Analysis) else title)
+    page = Page(appendix(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):
         page.heading("The form, as it was filled in")
         rows = [list(row) for row in form_rows(answers)]
@@ -61,18 +83,44 @@ def write(page: Page, notes: str) -> None:
     >>> [block["text"] for block in page.blocks]
     ['A b', 'σ_z^2 is R', '[picture: a map]']
     """
-    # the parser costs a fiftieth of a second: not where there are no notes
-    from markdown_it import MarkdownIt  # noqa: PLC0415
     from markdown_it.tree import SyntaxTreeNode  # noqa: PLC0415
 
+    _write_blocks(page, SyntaxTreeNode(parse(notes)), 0)
+
+
+def parse(notes: str, name: str = "the notes") -> list[Token]:
+    """Parse Markdown into tokens that can be drawn.
+
+    Parameters
+    ----------
+    notes : str
+    name : str
+        For the message.
+
+    Raises
+    ------
+    SettingsError
+        Emphasis, lists and quotes are nested more than :data:`MOST_NESTED` deep.
+    """
+    # the parser costs a fiftieth of a second: not where there are no notes
+    from markdown_it import MarkdownIt  # noqa: PLC0415
+
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
-    markdown.inline.ruler.before("escape", "maths", _maths)
-    _blocks(page, SyntaxTreeNode(markdown.parse(notes)), 0)
+    markdown.inline.ruler.before("escape", "maths", _parse_maths)
+    tokens = markdown.parse(notes)
+    every = (part for token in tokens for part in (token, *(token.children or ())))
+    depth = max(accumulate(token.nesting for token in every), default=0)
+    if depth > MOST_NESTED:
+        raise SettingsError(
+            f"{name}: nested {depth} deep, at most {MOST_NESTED} are drawn",
+            "Take repeated * and _ out.",
+        )
+    return tokens
 
 
-def _blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = "") -> None:
+def _write_blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = "") -> None:
     """Write what a node holds, the mark of a list before the first line of it."""
-    indent = INDENT * min(indents, MOST_INDENTS)
+    indent = INDENT * min(indents, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
         page.write("", size=BODY_SIZE, indent=indent, mark=mark)
@@ -81,69 +129,73 @@ def _blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = "") -> N
         match child.type:
             case "heading":
                 size = HEADING_SIZES.get(child.tag, BODY_SIZE)
-                page.write(_inline(child), size=size, bold=True, indent=indent, above=6.0)
+                page.write(_inline_text(child), size=size, bold=True, indent=indent, above=6.0)
             case "bullet_list" | "ordered_list":
                 first = int(child.attrs.get("start", 1))
                 for number, item in enumerate(child.children, first):
-                    numbered = child.type == "ordered_list"
-                    _blocks(page, item, indents + 1, f"{number}." if numbered else "•")
+                    is_numbered = child.type == "ordered_list"
+                    _write_blocks(page, item, indents + 1, f"{number}." if is_numbered else "•")
             case "blockquote":
-                _blocks(page, child, indents + 1)
+                _write_blocks(page, child, indents + 1)
             case "fence" | "code_block":
                 code = child.content.rstrip("\n").expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
-                page.write(code, size=7.5, colour=MUTED, indent=indent + INDENT)
+                page.write(code, size=7.5, colour=MUTED_COLOUR, indent=indent + INDENT)
             case "table":
-                rows = [row.children for part in child.children for row in part.children]
-                head, *body = ([_inline(cell) for cell in row] for row in rows)
+                rows = [row.children for section in child.children for row in section.children]
+                head, *body = ([_inline_text(cell) for cell in row] for row in rows)
                 page.table(head, body, shares=[1.0] * len(head), size=TABLE_SIZE)
             case "html_block":
-                page.write(TAG.sub("", child.content).strip(), size=BODY_SIZE, indent=indent)
+                page.write(
+                    TAG_PATTERN.sub("", child.content).strip(), size=BODY_SIZE, indent=indent
+                )
             case _:  # also a rule across, which says nothing
                 above = 0.0 if mark else 2.0
-                page.write(_inline(child), size=BODY_SIZE, indent=indent, mark=mark, above=above)
+                page.write(
+                    _inline_text(child), size=BODY_SIZE, indent=indent, mark=mark, above=above
+                )
         mark = ""
 
 
-def _inline(node: SyntaxTreeNode) -> str:
+def _inline_text(node: SyntaxTreeNode) -> str:
     """Words of a block without their marks."""
-    return "".join(map(_words, node.children))
+    return "".join(map(_node_text, node.children))
 
 
-def _words(node: SyntaxTreeNode) -> str:
+def _node_text(node: SyntaxTreeNode) -> str:
     match node.type:
         case "text" | "code_inline":
             return node.content
         case "softbreak" | "hardbreak" | "html_inline":
             return {"softbreak": " ", "hardbreak": "\n"}.get(node.type, "")
         case "maths":
-            return _letters(node.content)
+            return _tex_to_text(node.content)
         case "image":
             return f"[picture: {node.content}]" if node.content else "[picture]"
         case "link":
-            words, address = _inline(node), str(node.attrs.get("href", ""))
+            words, address = _inline_text(node), str(node.attrs.get("href", ""))
             return words if words in (address, "") else f"{words} ({address})"
         case _:
-            return _inline(node)
+            return _inline_text(node)
 
 
-def _maths(state: StateInline, silent: bool) -> bool:
+def _parse_maths(state: StateInline, silent: bool) -> bool:
     """Mathematics in dollar signs, as a rule of the parser: code and escapes come before it."""
-    found = MATHS.match(state.src, state.pos)
-    if found is None:
+    maths_match = MATHS_PATTERN.match(state.src, state.pos)
+    if maths_match is None:
         return False
     if not silent:
-        state.push("maths", "", 0).content = (found[1] or found[2]).strip()
-    state.pos = found.end()
+        state.push("maths", "", 0).content = (maths_match[1] or maths_match[2]).strip()
+    state.pos = maths_match.end()
     return True
 
 
-def _letters(maths: str) -> str:
+def _tex_to_text(maths: str) -> str:
     """TeX as letters, as far as letters go."""
-    text = COMMAND.sub(_symbol, FRACTION.sub(r"(\1)/(\2)", maths))
+    text = COMMAND_PATTERN.sub(_symbol, FRACTION_PATTERN.sub(r"(\1)/(\2)", maths))
     return text.translate(str.maketrans("{}~", "() "))
 
 
-def _symbol(found: re.Match[str]) -> str:
+def _symbol(command_match: re.Match[str]) -> str:
     """Greek letters and most signs are called as in HTML."""
-    name = found[1]
+    name = command_match[1]
     return SYMBOLS[name] if name in SYMBOLS else html5.get(f"{name};", name)

@@ -13,7 +13,7 @@ from typing import Any
 
 import typst
 
-from px4fuse.memory import give_back
+from px4fuse.memory import release_free_memory
 from px4fuse.report import (
     aids,
     clock,
@@ -29,29 +29,38 @@ from px4fuse.report import (
     whatif,
     why,
 )
-from px4fuse.report.cover import who
-from px4fuse.report.page import Page, data, printable
+from px4fuse.report.cover import student_line
+from px4fuse.report.page import Page, data, replace_unprintable
 from px4fuse.report.style import report_style
 from px4fuse.results import contract
-from px4fuse.results.model import NOBODY
+from px4fuse.results.model import NO_STUDENT
 
 RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
 # Of each kind of results
 PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.ComparisonResults: (
-        cover.draw, flight.draw, flight.draw_innovations, why.draw, flight.draw_other_axes,
-        consistency.draw, sensitivity.draw, clock.draw, aids.draw, loop.draw, notes.draw,
+        cover.draw,
+        flight.draw,
+        flight.draw_innovations,
+        why.draw,
+        flight.draw_other_axes,
+        consistency.draw,
+        sensitivity.draw,
+        clock.draw,
+        aids.draw,
+        loop.draw,
+        notes.draw,
         provenance.draw,
     ),
     contract.AidsResults: (aids.draw_alone, notes.draw, provenance.draw_aids),
     contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
     contract.WhatIfResults: (whatif.draw,),
     contract.EvaluationResults: (evaluation.draw,),
-}  # fmt: skip
+}
 
 
-def _named(results: Any) -> tuple[str, str, str]:
+def _title_name_hash(results: Any) -> tuple[str, str, str]:
     """Title of the PDF, and name and SHA-256 of the file that it is about."""
     match results:
         case contract.LoopResults(track=track):
@@ -62,12 +71,12 @@ def _named(results: Any) -> tuple[str, str, str]:
     return f"px4fuse {command} {log.name}", log.name, log.sha256
 
 
-def render(found: Any, results: Any, results_json: str) -> bytes:
+def render(content: Any, results: Any, results_json: str) -> bytes:
     """Set the report.
 
     Parameters
     ----------
-    found : Analysis, AidsAlone, Loop, Counterfactual or Evaluation
+    content : Analysis, AidsAlone, Loop, Counterfactual or Evaluation
         What is drawn.
     results : Results
         What is written of it; each kind has its :data:`PAGES`.
@@ -79,39 +88,39 @@ def render(found: Any, results: Any, results_json: str) -> bytes:
     bytes
         The same for the same input and the same versions: no dates, no random identifiers.
     """
-    blocks, written = list[Any](), ""
+    blocks, written_text = list[Any](), ""
     with report_style():
         # one at a time: the figures of all pages would be a tenth of all memory
-        for page in (page for draw in PAGES[type(results)] for page in draw(found, results)):
-            written += json.dumps(page.blocks, ensure_ascii=False, default=repr)
+        for page in (page for draw in PAGES[type(results)] for page in draw(content, results)):
+            written_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
             blocks += data(page.blocks)
-    title, name, sha256 = _named(results)
+    title, name, sha256 = _title_name_hash(results)
     made_by = f"px4fuse {metadata.version('px4fuse')}"
-    student = who(getattr(results, "student", NOBODY), " · ")
-    give_back()  # what drew the figures; Typst takes as much
+    student = student_line(getattr(results, "student", NO_STUDENT), " · ")
+    release_free_memory()  # what drew the figures; Typst takes as much
     # figures have no text of others
-    words = title + name + student + written
-    return compiled(
+    words = title + name + student + written_text
+    return compile_pdf(
         {
             "title": title,
             "author": made_by,
-            "head": _line(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
-            "student": _line(student, 40),
+            "head": _shorten(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
+            "student": _shorten(student, 40),
             "foot": made_by,
-            "fonts": fonts.families(words),
+            "fonts": fonts.font_names(words),
             "blocks": blocks,
             "results": results_json,
         }
     )
 
 
-def _line(text: str, most: int) -> str:
+def _shorten(text: str, max_length: int) -> str:
     """One line of so many letters at most."""
-    line = " ".join(printable(text).split())
-    return line if len(line) <= most else f"{line[: most - 1]}…"
+    line = " ".join(replace_unprintable(text).split())
+    return line if len(line) <= max_length else f"{line[: max_length - 1]}…"
 
 
-def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
+def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
     """Data set by a template, by default ``report.typ``.
 
     Raises
@@ -128,12 +137,12 @@ def compiled(report: Mapping[str, Any], template: str | None = None) -> bytes:
             font_paths=typst.Fonts(
                 include_system_fonts=False,
                 include_embedded_fonts=False,
-                font_paths=fonts.folders(tuple(report["fonts"])),
+                font_paths=fonts.font_folders(tuple(report["fonts"])),
             ),
             package_path=empty,
             package_cache_path=empty,
             sys_inputs={"data": json.dumps(report)},
         )
-        made = compiler.compile(format="pdf", pdf_standards=STANDARDS)
-    assert isinstance(made, bytes)
-    return made
+        document = compiler.compile(format="pdf", pdf_standards=STANDARDS)
+    assert isinstance(document, bytes)
+    return document

@@ -3,14 +3,14 @@
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from px4fuse.analysis import AidsAlone, Analysis
+from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.report import clock, fonts, say
 from px4fuse.report.page import Page
-from px4fuse.report.style import MUTED
-from px4fuse.report.words import alignment_words, clock_words
+from px4fuse.report.style import MUTED_COLOUR
+from px4fuse.report.words import describe_alignment, format_clock_map
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
@@ -20,41 +20,47 @@ INDENT, SIZE = 140.0, 7.5
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw one page or more."""
     flight, source = analysis.flight, analysis.source
-    placed = source.alignment
-    page = _begin("Appendix: provenance", results)
-    _log(page, flight, source)
-    clocks = map(clock_words, flight.clocks)
-    _section(page, "Clocks, to the autopilot's boot clock", plain=clocks)
-    _section(
-        page, f"Stamps of {source.name}, by the IMU", plain=[clock.line(analysis, results.findings)]
+    placement = source.alignment
+    page = _start_page("Appendix: provenance", results)
+    _write_log(page, flight, source)
+    clocks = map(format_clock_map, flight.clocks)
+    _write_section(page, "Clocks, to the autopilot's boot clock", plain=clocks)
+    _write_section(
+        page,
+        f"Stamps of {source.name}, by the IMU",
+        plain=[clock.summary_line(analysis, results.findings)],
     )
-    if placed is not None:
-        _section(page, f"Placement of {source.name}", alignment_words(placed).items())
-    _section(page, "Choices made on the way", plain=analysis.notes or ["none"])
-    _missing(page, analysis.missing)
-    _methods(page, "methods.md")
+    if placement is not None:
+        _write_section(page, f"Placement of {source.name}", describe_alignment(placement).items())
+    _write_section(page, "Choices made on the way", plain=analysis.notes or ["none"])
+    _write_missing(page, analysis.missing)
+    _write_methods(page, "methods.md")
     yield page
 
 
-def draw_aids(alone: AidsAlone, results: AidsResults) -> Iterator[Page]:
+def draw_aids(alone: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
     """Draw one page or more about a flight whose aids alone were judged."""
-    flight, page = alone.flight, _begin("Provenance", results)
-    _log(page, flight)
-    _section(page, "Choices made on the way", plain=flight.log.notes or ["none"])
-    _missing(page, (alone.lacking, *flight.missing))
+    flight, page = alone.flight, _start_page("Provenance", results)
+    _write_log(page, flight)
+    _write_section(page, "Choices made on the way", plain=flight.log.notes or ["none"])
+    _write_missing(page, (alone.missing_data, *flight.missing))
     yield page
 
 
-def _log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
+def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
     """What the log is, which position was taken, and its parameters without those of others."""
     log, facts = flight.log, dict[str, str]()
     others = (f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source)
-    unlike = set[str]()
+    other_parameters = set[str]()
     if source is not None:
         aid = source.origin.aid or EV_POS
-        unlike = unlike.union(*(one.own for one in (EV_POS, GNSS_POS) if one != aid))
+        other_parameters = other_parameters.union(
+            *(one.own_parameters for one in (EV_POS, GNSS_POS) if one != aid)
+        )
         facts["position source"] = say("source", source=source, topics=", ".join(source.topics))
-    parameters = (f"{n} {value:g}" for n, value in log.parameters.items() if n not in unlike)
+    parameters = (
+        f"{n} {value:g}" for n, value in log.parameters.items() if n not in other_parameters
+    )
     facts = {
         "file": f"{log.name}, {log.bytes} bytes, {log.format}",
         "SHA-256": log.sha256,
@@ -65,48 +71,52 @@ def _log(page: Page, flight: Flight, source: PositionTrack | None = None) -> Non
         "also in the log": ", ".join(others) or "no other position",
         "parameters": ", ".join(parameters) or "none",
     }
-    _section(page, "The log", facts.items())
+    _write_section(page, "The log", facts.items())
 
 
-def _missing(page: Page, parts: Iterable[Unavailable]) -> None:
+def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
     missing = [
-        (part.source or part.what, f"{part.reason}. {with_options(part.remedy)}") for part in parts
+        (part.source or part.what, f"{part.reason}. {with_options(part.remedy)}")
+        for part in unavailable_parts
     ]
     none = [] if missing else ["nothing is missing"]
-    _section(page, "Looked for and not found", missing, none)
+    _write_section(page, "Looked for and not found", missing, none)
 
 
 def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw one page or more about a loop alone."""
-    page = _begin("Provenance", results)
+    page = _start_page("Provenance", results)
     tracks = [("track", loop.odometry.trajectory), *(("reference", r) for r in loop.references)]
-    read = [
-        (label, f"{track.name}, {track.size_bytes} bytes, SHA-256 {track.sha256}. "
-         f"{' '.join(track.notes)}")
+    file_facts = [
+        (
+            label,
+            f"{track.name}, {track.size_bytes} bytes, SHA-256 {track.sha256}. "
+            f"{' '.join(track.notes)}",
+        )
         for label, track in tracks
-    ]  # fmt: skip
-    _section(page, "The files", read)
-    _section(page, "Choices made on the way", plain=loop.notes or ["none"])
-    _methods(page, "methods_loop.md")
+    ]
+    _write_section(page, "The files", file_facts)
+    _write_section(page, "Choices made on the way", plain=loop.notes or ["none"])
+    _write_methods(page, "methods_loop.md")
     yield page
 
 
-def _begin(title: str, results: ComparisonResults | AidsResults | LoopResults) -> Page:
+def _start_page(title: str, results: ComparisonResults | AidsResults | LoopResults) -> Page:
     """A page that begins with what the report was made with."""
-    page, student, made = Page(title), results.student, results.provenance
+    page, student, versions = Page(title), results.student, results.provenance
     facts = {
-        "command": made.command,
-        "px4fuse": f"{made.px4fuse} on Python {made.python}",
-        "libraries": ", ".join(f"{name} {version}" for name, version in made.libraries.items()),
+        "command": versions.command,
+        "px4fuse": f"{versions.px4fuse} on Python {versions.python}",
+        "libraries": ", ".join(f"{name} {version}" for name, version in versions.libraries.items()),
         "results": "attached inside this PDF as results.json",
     }
-    if fonts.missing(student.name + student.id + student.notes):
+    if fonts.missing_characters(student.name + student.id + student.notes):
         facts["fonts"] = say("no_font", sign=fonts.NO_GLYPH)
-    _section(page, "Made with", facts.items())
+    _write_section(page, "Made with", facts.items())
     return page
 
 
-def _section(
+def _write_section(
     page: Page, title: str, labelled: Iterable[tuple[str, str]] = (), plain: Iterable[str] = ()
 ) -> None:
     """Write labelled sentences and others in small letters; nothing where there are none."""
@@ -114,11 +124,13 @@ def _section(
     if labelled or plain:
         page.heading(title, 9.5, above=9.0)
     for label, text in labelled:
-        page.labelled(label, text, size=SIZE, width=INDENT, above=-1.0, colour=MUTED, bold=False)
+        page.labelled(
+            label, text, size=SIZE, width=INDENT, above=-1.0, colour=MUTED_COLOUR, bold=False
+        )
     for text in plain:
         page.write(text, size=SIZE)
 
 
-def _methods(page: Page, name: str) -> None:
+def _write_methods(page: Page, name: str) -> None:
     text = Path(__file__).with_name(name).read_text(encoding="utf-8")
-    _section(page, "How the numbers are made", plain=text.split("\n\n"))
+    _write_section(page, "How the numbers are made", plain=text.split("\n\n"))

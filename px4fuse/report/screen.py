@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from px4fuse.report.page import Block, Cell
-from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
+from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import (
     OPTIONS,
     ComparisonRequest,
@@ -28,14 +28,17 @@ from px4fuse.request import (
 )
 
 INDENT = 9
-COLUMN = 6.0  # points
+COLUMN_POINTS = 6.0  # points
 # Colours of paper that a screen has too; others stand for lines of panels, and are left out
 STYLES = {
-    MUTED: "dim", SEVERITY_COLOURS["error"]: "bold red", SEVERITY_COLOURS["warning"]: "yellow",
-    SEVERITY_COLOURS["info"]: "cyan", GOOD: "green",
-}  # fmt: skip
+    MUTED_COLOUR: "dim",
+    SEVERITY_COLOURS["error"]: "bold red",
+    SEVERITY_COLOURS["warning"]: "yellow",
+    SEVERITY_COLOURS["info"]: "cyan",
+    GOOD_COLOUR: "green",
+}
 # A value ends before the full stop of its sentence
-_WRITTEN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
+_COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 _FIELDS = {option.name: field for field, option in OPTIONS.items()}
 
 
@@ -52,11 +55,15 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
     for block in blocks:
         match block["kind"]:
             case "text" | "heading":
-                paragraph(console, _styled(block), indent=round(block.get("indent", 0.0) / COLUMN))
+                print_paragraph(
+                    console,
+                    _styled_text(block),
+                    indent=round(block.get("indent", 0.0) / COLUMN_POINTS),
+                )
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
-                console.print(_table(**block))
+                console.print(_rich_table(**block))
             case "command":
                 print_line(console, block["label"], block["text"])
             case "blank":
@@ -71,16 +78,18 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
     labels = [line for line in lines if len(line) < INDENT]
     aside = "".join(f" ({line})" for line in lines if len(line) >= INDENT)
     for place, (label, part) in enumerate(zip_longest(labels, block["texts"])):
-        words, commands = Text() if part is None else _styled(part), list[str]()
+        words, commands = Text() if part is None else _styled_text(part), list[str]()
         if request is not None:
-            words.plain, commands = runnable(words.plain, request)
+            words.plain, commands = expand_commands(words.plain, request)
         words.append("" if place else aside)
-        paragraph(console, words, _styled({**block["label"], "text": label or ""}), INDENT)
+        print_paragraph(
+            console, words, _styled_text({**block["label"], "text": label or ""}), INDENT
+        )
         for command in commands:
             print_line(console, "", command)
 
 
-def runnable(text: str, request: Request) -> tuple[str, list[str]]:
+def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     """A text with its commands cut down to what they change, and the commands in full.
 
     Parameters
@@ -91,41 +100,45 @@ def runnable(text: str, request: Request) -> tuple[str, list[str]]:
 
     Examples
     --------
-    >>> runnable("px4fuse compare LOG --sigma-z 0.2: better.", ComparisonRequest(log="a b.ulg"))
+    >>> expand_commands("px4fuse compare LOG --sigma-z 0.2: better.", ComparisonRequest(log="a b.ulg"))
     ('--sigma-z 0.2: better.', ["px4fuse compare 'a b.ulg' --sigma-z 0.2"])
     """
     commands = []
-    for name, options in _WRITTEN.findall(text):
+    for name, options in _COMMAND.findall(text):
         words = options.split()
         values = zip(words[::2], words[1::2], strict=True)
         changes = {_FIELDS[option]: float(value) for option, value in values}
         commands.append(rerun(request, name, changes))
-    short = _WRITTEN.sub(lambda found: found[2].strip() or f"px4fuse {found[1]}", text)
-    return short, list(dict.fromkeys(commands))
+    short_text = _COMMAND.sub(lambda found: found[2].strip() or f"px4fuse {found[1]}", text)
+    return short_text, list(dict.fromkeys(commands))
 
 
 def rerun(request: Request, command: str, changes: Mapping[str, float]) -> str:
     """A command on the files of a request, with its other options and some changed."""
-    asked = request
+    new_request = request
     if isinstance(request, ComparisonRequest):
         if command == "loop":
-            asked = LoopRequest(
+            new_request = LoopRequest(
                 source=request.log,
                 system=request.system,
                 start_s=request.start_s,
                 end_s=request.end_s,
             )
         elif command == "whatif":
-            asked = WhatIfRequest(log=request.log, mavlink=request.mavlink, system=request.system)
-    return command_line(replace(asked, **changes), command, typed=True)
+            new_request = WhatIfRequest(
+                log=request.log, mavlink=request.mavlink, system=request.system
+            )
+    return command_line(replace(new_request, **changes), command, typed=True)
 
 
-def _styled(block: Block) -> Text:
+def _styled_text(block: Block) -> Text:
     style = STYLES.get(block["colour"], "")
     return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
 
 
-def paragraph(console: Console, text: str | Text, head: str | Text = "", indent: int = 0) -> None:
+def print_paragraph(
+    console: Console, text: str | Text, head: str | Text = "", indent: int = 0
+) -> None:
     """Print a paragraph.
 
     Parameters
@@ -152,16 +165,16 @@ def print_line(console: Console, label: str, text: str, style: str = "bold cyan 
     console.print(Text(f"{label:{INDENT}}", "bold").append(text, style), soft_wrap=True)
 
 
-def _table(
+def _rich_table(
     head: Sequence[str], rows: Iterable[Iterable[Cell]], right: Sequence[int], **_: object
 ) -> Table:
     """A table without lines; of a head the lines are its group, name and unit."""
-    made = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    vertical: Literal["bottom", "top"] = "bottom" if any("\n" in one for one in head) else "top"
-    for at, one in enumerate(head):
-        side: Literal["right", "left"] = "right" if at in right else "left"
-        made.add_column(Text(one), justify=side, overflow="fold", vertical=vertical)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    vertical: Literal["bottom", "top"] = "bottom" if any("\n" in title for title in head) else "top"
+    for index, title in enumerate(head):
+        side: Literal["right", "left"] = "right" if index in right else "left"
+        table.add_column(Text(title), justify=side, overflow="fold", vertical=vertical)
     for row in rows:
         texts = [(cell, "") if isinstance(cell, str) else cell for cell in row]
-        made.add_row(*(Text(text, STYLES.get(colour, "")) for text, colour in texts))
-    return made
+        table.add_row(*(Text(text, STYLES.get(colour, "")) for text, colour in texts))
+    return table

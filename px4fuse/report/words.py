@@ -7,42 +7,42 @@ from typing import TYPE_CHECKING, Any
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
 from px4fuse.comparison.model import UnjudgedFilter as Unjudged
-from px4fuse.filter.consistency import SIGMA_OFF, Consistency
+from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.flight import Alignment, Truth, Unavailable
-from px4fuse.plain import factor_words, number_words, p_words
+from px4fuse.plain import format_factor, format_number, format_p_value
 from px4fuse.recording import ClockMap
 from px4fuse.report import say
-from px4fuse.report.style import GOOD, MUTED, SEVERITY_COLOURS
+from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
     from px4fuse.report.page import Cell, Page
 
 # Below, "white" is wrong: of the eight verdicts of a flight one in a hundred by chance
-WHITE_P = 0.001
-RMSE = ("position_rmse_m", "velocity_rmse_m_s")
+MIN_WHITE_P = 0.001
+RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
-def settings_words(settings: Settings) -> str:
+def format_settings(settings: Settings) -> str:
     """The filter's settings in one phrase."""
     offset = f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     return say("settings", settings=settings, offset=offset)
 
 
-def verdict_words(statement: Consistency | Unavailable) -> str:
+def format_verdict(statement: Consistency | Unavailable) -> str:
     """Verdict with its factor, or why there is none."""
     if isinstance(statement, Unavailable):
         return "not available"
     if statement.verdict == "consistent":
         return "consistent"
     side = statement.verdict.removeprefix("variance ")
-    return f"{side} {factor_words(statement.times_off)}× in σ"
+    return f"{side} {format_factor(statement.sigma_error_factor)}× in σ"
 
 
-def filters(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
+def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
     """Both filters of an axis by the names that a reader sees; ours alone where EKF2 is missing."""
     known = {"ours": result.filters["kf"]}
     if not isinstance(result.ekf2_state, Unavailable):
@@ -55,18 +55,20 @@ VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "innovation\nvarian
 
 def verdict_rows(
     axes: Iterable[AxisComparison],
-    more: Callable[[AxisComparison, str, FilterSummary | Unjudged], Sequence[str]],
+    extra_cells: Callable[[AxisComparison, str, FilterSummary | Unjudged], Sequence[str]],
 ) -> list[list[Cell]]:
     """A row for each axis and filter: what :data:`VERDICT_HEAD` says, and more cells."""
     rows: list[list[Cell]] = []
     for result in axes:
-        for name, one in filters(result).items():
+        for name, one in filters_by_name(result).items():
             label = result.axis.name if name == "ours" else ""
-            nis, colour = ("", ""), MUTED
+            nis, colour = ("", ""), MUTED_COLOUR
             if isinstance(one, Consistency):
-                nis = (number_words(one.nis_mean), "{:.2f} – {:.2f}".format(*one.nis_band))
-                colour = GOOD if one.verdict == "consistent" else SEVERITY_COLOURS["warning"]
-            rows.append([label, name, *nis, (verdict_words(one), colour), *more(result, name, one)])
+                nis = (format_number(one.nis_mean), "{:.2f} – {:.2f}".format(*one.nis_band))
+                colour = GOOD_COLOUR if one.verdict == "consistent" else SEVERITY_COLOURS["warning"]
+            rows.append(
+                [label, name, *nis, (format_verdict(one), colour), *extra_cells(result, name, one)]
+            )
     return rows
 
 
@@ -79,19 +81,19 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 
-    def more(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
-        found: list[Any] = [result.difference if name == "ours" else None] if has_ekf2 else []
-        found += [one.truth] if has_truth else []
-        return [_metres(part, field) for part in found for field in RMSE]
+    def rms_cells(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
+        statistics: list[Any] = [result.difference if name == "ours" else None] if has_ekf2 else []
+        statistics += [one.truth] if has_truth else []
+        return [_format_rms(statistic, field) for statistic in statistics for field in RMSE_FIELDS]
 
     head = [*VERDICT_HEAD, *(["apart\n(m)", "\n(m/s)"] if has_ekf2 else [])]
     head += ["to truth\n(m)", "\n(m/s)"] if has_truth else []
-    page.table(head, verdict_rows(axes, more), right=(2, 3, 5, 6, 7, 8))
+    page.table(head, verdict_rows(axes, rms_cells), right=(2, 3, 5, 6, 7, 8))
 
 
-def _metres(part: object, field: str) -> str:
+def _format_rms(statistic: object, field: str) -> str:
     """A root mean square of three digits; empty where there is none."""
-    value = getattr(part, field, None)
+    value = getattr(statistic, field, None)
     return "" if value is None else f"{value:.3f}"
 
 
@@ -101,49 +103,51 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     A source that may drift; factors that are too small for a finding; innovations of the right
     size that are not white.
     """
-    stated = [
-        (result.axis.name, owner, statement)
+    statements = [
+        (result.axis.name, filter_name, statement)
         for result in comparison.axes.values()
-        for owner, statement in filters(result).items()
+        for filter_name, statement in filters_by_name(result).items()
         if isinstance(statement, Consistency)
     ]
     notes = []
     if comparison.source.origin.may_drift:
         notes.append(say("follows_source"))
-    small = [
-        f"{owner} {axis} {verdict_words(statement)}"
-        for axis, owner, statement in stated
-        if statement.verdict != "consistent" and statement.times_off < SIGMA_OFF
+    small_deviations = [
+        f"{filter_name} {axis} {format_verdict(statement)}"
+        for axis, filter_name, statement in statements
+        if statement.verdict != "consistent" and statement.sigma_error_factor < SIGMA_FACTOR_FINDING
     ]
-    if small:
-        notes.append(say("small_factors", which=", ".join(small), least=SIGMA_OFF))
-    coloured = [
-        f"{owner} {axis} {p_words(statement.ljung_box_p)}, lag-1 "
+    if small_deviations:
+        notes.append(
+            say("small_factors", which=", ".join(small_deviations), least=SIGMA_FACTOR_FINDING)
+        )
+    correlated = [
+        f"{filter_name} {axis} {format_p_value(statement.ljung_box_p)}, lag-1 "
         f"{statement.lag1_autocorrelation:+.2f}"
-        for axis, owner, statement in stated
-        if statement.verdict == "consistent" and statement.ljung_box_p < WHITE_P
+        for axis, filter_name, statement in statements
+        if statement.verdict == "consistent" and statement.ljung_box_p < MIN_WHITE_P
     ]
-    if coloured:
-        notes.append(say("not_white", which="; ".join(coloured)))
+    if correlated:
+        notes.append(say("not_white", which="; ".join(correlated)))
     return notes
 
 
-def consequences_words(followers: Sequence[Finding]) -> str:
+def format_consequences(followers: Sequence[Finding]) -> str:
     """What the same cause brings with it, each in one sentence."""
-    return "With it: " + " ".join(f"{one.headline}." for one in followers)
+    return "With it: " + " ".join(f"{finding.headline}." for finding in followers)
 
 
-def clock_words(clock: ClockMap) -> str:
+def format_clock_map(clock: ClockMap) -> str:
     """How one clock was mapped to the autopilot's, with its figures."""
-    told = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
-    if told or clock.distinct_stamps is not None:
+    is_note_sufficient = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
+    if is_note_sufficient or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
     return say("clock_map", clock=clock, jitter_ms=clock.jitter_s * 1e3) + (
         f"; {clock.note}" if clock.note else ""
     )
 
 
-def alignment_words(alignment: Alignment) -> dict[str, str]:
+def describe_alignment(alignment: Alignment) -> dict[str, str]:
     """How a position file was placed into the flight: labels and sentences."""
     north, east, down = alignment.origin_m
     yaw = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
@@ -157,9 +161,9 @@ def alignment_words(alignment: Alignment) -> dict[str, str]:
         f"({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
-        apart = "" if residual is None else f", {residual:.3f} m RMS per axis"
-        like = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
-        lines["match"] = like + apart
+        residual_text = "" if residual is None else f", {residual:.3f} m RMS per axis"
+        correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
+        lines["match"] = correlation_text + residual_text
     return lines
 
 
@@ -185,17 +189,17 @@ def tuning_advice(
         if noise.value is not None and not drifts
     ]
     if options:
-        typed = f"px4fuse compare LOG{''.join(options)}"
-        advice["Re-run"] = f"with the noises of {name}: {typed}"
+        command = f"px4fuse compare LOG{''.join(options)}"
+        advice["Re-run"] = f"with the noises of {name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
         advice["SIGMA_Z"] = f"is at least {sigma_z.low:.2g} m: is this a position source at all?"
     elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = say("sigma_z_hidden", bound=bound)
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
-        now = log.parameters.get("EKF2_EVP_NOISE")
-        said = "" if now is None else f" (now {now:g})"
-        advice["PX4"] = f"EKF2_EVP_NOISE {sigma_z.value:.3g}{said}"
+        px4_value = log.parameters.get("EKF2_EVP_NOISE")
+        current_value = "" if px4_value is None else f" (now {px4_value:g})"
+        advice["PX4"] = f"EKF2_EVP_NOISE {sigma_z.value:.3g}{current_value}"
     if sigma_a.value is None:
         advice["SIGMA_A"] = (
             "is not determined by this flight: too little motion, or too short."

@@ -21,12 +21,12 @@ from px4fuse.ekf2.whatif import Summary
 from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.heading import HeadingError
-from px4fuse.filter.tuning import Tuned
+from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.findings import Finding
 from px4fuse.flight import Alignment
-from px4fuse.loop.model import LoopPart
+from px4fuse.loop.model import LoopResult
 from px4fuse.origin import Passage, PositionKind
-from px4fuse.record import Count, Maybe, Positive, Record, Sha256, Span, Unavailable
+from px4fuse.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
 from px4fuse.recording import ClockMap, InputFile, LogInfo
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import VERSION, Provenance, Schema, Student, Version
@@ -99,7 +99,7 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
 
 
 # Field of Tuned that says what each setting of the filter should be
-ASKED = {"sigma_a_m_s2": "filter_sigma_a_m_s2", "sigma_z_m": "sigma_z_m"}
+TUNED_FIELDS = {"sigma_a_m_s2": "filter_sigma_a_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
 Which = Literal["A", "B"]
@@ -158,7 +158,7 @@ class FindingChange(Record, frozen=True):
     only_in: Which
 
 
-class _OfFlight(Record, frozen=True):
+class _FlightResults(Record, frozen=True):
     schema: Schema
     request: ComparisonRequest
     log: Log
@@ -166,7 +166,7 @@ class _OfFlight(Record, frozen=True):
     settings: ChosenSettings
 
 
-class ComparisonResults(_OfFlight, frozen=True):
+class ComparisonResults(_FlightResults, frozen=True):
     """Results of ``px4fuse compare``, attached to its report.
 
     Attributes
@@ -206,14 +206,14 @@ class ComparisonResults(_OfFlight, frozen=True):
 
     axes: Annotated[dict[AxisName, AxisResult], Meta(min_length=1)]
     horizontal: dict[FilterName, HorizontalNis]
-    tuning: dict[str, Maybe[Tuned]]
-    clock: Maybe[Clock]
-    heading: Maybe[HeadingError]
-    ekf2_replay: Maybe[Replayed]
-    why: dict[str, Maybe[WhySteps]]
+    tuning: dict[str, OrUnavailable[NoiseEstimate]]
+    clock: OrUnavailable[Clock]
+    heading: OrUnavailable[HeadingError]
+    ekf2_replay: OrUnavailable[Replayed]
+    why: dict[str, OrUnavailable[WhySteps]]
     causes: tuple[Intervention, ...]
     aids: dict[str, AidResult]
-    loop: Maybe[LoopPart]
+    loop: OrUnavailable[LoopResult]
     story: tuple[str, ...]
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -235,17 +235,17 @@ class AidsResults(Record, frozen=True):
     provenance: Provenance
 
 
-class TuningResults(_OfFlight, frozen=True):
+class TuningResults(_FlightResults, frozen=True):
     """Results of ``px4fuse tune``: the noises that the data ask for, by axis."""
 
-    tuning: dict[str, Maybe[Tuned]]
+    tuning: dict[str, OrUnavailable[NoiseEstimate]]
     provenance: Provenance
 
 
-class SyncResults(_OfFlight, frozen=True):
+class SyncResults(_FlightResults, frozen=True):
     """Results of ``px4fuse sync``: the clock offset of the position source."""
 
-    clock: Maybe[Clock]
+    clock: OrUnavailable[Clock]
     provenance: Provenance
 
 
@@ -256,7 +256,7 @@ class LoopResults(Record, frozen=True):
     request: LoopRequest
     track: Track
     references: tuple[Track, ...]
-    loop: LoopPart
+    loop: LoopResult
     findings: tuple[Finding, ...]
     student: Student
     provenance: Provenance
@@ -384,8 +384,8 @@ def schema() -> dict[str, Any]:
 
 def to_plain(results: msgspec.Struct) -> dict[str, Any]:
     """Results as dicts, lists and numbers, by the names that they have in JSON."""
-    found: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain)
-    return found
+    plain_results: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain)
+    return plain_results
 
 
 def round_number(value: float) -> float:
@@ -431,11 +431,11 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
     ValueError
         A number in them is not finite.
     """
-    found = to_plain(results) if isinstance(results, msgspec.Struct) else results
-    plain = _round_numbers(found)
+    plain_results = to_plain(results) if isinstance(results, msgspec.Struct) else results
+    plain = _round_numbers(plain_results)
     return json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def files_named(text: str) -> list[str]:
+def file_hashes_in(text: str) -> list[str]:
     """SHA-256 of every file that results as JSON rest on, as they stand there."""
     return re.findall(r'"([0-9a-f]{64})"', text)

@@ -14,7 +14,7 @@ VERSION: Literal["3.0"] = "3.0"
 # The libraries on whose arithmetic the numbers rest
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 MAX_NOTES_BYTES = 200_000
-MAX_PERSON = 10_000
+MAX_PERSON_LENGTH = 10_000
 
 Version = Annotated[str, Meta(pattern="^[0-9A-Za-z.+!_-]{1,60}$")]
 
@@ -38,13 +38,13 @@ class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         The form about the flight, as filled in.
     """
 
-    name: Annotated[str, Meta(max_length=MAX_PERSON)] = ""
-    id: Annotated[str, Meta(max_length=MAX_PERSON)] = ""
+    name: Annotated[str, Meta(max_length=MAX_PERSON_LENGTH)] = ""
+    id: Annotated[str, Meta(max_length=MAX_PERSON_LENGTH)] = ""
     notes: Annotated[str, Meta(max_length=MAX_NOTES_BYTES)] = ""
     answers: Answers | msgspec.UnsetType = msgspec.UNSET
 
 
-NOBODY = Student()
+NO_STUDENT = Student()
 
 
 class Provenance(Record, frozen=True):

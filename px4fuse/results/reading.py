@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from px4fuse.errors import ResultsError
-from px4fuse.record import choose
+from px4fuse.record import decode_record_or_unavailable
 from px4fuse.results.contract import KINDS, Results
 from px4fuse.results.model import VERSION
 
@@ -29,7 +29,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     Returns
     -------
     Results
-        By the name in its schema. Texts are :func:`cleaned`, numbers are finite.
+        By the name in its schema. Texts are :func:`clean_text`, numbers are finite.
 
     Raises
     ------
@@ -39,8 +39,8 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if len(data) > MAX_BYTES:
         raise ResultsError(f"{name} is larger than {MAX_BYTES // 1_000_000} MB.")
     try:
-        value = _all_cleaned(msgspec.json.decode(data))
-        json.loads(data, object_pairs_hook=_each_once)
+        value = _clean_values(msgspec.json.decode(data))
+        json.loads(data, object_pairs_hook=_require_unique_keys)
     except RecursionError as error:
         raise ResultsError(f"{name} is nested too deeply.") from error
     except (msgspec.DecodeError, ValueError) as error:
@@ -54,40 +54,40 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
             "other_version", name=name, version=one_line(version, 20), reads=VERSION
         )
     try:
-        found: Results = msgspec.convert(value, kind, dec_hook=choose)
+        results: Results = msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
     except msgspec.ValidationError as error:
         raise ResultsError.of("not_of_schema", name=name, why=one_line(str(error), 300)) from error
-    return found
+    return results
 
 
-def _each_once(pairs: list[tuple[str, Any]]) -> None:
+def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:
     """Refuse what one program reads from its first place and another one from its last."""
     if len(dict(pairs)) < len(pairs):
         raise ValueError("a key stands there twice")
 
 
-def _all_cleaned(value: Any) -> Any:
-    """The same with every text :func:`cleaned`."""
+def _clean_values(value: Any) -> Any:
+    """The same with every text :func:`clean_text`."""
     if isinstance(value, str):
-        return cleaned(value)
+        return clean_text(value)
     if isinstance(value, dict):
-        return {cleaned(name): _all_cleaned(part) for name, part in value.items()}
+        return {clean_text(name): _clean_values(part) for name, part in value.items()}
     if isinstance(value, int) and value.bit_length() > INTEGER_BITS:
         raise ValueError("an integer is too large")
-    return [_all_cleaned(part) for part in value] if isinstance(value, list) else value
+    return [_clean_values(part) for part in value] if isinstance(value, list) else value
 
 
-def cleaned(text: str) -> str:
+def clean_text(text: str) -> str:
     r"""Text without characters that act on a terminal, a page or the order of its neighbours.
 
     Control characters other than newline and tab, bidirectional embeddings, overrides and
     isolates, line and paragraph separators, invisible tags, noncharacters and lone surrogates are
     dropped. Letters and signs of all languages stay.
 
-    >>> cleaned("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
+    >>> clean_text("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
     'Zoë[2J gnp.exe'
     """
-    return text if text.isascii() and text.isprintable() else "".join(filter(_harmless, text))
+    return text if text.isascii() and text.isprintable() else "".join(filter(_is_harmless, text))
 
 
 def one_line(text: str, length: int) -> str:
@@ -97,12 +97,12 @@ def one_line(text: str, length: int) -> str:
     'a b…'
     """
     # of a million characters only as many are looked at as may count
-    line = " ".join(cleaned(text[: 10 * length]).split())
+    line = " ".join(clean_text(text[: 10 * length]).split())
     return line if len(line) <= length else line[: length - 1].rstrip() + "…"
 
 
 @cache
-def _harmless(character: str) -> bool:
+def _is_harmless(character: str) -> bool:
     code = ord(character)
     if character in "\n\t":
         return True

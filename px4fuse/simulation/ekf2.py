@@ -17,11 +17,11 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.heights import inside
-from px4fuse.ekf2.inputs import NO_LIMIT, Inputs, Received, Rules
+from px4fuse.ekf2.heights import samples_inside
+from px4fuse.ekf2.inputs import UNLIMITED_RESETS, FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.model import delayed_states, run_variants
-from px4fuse.ekf2.output_predictor import follow_attitude, later, publish
-from px4fuse.ekf2.recursion import EAST, HEADING, LEVEL, NORTH, Run, Variant
+from px4fuse.ekf2.output_predictor import delay_by, follow_attitude, publish
+from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, POSITION_COLUMNS, StretchRun, Variant
 from px4fuse.ekf2.stretches import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -29,11 +29,11 @@ from px4fuse.ekf2.stretches import (
     STATES,
     THETA,
     VELOCITY,
-    Heights,
+    HeightSamples,
     Stretch,
+    add_field_states,
     down_sampled,
     step_ends,
-    with_field,
 )
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
 from px4fuse.simulation import sensors
@@ -55,9 +55,11 @@ PREDICT_US = 10_000  # EKF2_PREDICT_US
 # Of each axis of both fields, when the magnetometer has been aligned on the ground
 FIELD_SD_GAUSS = 0.03
 # v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
-RULES = Rules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
+RULES = FusionRules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
 # v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
-GNSS_RULES = Rules(np.inf, np.inf, 7.0, NO_LIMIT, None, False, reset_scale=2.0, with_velocity=True)
+GNSS_RULES = FusionRules(
+    np.inf, np.inf, 7.0, UNLIMITED_RESETS, None, False, reset_scale=2.0, with_velocity=True
+)
 # EKF2_NOAID_TOUT: without aiding for longer EKF2 stays where it is (fake_pos_control.cpp)
 NO_AIDING_S = 5.0
 # EKF2_ANGERR_INIT, _GPS_V_NOISE, _GPS_P_NOISE, _GBIAS_INIT and _ABIAS_INIT (covariance.cpp)
@@ -72,7 +74,7 @@ HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.15
 MAX_INTERVAL_S = 0.1
 
 
-def _fused(scenario: Scenario) -> tuple[Aid, ...]:
+def _fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
     """What of EKF2's aids has parameters in the model."""
     return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
@@ -81,7 +83,7 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
     """EKF2's parameters as flown: all that its model has, by PX4 name."""
     aid = scenario.aid
     gnss = aid == GNSS_POS
-    known = settings_in_force({}, *_fused(scenario))
+    known = settings_in_force({}, *_fused_aids(scenario))
     delay_ms = known[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
     of_aid: dict[str, float] = {aid.noise_mode: 1}
     if gnss:
@@ -110,7 +112,7 @@ def fly(
     imu: Topic,
     source: sensors.SensedPositions,
     others: tuple[Topic, ...],
-    flown: Mapping[str, int | float],
+    log_parameters: Mapping[str, int | float],
 ) -> tuple[Topic, ...]:
     """EKF2's topics of a flight, those that it had anything to say in.
 
@@ -118,15 +120,15 @@ def fly(
     ----------
     imu, source, others : Topic, SensedPositions, tuple of Topic
         As EKF2 received them, whatever of them is logged; outdoors magnetometer and barometer.
-    flown : mapping
+    log_parameters : mapping
         Parameters of the log.
     """
-    aid, aids = scenario.aid, _fused(scenario)
+    aid, aids = scenario.aid, _fused_aids(scenario)
     stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu)
-    known = {name: float(np.float32(v)) for name, v in flown.items()}
+    known = {name: float(np.float32(v)) for name, v in log_parameters.items()}
     if others:
         magnetometer, barometer = others
-        stretch = replace(stretch, heights=_heights(stretch, barometer))
+        stretch = replace(stretch, heights=_barometer_heights(stretch, barometer))
         if not known[MAG.switch]:
             stretch = _with_field(stretch, magnetometer)
     settings = settings_in_force(known, *aids)
@@ -136,9 +138,11 @@ def fly(
     inputs = Inputs(
         settings=settings,
         stretches=(stretch,),
-        received=_received(source),
+        received=_arrived_samples(source),
         # ev_pos_control.cpp: without bit 0 samples are only compared with the state
-        rules=rules if int(flown[aid.switch]) & 1 else replace(rules, start_interval_s=0.0),
+        rules=rules
+        if int(log_parameters[aid.switch]) & 1
+        else replace(rules, start_interval_s=0.0),
         step_s=step_s,
         horizon_s=(length - 1) * step_s,
         predict_s=PREDICT_US * 1e-6,
@@ -147,10 +151,10 @@ def fly(
         aid=aid,
         max_interval_s=MAX_INTERVAL_S,
     )
-    done = run_variants(inputs, [Variant(settings)], {})[0]
-    track = _track(inputs, done, time_us, nominal)
+    model_run = run_variants(inputs, [Variant(settings)], {})[0]
+    track = _topic_track(inputs, model_run, time_us, nominal)
     aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
-    return ekf2_topics(inputs, done, track, scenario.attitude_rate_hz, aid_source_hz)
+    return ekf2_topics(inputs, model_run, track, scenario.attitude_rate_hz, aid_source_hz)
 
 
 def _stretch(
@@ -170,11 +174,13 @@ def _stretch(
     rotation = attitude(motion.at(time)).body_to_ned
     nominal = sensors.quaternions(rotation)
     gyro = running_product(np.concatenate([nominal[:1], from_vector(turn)]))
-    beyond = multiply(nominal, conjugate(gyro))
+    attitude_difference = multiply(nominal, conjugate(gyro))
     error = np.zeros((len(time), 3))
     error[:, HEADING] = sensors.attitude_error(scenario, mistakes, time).as_rotvec()[:, HEADING]
-    at_rest = sensors.at_rest(scenario, mistakes, motion, REST_S)
-    state, covariance = _standing(rotation[0], *at_rest, float(error[0, HEADING]))
+    mean_imu_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_S)
+    state, covariance = _initial_state_at_rest(
+        rotation[0], *mean_imu_at_rest, float(error[0, HEADING])
+    )
     variance = np.diagonal(covariance).copy()
     deviation = np.sqrt(variance)
     return (
@@ -182,7 +188,9 @@ def _stretch(
             time_s=time,
             step_s=np.diff(time),
             rotation=rotation,
-            correction_rad=to_vector(multiply(beyond[1:], conjugate(beyond[:-1]))),
+            correction_rad=to_vector(
+                multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
+            ),
             force_m_s2=gain / np.diff(time)[:, None],
             accelerometer_bias_m_s2=np.zeros(3),
             state=state,
@@ -205,18 +213,18 @@ def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
     taken_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(stretch.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
     fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
-    return with_field(stretch, taken_s, gauss, 1.0, fields, np.full(6, FIELD_SD_GAUSS**2))
+    return add_field_states(stretch, taken_s, gauss, 1.0, fields, np.full(6, FIELD_SD_GAUSS**2))
 
 
-def _heights(stretch: Stretch, barometer: Topic) -> Heights:
+def _barometer_heights(stretch: Stretch, barometer: Topic) -> HeightSamples:
     """The barometer, EKF2's only sensor of height here."""
     taken_s = sensors.time_s(barometer) - 0.5 * float(np.median(stretch.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    samples = inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
-    return Heights((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
+    samples = samples_inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
+    return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
 
 
-def _standing(
+def _initial_state_at_rest(
     rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
     """State and covariance when the log begins: PX4's initial ones, told that it stands still.
@@ -240,7 +248,7 @@ def _standing(
     return x, 0.5 * (P + P.T)
 
 
-def _received(source: sensors.SensedPositions) -> Received:
+def _arrived_samples(source: sensors.SensedPositions) -> ReceivedPositions:
     """The samples in the order of their arrival, without those that are older than the one before.
 
     EKF2 takes no sample that is not newer than the last (estimator_interface.cpp).
@@ -251,40 +259,46 @@ def _received(source: sensors.SensedPositions) -> Received:
         for name in ("timestamp_sample", "timestamp")
     )
     newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamp[:-1]]))
-    kept = stamp > newest
+    is_newer = stamp > newest
     velocity = source.velocity_m_s
     if velocity is not None:
-        accuracy = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)[kept] ** 2
-        speed = np.repeat(fields["s_variance_m_s"][kept, None] ** 2, 3, axis=1)
+        accuracy = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)[is_newer] ** 2
+        speed = np.repeat(fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1)
     else:
-        accuracy, speed = fields["position_variance"][kept], None
-    return Received(
-        stamp_s=stamp[kept],
-        arrival_s=arrival[kept],
-        position_m=source.position_m[kept].astype(np.float32).astype(np.float64),
+        accuracy, speed = fields["position_variance"][is_newer], None
+    return ReceivedPositions(
+        stamp_s=stamp[is_newer],
+        arrival_s=arrival[is_newer],
+        position_m=source.position_m[is_newer].astype(np.float32).astype(np.float64),
         variance_m2=accuracy.astype(np.float64),
-        rejected=np.full(int(kept.sum()), np.nan),
-        reset=np.zeros(int(kept.sum()), dtype=bool),
+        rejected=np.full(int(is_newer.sum()), np.nan),
+        reset=np.zeros(int(is_newer.sum()), dtype=bool),
         source=source.topic.name,
-        velocity_m_s=None if velocity is None else velocity[kept],
+        velocity_m_s=None if velocity is None else velocity[is_newer],
         velocity_variance_m2_s2=speed,
     )
 
 
-def _track(inputs: Inputs, done: Run, time_us: IntArray, nominal: Array) -> TopicTrack:
-    stretch = done.stretch
+def _topic_track(
+    inputs: Inputs, model_run: StretchRun, time_us: IntArray, nominal: Array
+) -> TopicTrack:
+    stretch = model_run.stretch
     lag = round(inputs.horizon_s / inputs.step_s)
-    state, _ = delayed_states(done, 0)
-    resets, aided = _held(done, state)
-    moved = np.zeros((len(state), 3))
+    state, _ = delayed_states(model_run, 0)
+    resets, aided = _hold_without_aiding(model_run, state)
+    reset_sum_m = np.zeros((len(state), 3))
     for step, jump in resets:
-        moved[step:, :2] += jump
+        reset_sum_m[step:, :2] += jump
     # the newest IMU samples are corrected with the bias of the horizon
-    gyro = np.einsum("nij,nj->ni", stretch.rotation[1:], later(state[:, GYRO_BIAS], lag)[1:])
-    turned = -stretch.correction_rad - gyro * stretch.step_s[:, None]
-    free = state[0, THETA] + np.concatenate([np.zeros((1, 3)), np.cumsum(turned, axis=0)])
-    ours = free + follow_attitude(state[:, THETA] - free, lag, inputs.step_s, inputs.horizon_s)
-    velocity, position = publish(stretch, state, moved, ours, lag, inputs.settings)
+    gyro = np.einsum("nij,nj->ni", stretch.rotation[1:], delay_by(state[:, GYRO_BIAS], lag)[1:])
+    attitude_steps = -stretch.correction_rad - gyro * stretch.step_s[:, None]
+    gyro_attitude_error = state[0, THETA] + np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(attitude_steps, axis=0)]
+    )
+    attitude_error = gyro_attitude_error + follow_attitude(
+        state[:, THETA] - gyro_attitude_error, lag, inputs.step_s, inputs.horizon_s
+    )
+    velocity, position = publish(stretch, state, reset_sum_m, attitude_error, lag, inputs.settings)
     return TopicTrack(
         time_us=time_us,
         lag=lag,
@@ -292,32 +306,36 @@ def _track(inputs: Inputs, done: Run, time_us: IntArray, nominal: Array) -> Topi
         delayed=state[:, 3:],
         velocity_m_s=velocity,
         position_m=position,
-        attitude=multiply(from_vector(ours), nominal),
+        attitude=multiply(from_vector(attitude_error), nominal),
         resets=tuple((step + lag, jump) for step, jump in resets),
         aided=aided,
     )
 
 
-def _held(done: Run, state: Array) -> tuple[list[tuple[int, Array]], BoolArray]:
+def _hold_without_aiding(
+    model_run: StretchRun, state: Array
+) -> tuple[list[tuple[int, Array]], BoolArray]:
     """Resets by step, and where there is aiding; without it for long the position stays.
 
     EKF2 then fuses a position of its own making. The model has none: ``state`` is held in place.
     """
-    events, run, time = done.events[0], done, done.stretch.time_s
+    events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
     horizontal = slice(NORTH, EAST + 1)
     used = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
     last = np.zeros(len(time))
     last[events.end[used]] = time[events.end[used]]
     aided = time - np.maximum.accumulate(last) <= NO_AIDING_S
-    first = np.flatnonzero(np.diff(aided.astype(int)) == -1) + 1
-    beyond = np.flatnonzero(np.diff(aided.astype(int)) == 1) + 1
-    for start, end in zip(first, [*beyond, len(time)][: len(first)], strict=True):
+    aiding_ends = np.flatnonzero(np.diff(aided.astype(int)) == -1) + 1
+    aiding_starts = np.flatnonzero(np.diff(aided.astype(int)) == 1) + 1
+    for start, end in zip(
+        aiding_ends, [*aiding_starts, len(time)][: len(aiding_ends)], strict=True
+    ):
         state[start:end, horizontal] = state[start - 1, horizontal]
         state[start:end, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
     for event in np.flatnonzero(run.reset[:, 0]):
         step = int(events.end[event])
-        jump = run.innovation[event, 0, LEVEL]
+        jump = run.innovation[event, 0, POSITION_COLUMNS]
         if not aided[step - 1]:
             jump = state[step, horizontal] - state[step - 1, horizontal]
         resets.append((step, jump))

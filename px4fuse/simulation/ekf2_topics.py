@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.recursion import EAST, LEVEL, NORTH, Run
+from px4fuse.ekf2.recursion import EAST, NORTH, POSITION_COLUMNS, StretchRun
 from px4fuse.ekf2.stretches import POSITION
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.readers.px4_ekf2 import MAG_3D_BIT
@@ -21,7 +21,7 @@ from px4fuse.simulation.ulog_writer import Topic, topic
 VEHICLE_AID_SOURCE_HZ = 2.0
 STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
 MAGNETOMETER_HZ, OTHER_AIDS_HZ = 2.0, 2.0
-PUBLISHED_LATER_US = 100
+PUBLICATION_DELAY_US = 100
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class TopicTrack:
 
 def ekf2_topics(
     inputs: Inputs,
-    done: Run,
+    model_run: StretchRun,
     track: TopicTrack,
     attitude_hz: float,
     aid_source_hz: float,
@@ -74,7 +74,7 @@ def ekf2_topics(
 
     Parameters
     ----------
-    done : Run
+    model_run : Run
         The model's run, of one variant in one stretch.
     attitude_hz : float
         Of vehicle_attitude, which is EKF2's where it fuses a magnetometer.
@@ -82,22 +82,26 @@ def ekf2_topics(
         To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
     """
     topics = (
-        _local_position(track, gnss=inputs.aid == GNSS_POS),
-        _states(done, track, gnss=inputs.aid == GNSS_POS),
-        *_aid_sources(inputs, done, track, aid_source_hz),
-        *_barometer(inputs, done, track),
-        *([] if done.stretch.field is None else _of_field(inputs, done, track, attitude_hz)),
-        _flags(inputs, done, track),
+        _local_position_topic(track, gnss=inputs.aid == GNSS_POS),
+        _states_topic(model_run, track, gnss=inputs.aid == GNSS_POS),
+        *_aid_sources(inputs, model_run, track, aid_source_hz),
+        *_barometer_topics(inputs, model_run, track),
+        *(
+            []
+            if model_run.stretch.field is None
+            else _magnetometer_topics(inputs, model_run, track, attitude_hz)
+        ),
+        _flags_topic(inputs, model_run, track),
     )
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
 
 
-def _local_position(track: TopicTrack, *, gnss: bool) -> Topic:
-    rows = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), LOCAL_POSITION_HZ))
+def _local_position_topic(track: TopicTrack, *, gnss: bool) -> Topic:
+    rows = np.flatnonzero(sensors.keep_at_rate(sensors.seconds(track.time_us), LOCAL_POSITION_HZ))
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
     count = np.searchsorted(steps, rows, side="right")
-    fields = sensors.stamps(track.time_us[rows], PUBLISHED_LATER_US)
+    fields = sensors.stamps(track.time_us[rows], PUBLICATION_DELAY_US)
     fields |= sensors.vectors({"": track.position_m[rows], "v": track.velocity_m_s[rows]})
     aided = track.aided[np.maximum(rows - track.lag, 0)]
     fields |= {"delta_xy": jumps[count], "xy_reset_counter": count % 256}
@@ -107,12 +111,12 @@ def _local_position(track: TopicTrack, *, gnss: bool) -> Topic:
     return topic("vehicle_local_position", fields)
 
 
-def _states(done: Run, track: TopicTrack, *, gnss: bool) -> Topic:
+def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> Topic:
     """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
-    end = done.events[0].end
+    end = model_run.events[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
     events = events[end[events] < len(track.time_us) - track.lag]
-    events = events[sensors.thinned(sensors.seconds(track.time_us[end[events]]), STATES_HZ)]
+    events = events[sensors.keep_at_rate(sensors.seconds(track.time_us[end[events]]), STATES_HZ)]
     rows = end[events]
     states = np.zeros((len(rows), 25), np.float32)
     states[:, 0:4] = track.delayed_attitude[rows]
@@ -121,27 +125,33 @@ def _states(done: Run, track: TopicTrack, *, gnss: bool) -> Topic:
     if gnss:
         states[:, 9] -= sensors.HOME[2]  # and downwards as altitude, where there is an origin
     covariances = np.zeros((len(rows), 24), np.float32)
-    covariances[:, : done.variance.shape[2]] = done.variance[events + 1, 0]
+    covariances[:, : model_run.variance.shape[2]] = model_run.variance[events + 1, 0]
     fields = track.stamps(rows) | {"states": states, "covariances": covariances}
     return topic("estimator_states", fields)
 
 
-def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -> tuple[Topic, ...]:
+def _aid_sources(
+    inputs: Inputs, model_run: StretchRun, track: TopicTrack, rate_hz: float
+) -> tuple[Topic, ...]:
     """estimator_aid_src_*: a message for every sample that came in time."""
-    events, run, aid = done.events[0], done, inputs.aid
-    seen = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
-    seen = seen[sensors.thinned(sensors.seconds(track.time_us[events.end[seen]]), rate_hz)]
-    rows, sample, received = events.end[seen], events.sample[seen], inputs.received
-    shown = track.stamps(rows, events.time_s[seen])
+    events, run, aid = model_run.events[0], model_run, inputs.aid
+    event_rows = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
+    event_rows = event_rows[
+        sensors.keep_at_rate(sensors.seconds(track.time_us[events.end[event_rows]]), rate_hz)
+    ]
+    rows, sample, received = events.end[event_rows], events.sample[event_rows], inputs.received
+    aid_stamps = track.stamps(rows, events.time_s[event_rows])
     measured = received.position_m[sample, :2]
     north, east = measured.T
-    told = (run.innovation, run.innovation_variance, run.noise)
-    innovation, variance, noise = (each[seen, 0, LEVEL] for each in told)
+    innovation_arrays = (run.innovation, run.innovation_variance, run.noise)
+    innovation, variance, noise = (
+        each[event_rows, 0, POSITION_COLUMNS] for each in innovation_arrays
+    )
     idle = np.isnan(innovation[:, :1])
     # while it is not fused, against the state that there is
     innovation = np.where(idle, measured - track.delayed[rows][:, POSITION][:, :2], innovation)
-    variance = np.where(idle, run.variance[seen + 1, 0, NORTH : EAST + 1] + noise, variance)
-    used = np.where(run.fused[seen, 0] | run.reset[seen, 0], track.time_us[rows], -1)
+    variance = np.where(idle, run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise, variance)
+    used = np.where(run.fused[event_rows, 0] | run.reset[event_rows, 0], track.time_us[rows], -1)
     last = np.maximum.accumulate(used)
     last_us = np.where(last >= 0, sensors.START_US + last, 0)
     gnss = received.velocity_m_s is not None
@@ -149,72 +159,91 @@ def _aid_sources(inputs: Inputs, done: Run, track: TopicTrack, rate_hz: float) -
     position = _aid_source(
         aid,
         inputs.settings,
-        shown | {"time_last_fuse": last_us},
+        aid_stamps | {"time_last_fuse": last_us},
         np.stack(observed, axis=1),
         (innovation, variance, noise),
-        (run.rejected[seen, 0], run.fused[seen, 0]),
+        (run.rejected[event_rows, 0], run.fused[event_rows, 0]),
     )
     if received.velocity_m_s is None:
         return (position,)
-    moving, spread, speed_noise = (each[seen, 0, :3] for each in told)
+    moving, spread, speed_noise = (each[event_rows, 0, :3] for each in innovation_arrays)
     outside = np.any(moving**2 > inputs.settings[GNSS_VEL.gate] ** 2 * spread, axis=1)
     return position, _aid_source(
         GNSS_VEL,
         inputs.settings,
-        shown,
+        aid_stamps,
         received.velocity_m_s[sample],
         (moving, spread, speed_noise),
         (outside, ~outside & np.isfinite(moving).all(axis=1)),
     )
 
 
-def _barometer(inputs: Inputs, done: Run, track: TopicTrack) -> list[Topic]:
+def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> list[Topic]:
     """What a barometer has EKF2 say: its innovations."""
-    heights, end = done.stretch.heights, done.events[0].end
-    if heights is None or done.heights is None:
+    heights, end = model_run.stretch.heights, model_run.events[0].end
+    if heights is None or model_run.heights is None:
         return []
-    told = done.heights.updates(BAROMETER.name, 0, end.astype(float))
-    told = told[told["fused_at_s"] < len(track.time_us) - track.lag].iloc[1:]
-    told = told[sensors.thinned(told.index.to_numpy(), OTHER_AIDS_HZ)]
-    innovation, variance, rejected, fused, rows = told.to_numpy().T
-    taken_s, step = told.index.to_numpy(), rows.astype(np.intp)
+    update_rows = model_run.heights.updates(BAROMETER.name, 0, end.astype(float))
+    update_rows = update_rows[update_rows["fused_at_s"] < len(track.time_us) - track.lag].iloc[1:]
+    update_rows = update_rows[sensors.keep_at_rate(update_rows.index.to_numpy(), OTHER_AIDS_HZ)]
+    innovation, variance, rejected, fused, rows = update_rows.to_numpy().T
+    taken_s, step = update_rows.index.to_numpy(), rows.astype(np.intp)
     measured = heights.down_m[np.searchsorted(heights.taken_s, taken_s)] - sensors.HOME[2]
     noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
     return [
         _aid_source(
-            BAROMETER, inputs.settings, track.stamps(step, taken_s),
-            measured, (innovation, variance, noise), (rejected > 0, fused > 0),
+            BAROMETER,
+            inputs.settings,
+            track.stamps(step, taken_s),
+            measured,
+            (innovation, variance, noise),
+            (rejected > 0, fused > 0),
         )
-    ]  # fmt: skip
+    ]
 
 
-def _of_field(inputs: Inputs, done: Run, track: TopicTrack, attitude_hz: float) -> list[Topic]:
+def _magnetometer_topics(
+    inputs: Inputs, model_run: StretchRun, track: TopicTrack, attitude_hz: float
+) -> list[Topic]:
     """What a magnetometer has EKF2 say: vehicle_attitude, its innovations, and that it is fused."""
-    field, settings, end = done.stretch.field, inputs.settings, done.events[0].end
+    field, settings, end = model_run.stretch.field, inputs.settings, model_run.events[0].end
     assert field is not None
-    seen = np.flatnonzero(
-        np.isfinite(done.field[:, 2, 0, 0]) & (end < len(track.time_us) - track.lag)
+    event_rows = np.flatnonzero(
+        np.isfinite(model_run.field[:, 2, 0, 0]) & (end < len(track.time_us) - track.lag)
     )
-    seen = seen[sensors.thinned(sensors.seconds(track.time_us[end[seen]]), OTHER_AIDS_HZ)]
-    rows, (innovation, variance, fused) = end[seen], np.moveaxis(done.field[seen, :, 0], 1, 0)
+    event_rows = event_rows[
+        sensors.keep_at_rate(sensors.seconds(track.time_us[end[event_rows]]), OTHER_AIDS_HZ)
+    ]
+    rows, (innovation, variance, fused) = (
+        end[event_rows],
+        np.moveaxis(model_run.field[event_rows, :, 0], 1, 0),
+    )
     last = field.value[np.searchsorted(field.step, rows, side="right") - 1]
     noise = np.full(innovation.shape, settings[MAG.noise] ** 2)
     taken = fused[:, 0] > 0.0
-    published = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us), attitude_hz))
-    told = np.flatnonzero(sensors.thinned(sensors.seconds(track.time_us[: -track.lag]), FLAGS_HZ))
+    published = np.flatnonzero(sensors.keep_at_rate(sensors.seconds(track.time_us), attitude_hz))
+    status_rows = np.flatnonzero(
+        sensors.keep_at_rate(sensors.seconds(track.time_us[: -track.lag]), FLAGS_HZ)
+    )
     return [
         sensors.attitude_topic(
-            "vehicle_attitude", track.time_us[published], PUBLISHED_LATER_US,
+            "vehicle_attitude",
+            track.time_us[published],
+            PUBLICATION_DELAY_US,
             track.attitude[published],
         ),
         _aid_source(
-            MAG, settings, track.stamps(rows), last,
-            (innovation, variance, noise), (~taken, taken),
+            MAG,
+            settings,
+            track.stamps(rows),
+            last,
+            (innovation, variance, noise),
+            (~taken, taken),
         ),
         topic(
-            "estimator_status", track.stamps(told) | {"control_mode_flags": 1 << MAG_3D_BIT}
+            "estimator_status", track.stamps(status_rows) | {"control_mode_flags": 1 << MAG_3D_BIT}
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _aid_source(
@@ -222,11 +251,11 @@ def _aid_source(
     settings: Mapping[str, float],
     stamps: Mapping[str, Any],
     observation: Array,
-    judged: tuple[Array, Array, Array],
-    decided: tuple[BoolArray, BoolArray],
+    innovation_parts: tuple[Array, Array, Array],
+    decisions: tuple[BoolArray, BoolArray],
 ) -> Topic:
-    """An aid's message; ``judged`` are innovation, S and R, ``decided`` rejected and fused."""
-    innovation, variance, noise = judged
+    """An aid's message; ``innovation_parts`` are innovation, S and R, ``decisions`` rejected and fused."""
+    innovation, variance, noise = innovation_parts
     ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
     fields = {
         **stamps,
@@ -235,30 +264,32 @@ def _aid_source(
         "innovation": -innovation,
         "innovation_variance": variance,
         "test_ratio": ratio,
-        "innovation_rejected": decided[0],
-        "fused": decided[1],
+        "innovation_rejected": decisions[0],
+        "fused": decisions[1],
     }
     name = f"estimator_aid_src_{aid.name}"
     return topic(name, fields, name if aid == GNSS_POS else "estimator_aid_src")
 
 
-def _flags(inputs: Inputs, done: Run, track: TopicTrack) -> Topic:
+def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> Topic:
     """estimator_status_flags: once a second, and when fusion of vision starts or stops."""
-    events, run, time = done.events[0], done, done.stretch.time_s
-    tried = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
-    on = np.zeros(len(time), np.bool_)
-    stops = np.append(time[events.end[tried]], np.inf)[1:]
-    for step, stop in zip(events.end[tried].tolist(), stops.tolist(), strict=True):
+    events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
+    attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
+    is_fusing = np.zeros(len(time), np.bool_)
+    stops = np.append(time[events.end[attempts]], np.inf)[1:]
+    for step, stop in zip(events.end[attempts].tolist(), stops.tolist(), strict=True):
         until = time[step] + inputs.rules.stop_s
-        on[step : int(np.searchsorted(time, min(stop, until)))] = True
-    changed = np.diff(on.astype(int), prepend=0) != 0
-    kept = changed | sensors.thinned(time, FLAGS_HZ)
-    rows = np.flatnonzero(kept[: len(time) - track.lag])
+        is_fusing[step : int(np.searchsorted(time, min(stop, until)))] = True
+    changed = np.diff(is_fusing.astype(int), prepend=0) != 0
+    is_logged = changed | sensors.keep_at_rate(time, FLAGS_HZ)
+    rows = np.flatnonzero(is_logged[: len(time) - track.lag])
     gnss = inputs.aid == GNSS_POS
     fields = track.stamps(rows) | {
         "control_status_changes": np.cumsum(changed)[rows],
-        "cs_gnss_pos": on[rows] & gnss,
-        "cs_ev_pos": on[rows] & (not gnss),
-        "cs_mag_hdg" if done.stretch.field is None else "cs_mag_3d": True,
+        "cs_gnss_pos": is_fusing[rows] & gnss,
+        "cs_ev_pos": is_fusing[rows] & (not gnss),
+        "cs_mag_hdg" if model_run.stretch.field is None else "cs_mag_3d": True,
     }
-    return topic("estimator_status_flags", fields | ({"cs_gnss_vel": on[rows]} if gnss else {}))
+    return topic(
+        "estimator_status_flags", fields | ({"cs_gnss_vel": is_fusing[rows]} if gnss else {})
+    )

@@ -10,12 +10,12 @@ from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Flight
-from px4fuse.plain import plain
+from px4fuse.plain import to_json_types
 from px4fuse.readers.ulog import read_ulog
 from px4fuse.readers.ulog_topics import NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ
-from px4fuse.simulation.mistakes import MISTAKES, Mistakes, as_typed, made
+from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistakes, format_mistake
 from px4fuse.simulation.motion import Motion, plan
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
@@ -62,7 +62,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     SettingsError
         A mistake does not fit the scenario.
     """
-    for name in made(mistakes):
+    for name in active_mistakes(mistakes):
         if scenario.kind not in (kinds := MISTAKES[name].kinds):
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
         if MISTAKES[name].of_ekf2 and not scenario.ekf2:
@@ -88,7 +88,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     if scenario.aid == GNSS_POS:
         barometer = sensors.barometer(scenario, motion)
         others = (sensors.magnetometer(scenario, mistakes, motion), barometer)
-        topics += [sensors.at_rate(others[0], MAGNETOMETER_HZ), barometer]
+        topics += [sensors.limit_rate(others[0], MAGNETOMETER_HZ), barometer]
     if scenario.truth:
         topics.append(sensors.ground_truth(scenario, motion))
     for topic in topics:
@@ -155,18 +155,18 @@ def answer(simulation: Simulation) -> dict[str, Any]:
     first, last = motion.at(np.array([0.0, motion.duration_s])).position_m
     stamps = source.topic.fields["timestamp_sample"].astype(np.int64) - sensors.START_US
     outlier = np.flatnonzero(source.outlier)
-    found: dict[str, Any] = plain(
+    found: dict[str, Any] = to_json_types(
         {
             "schema": ANSWER_SCHEMA,
             "scenario": asdict(scenario),
             "mistakes": {
                 name: {
-                    "typed": as_typed(name, mistakes),
+                    "typed": format_mistake(name, mistakes),
                     "help": MISTAKES[name].help,
                     "finding": MISTAKES[name].finding,
                     **{field: getattr(mistakes, field) for field in MISTAKES[name].sizes},
                 }
-                for name in made(mistakes)
+                for name in active_mistakes(mistakes)
             },
             "truth": {
                 "duration_s": motion.duration_s,

@@ -7,7 +7,7 @@ clear case.
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from px4fuse.errors import SettingsError, did_you_mean
+from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
 from px4fuse.simulation.scenario import KINDS, Kind, number, quantities
 from px4fuse.units import NAMES, in_unit
@@ -122,30 +122,30 @@ def parse(texts: Iterable[str]) -> Mistakes:
     SettingsError
         Unknown name, or a value that is not a number, has an unknown unit or is out of range.
     """
-    changed: dict[str, float] = {}
+    value_by_field: dict[str, float] = {}
     for text in texts:
         name, equals, values = text.strip().partition("=")
         if name not in MISTAKES:
             raise SettingsError(
                 f"--mistake {text}: not a known mistake",
-                f"{did_you_mean(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
+                f"{suggest_name(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
             )
         mistake = MISTAKES[name]
-        given = values.split(",") if equals else []
-        if len(given) > len(mistake.sizes):
+        typed_values = values.split(",") if equals else []
+        if len(typed_values) > len(mistake.sizes):
             raise SettingsError(f"--mistake {text}: give {name}{mistake.usage}.")
-        changed[mistake.fields[0]] = mistake.usual
-        for field, value in zip(mistake.sizes, given, strict=False):
-            taken, size = QUANTITIES[field], in_unit(value, QUANTITIES[field].unit)
+        value_by_field[mistake.fields[0]] = mistake.usual
+        for field, value in zip(mistake.sizes, typed_values, strict=False):
+            bounds, size = QUANTITIES[field], in_unit(value, QUANTITIES[field].unit)
             if size is None:
-                wanted = f"{NAMES[taken.unit]}, as in {name}{mistake.usage}"
+                wanted = f"{NAMES[bounds.unit]}, as in {name}{mistake.usage}"
                 raise SettingsError(f"--mistake {text}: {value!r}: give {wanted}.")
-            taken.check(size, f"--mistake {text}: {taken.typed}")
-            changed[field] = size
-    return Mistakes(**changed)  # type: ignore[arg-type]
+            bounds.check(size, f"--mistake {text}: {bounds.typed}")
+            value_by_field[field] = size
+    return Mistakes(**value_by_field)  # type: ignore[arg-type]
 
 
-def made(mistakes: Mistakes) -> tuple[str, ...]:
+def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
     """Names of the mistakes that these are."""
     clean = Mistakes()
     return tuple(
@@ -155,12 +155,18 @@ def made(mistakes: Mistakes) -> tuple[str, ...]:
     )
 
 
-def as_typed(name: str, mistakes: Mistakes) -> str:
+def format_mistake(name: str, mistakes: Mistakes) -> str:
     """One mistake as :func:`parse` takes it, with its values.
 
-    >>> as_typed("nlos", parse(["nlos=5"]))
+    >>> format_mistake("nlos", parse(["nlos=5"]))
     'nlos=5%,2m'
     """
-    given = ((getattr(mistakes, one), QUANTITIES[one].unit) for one in MISTAKES[name].sizes)
-    values = [f"{value:g}{_ASCII.get(unit, unit)}" for value, unit in given if value is not None]
+    sizes_with_units = (
+        (getattr(mistakes, one), QUANTITIES[one].unit) for one in MISTAKES[name].sizes
+    )
+    values = [
+        f"{value:g}{_ASCII.get(unit, unit)}"
+        for value, unit in sizes_with_units
+        if value is not None
+    ]
     return f"{name}={','.join(values)}" if values else name

@@ -24,7 +24,7 @@ GROUND_S = 6.0
 CLIMB_M_S = 0.75
 CLIMB_RAMP_S = 1.5
 # A log of 70 MB
-LONGEST_S = 3600.0
+MAX_FLIGHT_S = 3600.0
 # Of the fade of the wander, at take-off and landing
 FADE_S = 3.0
 # To turn round at the end of the aisle, where the nose follows the flight
@@ -35,9 +35,14 @@ WANDER_SINES = 4
 
 def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
     """S(x), from 0 to 1 with two zero derivatives at either end, and its three derivatives."""
-    square, slope, rest = x * x, x * (1.0 - x), 1.0 - x
+    square, slope, complement = x * x, x * (1.0 - x), 1.0 - x
     value = square * x * (6.0 * square - 15.0 * x + 10.0)
-    return value, 30.0 * slope**2, 60.0 * x * rest * (rest - x), 60.0 * (1.0 - 6.0 * x * rest)
+    return (
+        value,
+        30.0 * slope**2,
+        60.0 * x * complement * (complement - x),
+        60.0 * (1.0 - 6.0 * x * complement),
+    )
 
 
 @dataclass(frozen=True)
@@ -65,21 +70,26 @@ class Ramps:
         """Position, velocity, acceleration and jerk, each of shape (n, k), from zero at rest."""
         velocity_before = np.cumsum(self.change, axis=0) - self.change
         # a whole ramp moves by half its length times its change, and by the speed before
-        gained = velocity_before[:-1] * np.diff(self.start_s)[:, None] + self.change[:-1] * (
-            np.diff(self.start_s) - self.length_s[:-1] / 2.0
-        )[:, None]  # fmt: skip
-        position_before = np.vstack([np.zeros((1, self.change.shape[1])), np.cumsum(gained, 0)])
+        position_gained = (
+            velocity_before[:-1] * np.diff(self.start_s)[:, None]
+            + self.change[:-1] * (np.diff(self.start_s) - self.length_s[:-1] / 2.0)[:, None]
+        )
+        position_before = np.vstack(
+            [np.zeros((1, self.change.shape[1])), np.cumsum(position_gained, 0)]
+        )
         at = np.maximum(np.searchsorted(self.start_s, time_s, side="right") - 1, 0)
         length = self.length_s[at]
-        since = time_s - self.start_s[at]
-        x = np.clip(since / length, 0.0, 1.0)
+        time_in_ramp = time_s - self.start_s[at]
+        x = np.clip(time_in_ramp / length, 0.0, 1.0)
         integral = length * (x * x) ** 2 * (x * x - 3.0 * x + 2.5)
-        integral += np.maximum(since - length, 0.0)
+        integral += np.maximum(time_in_ramp - length, 0.0)
         step, first, second, _ = _quintic(x)
         # take is several times faster than indexing
         change, before = self.change.take(at, axis=0), velocity_before.take(at, axis=0)
         return (
-            position_before.take(at, axis=0) + before * since[:, None] + change * integral[:, None],
+            position_before.take(at, axis=0)
+            + before * time_in_ramp[:, None]
+            + change * integral[:, None],
             before + change * step[:, None],
             change * (first / length)[:, None],
             change * (second / length**2)[:, None],
@@ -166,7 +176,7 @@ class Motion:
         """The truth at some times (s from the first data)."""
         position, velocity, acceleration, jerk = self.path.at(time_s)
         w = self.wander.at(time_s, 4)
-        e, inside = self._fade(time_s)
+        e, inside = self._wander_fade(time_s)
         # Leibniz: the wander fades in and out, with derivatives of its own while it does
         d = [part[inside] for part in w]
         velocity[inside] += e[1] * d[0]
@@ -182,7 +192,7 @@ class Motion:
             yaw_rate_rad_s=yaw_rate[:, 0],
         )
 
-    def _fade(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
+    def _wander_fade(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
         """Size of the wander, shape (n, 1), its derivatives at m indices, (m, 1), and those."""
         rise = np.clip((time_s - self.take_off_s) / FADE_S, 0.0, 1.0)
         fall = np.clip((time_s - self.touch_down_s) / FADE_S + 1.0, 0.0, 1.0)
@@ -269,8 +279,8 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
         _fly_loop(ramps, scenario, mistakes)
     ramps.change(-up, CLIMB_RAMP_S, rise_s)
     touch_down_s = ramps.centre_s + CLIMB_RAMP_S / 2.0
-    if touch_down_s > LONGEST_S:
-        raise SettingsError.of("flight_long", touch_down_s=touch_down_s, longest_s=LONGEST_S)
+    if touch_down_s > MAX_FLIGHT_S:
+        raise SettingsError.of("flight_long", touch_down_s=touch_down_s, longest_s=MAX_FLIGHT_S)
     ramps.change(up, CLIMB_RAMP_S, 0.0)
     return Motion(
         path=Ramps.of(ramps.path),

@@ -19,7 +19,7 @@ DT_S = 0.1
 START_STOP_S = 1.5
 CORNER_S = 2.0
 # What a kind of flight has where nothing is chosen, beside the defaults of all
-OF_KIND: Mapping[Kind, Mapping[str, float]] = {
+DEFAULTS_OF_KIND: Mapping[Kind, Mapping[str, float]] = {
     "aisle": {},
     "loop": {"passes": 1},
     "outdoor": {"passes": 3, "length_m": 30.0, "speed_m_s": 4.0, "altitude_m": 8.0},
@@ -179,8 +179,8 @@ class Scenario:
             raise SettingsError(f"--kind {self.kind}: give {' or '.join(KINDS)}.")
         if self.yaw is not None and self.yaw not in YAWS:
             raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAWS)}.")
-        for name, taken in quantities(Scenario).items():
-            taken.check(getattr(self, name), taken.typed or name)
+        for name, bounds in quantities(Scenario).items():
+            bounds.check(getattr(self, name), bounds.typed or name)
         needed = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)
         if self.length_m < needed:
             raise SettingsError.of(
@@ -215,6 +215,6 @@ class Scenario:
         return self.sigma_a_m_s2 * math.sqrt(DT_S * self.imu_rate_hz)
 
 
-def scenario_of(kind: Kind, **chosen: Any) -> Scenario:
+def make_scenario(kind: Kind, **chosen: Any) -> Scenario:
     """A flight of a kind as it is usual for it, but for what is chosen."""
-    return Scenario(kind=kind, **{**OF_KIND[kind], **chosen})
+    return Scenario(kind=kind, **{**DEFAULTS_OF_KIND[kind], **chosen})

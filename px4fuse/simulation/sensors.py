@@ -34,7 +34,7 @@ NLOS_BURST = 3  # samples, mean
 HOME = (47.397742, 8.545594, 488.0)
 # Of a fix when it is stamped; GNSS is less exact downwards
 FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
-OF_GNSS = np.array([1.0, 1.0, 1.5])
+GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
 # The magnetic field there (NED) and noise of its samples; noise of the barometer
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
 SIGMA_FIELD_GAUSS, SIGMA_BAROMETER_M = 0.02, 0.4
@@ -117,13 +117,13 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
         sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
         force += sigma * stream(scenario, Stream.VIBRATION).standard_normal(shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
-    of_both = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
-    sampled: dict[str, Any] = {
-        "timestamp": _boot(time_us),
+    integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
+    sample_fields: dict[str, Any] = {
+        "timestamp": _boot_stamps(time_us),
         "gyro_rad": rate,
         "accelerometer_m_s2": force,
     }
-    return topic("sensor_combined", sampled | of_both)
+    return topic("sensor_combined", sample_fields | integral_fields)
 
 
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
@@ -155,18 +155,18 @@ def height_error(scenario: Scenario, time_s: Array) -> Array:
     return Sines.draw(rng, rms, ATTITUDE_PERIODS_S, ATTITUDE_SINES).at(time_s)[0][:, 0]
 
 
-def at_rate(complete: Topic, rate_hz: float) -> Topic:
+def limit_rate(complete: Topic, rate_hz: float) -> Topic:
     """A topic as a logger keeps it that passes on at most this rate; 0 keeps all."""
-    return _some(complete, thinned(time_s(complete), rate_hz))
+    return _select_messages(complete, keep_at_rate(time_s(complete), rate_hz))
 
 
 def logged_imu(complete: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     """sensor_combined as the logger keeps it."""
     stamps_s = time_s(complete)
-    keep = _outside_gap(
+    keep = _is_outside_gap(
         stamps_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
     )
-    return _some(complete, keep & thinned(stamps_s, mistakes.imu_rate_hz))
+    return _select_messages(complete, keep & keep_at_rate(stamps_s, mistakes.imu_rate_hz))
 
 
 def time_s(topic: Topic) -> Array:
@@ -174,11 +174,11 @@ def time_s(topic: Topic) -> Array:
     return seconds(topic.fields["timestamp"].astype(np.int64) - START_US)
 
 
-def _some(topic: Topic, keep: BoolArray) -> Topic:
+def _select_messages(topic: Topic, keep: BoolArray) -> Topic:
     return Topic(topic.name, {name: values[keep] for name, values in topic.fields.items()})
 
 
-def at_rest(
+def mean_imu_at_rest(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, time_s: float
 ) -> tuple[Array, Array]:
     """Mean of accelerometer (m/s²) and gyro (rad/s) over some time of standing before the log."""
@@ -197,8 +197,8 @@ def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> T
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     error = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix()
-    turned = quaternions(error @ truth)
-    return attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, turned)
+    turned_attitude = quaternions(error @ truth)
+    return attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, turned_attitude)
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
@@ -238,8 +238,8 @@ def land_detector(motion: Motion) -> Topic:
     changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(np.int64)
     time_us = np.union1d(np.arange(0, int(motion.duration_s * 1e6), LANDED_INTERVAL_US), changes_us)
     landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
-    said = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), landed)
-    return topic("vehicle_land_detected", {"timestamp": _boot(time_us), **said})
+    landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), landed)
+    return topic("vehicle_land_detected", {"timestamp": _boot_stamps(time_us), **landed_flags})
 
 
 def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
@@ -271,7 +271,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
         drift = vio_drift(scenario, distance)
     position += drift
     outdoor = scenario.kind == "outdoor"
-    sigma = scenario.source_sigma_m * (OF_GNSS if outdoor else 1.0)
+    sigma = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if outdoor else 1.0)
     position += sigma * stream(scenario, Stream.SOURCE).standard_normal(position.shape)
     airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
     shift, outlier = outliers(scenario, mistakes, airborne)
@@ -286,20 +286,22 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
     if mistakes.jump_m:
         at_s = motion.duration_s / 1.5 if mistakes.jump_at_s is None else mistakes.jump_at_s
         position[time_s >= at_s] += mistakes.jump_m * direction(scenario.heading_deg)
-    keep = _outside_gap(
+    keep = _is_outside_gap(
         time_s, mistakes.dropout_s, mistakes.dropout_at_s, motion.duration_s
-    ) & thinned(time_s, mistakes.decimate_hz)
+    ) & keep_at_rate(time_s, mistakes.decimate_hz)
     arrival_us, stamp_us = _stamps(mistakes, time_s, timing)
     reported_m = reported_sigma_m(scenario, mistakes)
     velocity = None
     if outdoor:
         noise = stream(scenario, Stream.FIX_VELOCITY).standard_normal(position.shape)
-        velocity = (state.velocity_m_s + scenario.sigma_gnss_m_s * OF_GNSS * noise)[keep]
+        velocity = (state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * noise)[keep]
         fix_us = stamp_us + round(1e6 * FIX_AGE_S)
-        topic = _fixes(fix_us[keep], position[keep], velocity, reported_m, scenario)
+        topic = _gnss_topic(fix_us[keep], position[keep], velocity, reported_m, scenario)
     else:
         rotation = attitude(state).body_to_ned[keep] if scenario.kind == "loop" else None
-        topic = _odometry(arrival_us[keep], stamp_us[keep], position[keep], reported_m, rotation)
+        topic = _odometry_topic(
+            arrival_us[keep], stamp_us[keep], position[keep], reported_m, rotation
+        )
     return SensedPositions(
         topic=topic,
         outlier=outlier[keep],
@@ -363,7 +365,7 @@ def outliers(
     return shift, chosen
 
 
-def thinned(time_s: Array, rate_hz: float) -> BoolArray:
+def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
     """Samples that a logger keeps which passes on at most this rate; 0 keeps all."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
@@ -385,7 +387,7 @@ def _stamps(
     return arrival_us, stamp_us
 
 
-def _odometry(
+def _odometry_topic(
     arrival_us: NDArray[np.int64],
     stamp_us: NDArray[np.int64],
     position_m: Array,
@@ -400,7 +402,7 @@ def _odometry(
     return topic("vehicle_visual_odometry", fields)
 
 
-def _fixes(
+def _gnss_topic(
     stamp_us: NDArray[np.int64],
     position_m: Array,
     velocity_m_s: Array,
@@ -411,7 +413,7 @@ def _fixes(
     latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME[:2])
     accuracies = {
         "eph": sigma_m,
-        "epv": sigma_m * OF_GNSS[2],
+        "epv": sigma_m * GNSS_SIGMA_FACTORS[2],
         "s_variance_m_s": scenario.sigma_gnss_m_s,
     }
     place = {
@@ -430,7 +432,7 @@ def _low_pass(position_m: Array, interval_s: float, constant_s: float) -> Array:
     return np.asarray(smooth)
 
 
-def _outside_gap(
+def _is_outside_gap(
     time_s: Array, length_s: float, at_s: float | None, duration_s: float
 ) -> BoolArray:
     """Samples outside a gap, which lies in the middle unless said otherwise."""
@@ -450,7 +452,10 @@ def seconds(time_us: NDArray[np.int64]) -> Array:
 
 def stamps(time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0) -> dict[str, Any]:
     """The two stamps of what was sampled then and published so much later, µs since boot."""
-    return {"timestamp": _boot(time_us + later_us), "timestamp_sample": _boot(time_us)}
+    return {
+        "timestamp": _boot_stamps(time_us + later_us),
+        "timestamp_sample": _boot_stamps(time_us),
+    }
 
 
 def vectors(values: Mapping[str, Array]) -> dict[str, Any]:
@@ -462,5 +467,5 @@ def vectors(values: Mapping[str, Array]) -> dict[str, Any]:
     }
 
 
-def _boot(time_us: NDArray[np.int64]) -> NDArray[np.uint64]:
+def _boot_stamps(time_us: NDArray[np.int64]) -> NDArray[np.uint64]:
     return (START_US + time_us).astype(np.uint64)

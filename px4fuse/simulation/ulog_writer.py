@@ -40,24 +40,30 @@ class Topic:
     instance: int = 0
 
 
-def topic(name: str, given: Mapping[str, ArrayLike], like: str = "") -> Topic:
+def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "") -> Topic:
     """A topic with the fields of PX4 in their types.
 
     Parameters
     ----------
     name : str
-    given : mapping
+    field_values : mapping
         Fields, a row per message; one number stands for all of them.
-    like : str
+    table_row : str
         Of which row of the table the topic is, where that is not its name.
     """
-    rows, count = FIELDS[like or name], np.size(given["timestamp"])
-    assert given.keys() <= rows.keys(), f"{name} has no {given.keys() - rows.keys()}"
+    rows, count = FIELDS[table_row or name], np.size(field_values["timestamp"])
+    assert field_values.keys() <= rows.keys(), f"{name} has no {field_values.keys() - rows.keys()}"
     fields = {}
-    for field, (kind, *still) in rows.items():
-        values = given[field] if field in given else still[0] if len(still) == 1 else still
-        if field in given or still:
-            if field not in given or not np.ndim(values):
+    for field, (kind, *default_values) in rows.items():
+        values = (
+            field_values[field]
+            if field in field_values
+            else default_values[0]
+            if len(default_values) == 1
+            else default_values
+        )
+        if field in field_values or default_values:
+            if field not in field_values or not np.ndim(values):
                 values = np.broadcast_to(values, (count, *np.shape(values)))
             fields[field] = np.asarray(values).astype(kind)
     return Topic(name, fields)
@@ -117,12 +123,12 @@ def _keyed(kind: str, key: str, value: bytes) -> bytes:
 
 
 def _format(topic: Topic) -> str:
-    parts = []
+    field_types = []
     for name, values in topic.fields.items():
         size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
         kind = _TYPES.get(values.dtype.name, f"{values.dtype.name}_t")
-        parts.append(f"{kind}{size} {name};")
-    return f"{topic.name}:{''.join(parts)}"
+        field_types.append(f"{kind}{size} {name};")
+    return f"{topic.name}:{''.join(field_types)}"
 
 
 def _data(topic: Topic, number: int) -> list[bytes]:

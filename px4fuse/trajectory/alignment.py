@@ -52,16 +52,16 @@ class Transform(Record, frozen=True):
 
     def apply(self, position_m: Array) -> Array:
         """Positions in the reference's frame, shape (n, 3) or (3,)."""
-        turned: Array = self.rotation.apply(self.scale * position_m)
-        return turned + self.translation_m
+        rotated: Array = self.rotation.apply(self.scale * position_m)
+        return rotated + self.translation_m
 
-    def undo(self, position_m: Array) -> Array:
+    def apply_inverse(self, position_m: Array) -> Array:
         """Positions in the estimate's world, shape (n, 3) or (3,)."""
-        back: Array = self.rotation.inv().apply(position_m - np.array(self.translation_m))
-        return back / self.scale
+        shifted: Array = self.rotation.inv().apply(position_m - np.array(self.translation_m))
+        return shifted / self.scale
 
 
-def fit(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform:
+def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform:
     """Transform of the estimate that leaves the least squared distance to the reference.
 
     Umeyama (1991), eqs. 40 to 43, for "se3" and "sim3"; for "yaw" the closed form of Zhang &
@@ -87,13 +87,13 @@ def fit(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform
     if kind == "yaw":
         x, y = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
         heading = float(np.angle(np.vdot(x - x.mean(), y - y.mean())))
-        transform = _transform(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
-        _check(transform, estimate_m, reference_m, kind)
+        transform = _similarity(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
+        _require_determined(transform, estimate_m, reference_m, kind)
         return transform
     # the scale is left out of the question: a wrong one is no reason to doubt the turn
-    free = umeyama(estimate_m, reference_m, with_scale=True)
-    _check(free, estimate_m, reference_m, kind)
-    return free if kind == "sim3" else umeyama(estimate_m, reference_m, with_scale=False)
+    similarity = umeyama(estimate_m, reference_m, with_scale=True)
+    _require_determined(similarity, estimate_m, reference_m, kind)
+    return similarity if kind == "sim3" else umeyama(estimate_m, reference_m, with_scale=False)
 
 
 def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Transform:
@@ -114,10 +114,10 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     # eq. 42; the smallest double would give an infinite scale
     scale = float(d @ s / variance) if with_scale and variance > MIN_SPREAD_M**2 else 1.0
     turn = Rotation.from_matrix((u * s) @ vt)  # eq. 40
-    return _transform(turn, estimate_m, reference_m, scale, 7 if with_scale else 6)
+    return _similarity(turn, estimate_m, reference_m, scale, 7 if with_scale else 6)
 
 
-def _transform(
+def _similarity(
     turn: Rotation, estimate_m: Array, reference_m: Array, scale: float, freedom: int
 ) -> Transform:
     """The similarity of a turn and a scale, which brings the means together (eq. 41)."""
@@ -137,7 +137,9 @@ def rms_m(difference_m: Array) -> float:
     return float(np.sqrt((difference_m * difference_m).sum(axis=1).mean()))
 
 
-def _check(transform: Transform, estimate_m: Array, reference_m: Array, kind: str) -> None:
+def _require_determined(
+    transform: Transform, estimate_m: Array, reference_m: Array, kind: str
+) -> None:
     """Refuse a turn that the motion does not determine.
 
     What determines a yaw is the horizontal motion; any other turn, the extent away from a line,
@@ -145,17 +147,22 @@ def _check(transform: Transform, estimate_m: Array, reference_m: Array, kind: st
     """
     spread, target = _spread(estimate_m), _spread(reference_m)
     if kind == "yaw":
-        told = min(float(np.hypot(*_spread(m[:, :2]))) for m in (estimate_m, reference_m))
-        left = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
+        extent_m = min(float(np.hypot(*_spread(m[:, :2]))) for m in (estimate_m, reference_m))
+        residual_m = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
         length, limit = float(np.linalg.norm(target)), MAX_PLANE_RATIO
         motion, instead = "horizontal motion (RMS) is", "`alignment` none"
     else:
-        length, told, _ = np.minimum(transform.scale * spread, target)
-        left = rms_m(reference_m - transform.apply(estimate_m))
+        length, extent_m, _ = np.minimum(transform.scale * spread, target)
+        residual_m = rms_m(reference_m - transform.apply(estimate_m))
         limit = MAX_LINE_RATIO
         motion = f"motion is along a line: {length:.2g} m (RMS) by"
         instead = "`alignment` yaw if z is vertical in both, or `alignment` none"
-    if told < max(MIN_SPREAD_M, MIN_SHARE * length) or left > limit * told:
+    if extent_m < max(MIN_SPREAD_M, MIN_SHARE * length) or residual_m > limit * extent_m:
         raise TrajectoryError.of(
-            "alignment_open", motion=motion, told=told, left=left, kind=kind, instead=instead
+            "alignment_open",
+            motion=motion,
+            extent_m=extent_m,
+            residual_m=residual_m,
+            kind=kind,
+            instead=instead,
         )

@@ -77,15 +77,22 @@ def associate(
     """
     time, (first, last) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
     if method == "nearest":
-        limit = slack = NEAREST_S if max_gap_s is None else max_gap_s
-        chosen, other = _nearest(estimate.time_s, reference.time_s, limit, time_offset_s)
-        matched = reference[other]
+        limit = end_tolerance_s = NEAREST_S if max_gap_s is None else max_gap_s
+        pose_indices, other = _pair_nearest(estimate.time_s, reference.time_s, limit, time_offset_s)
+        matched_reference = reference[other]
     else:
-        limit, slack = gap_limit(reference.time_s) if max_gap_s is None else max_gap_s, 0.0
-        chosen = np.flatnonzero(bracketed(time, reference.time_s, limit))
-        matched = _at(reference, time[chosen])
-    if len(chosen) < MIN_POSES:
-        what = f"only {len(chosen)} of its poses match" if len(chosen) else "no poses match"
+        limit, end_tolerance_s = (
+            gap_limit(reference.time_s) if max_gap_s is None else max_gap_s,
+            0.0,
+        )
+        pose_indices = np.flatnonzero(is_bracketed(time, reference.time_s, limit))
+        matched_reference = _interpolate_poses(reference, time[pose_indices])
+    if len(pose_indices) < MIN_POSES:
+        what = (
+            f"only {len(pose_indices)} of its poses match"
+            if len(pose_indices)
+            else "no poses match"
+        )
         added = f" (with the offset of {time_offset_s:.12g} s)" if time_offset_s else ""
         raise TrajectoryError(
             f"{estimate.name}: {what} in time: it spans {time[0]:.3f} to {time[-1]:.3f} s{added}, "
@@ -93,21 +100,21 @@ def associate(
             "Check that both are of "
             "the same flight; if their clocks differ, give `time_offset_s` auto.",
         )
-    outside = int(((time < first - slack) | (time > last + slack)).sum())
-    steps = np.diff(time[chosen])
+    outside = int(((time < first - end_tolerance_s) | (time > last + end_tolerance_s)).sum())
+    steps = np.diff(time[pose_indices])
     longest = max(5.0 * float(np.median(np.diff(estimate.time_s))), 0.5)
-    covered = float(steps[steps <= longest].sum() / (last - first))
-    used, all_poses = len(np.unique(chosen)), len(estimate)
+    covered_share = float(steps[steps <= longest].sum() / (last - first))
+    used_count, all_poses = len(np.unique(pose_indices)), len(estimate)
     found = Association(
         method=method,
-        poses=len(chosen),
+        poses=len(pose_indices),
         max_gap_s=limit,
         outside=outside,
-        in_gaps=all_poses - outside - used,
-        coverage_estimate=used / all_poses,
-        coverage_reference=min(covered, 1.0),
+        in_gaps=all_poses - outside - used_count,
+        coverage_estimate=used_count / all_poses,
+        coverage_reference=min(covered_share, 1.0),
     )
-    return estimate[chosen], matched, found
+    return estimate[pose_indices], matched_reference, found
 
 
 def gap_limit(time_s: Array, least_s: float = GAP_S) -> float:
@@ -115,7 +122,7 @@ def gap_limit(time_s: Array, least_s: float = GAP_S) -> float:
     return max(GAP_INTERVALS * float(np.median(np.diff(time_s))), least_s)
 
 
-def bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:
+def is_bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:
     """Whether each time is a reference's, or between two that are near enough to each other."""
     right = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
     before, after = reference_s[right - 1], reference_s[right]
@@ -123,13 +130,13 @@ def bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:
     return np.asarray(between | (before == time_s) | (after == time_s))
 
 
-def _at(trajectory: Trajectory, time_s: Array) -> Trajectory:
+def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
     """Poses at times within its span."""
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    made = trajectory.moved(positions_at(trajectory, time_s))
-    return replace(made, rotation=rotation, time_s=time_s)
+    interpolated = trajectory.moved(positions_at(trajectory, time_s))
+    return replace(interpolated, rotation=rotation, time_s=time_s)
 
 
 def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
@@ -138,7 +145,7 @@ def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
     return np.stack([np.interp(time_s, trajectory.time_s, one) for one in columns], axis=-1)
 
 
-def _nearest(
+def _pair_nearest(
     estimate_s: Array, reference_s: Array, limit: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
     """Indices of pairs: each stamp of the shorter with the nearest of the longer."""
@@ -149,5 +156,9 @@ def _nearest(
     right = np.minimum(np.searchsorted(long, short, side="right"), len(long) - 1)
     left = np.maximum(right - 1, 0)
     nearest = np.where(np.abs(long[right] - short) < np.abs(short - long[left]), right, left)
-    kept = np.flatnonzero(np.abs(long[nearest] - short) <= limit)
-    return (nearest[kept], kept) if is_longer else (kept, nearest[kept])
+    within_limit = np.flatnonzero(np.abs(long[nearest] - short) <= limit)
+    return (
+        (nearest[within_limit], within_limit)
+        if is_longer
+        else (within_limit, nearest[within_limit])
+    )

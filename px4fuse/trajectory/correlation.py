@@ -43,15 +43,17 @@ def moments(a: Series, b: Series, a_known: BoolArray, b_known: BoolArray) -> Mom
         At least one sample of each.
     """
     # about their means, else roundings matter
-    both = (a, a_known), (b, b_known)
-    a, b = (np.where(known, values - np.mean(values[known]), 0.0) for values, known in both)
+    masked_series = (a, a_known), (b, b_known)
+    a, b = (
+        np.where(known, values - np.mean(values[known]), 0.0) for values, known in masked_series
+    )
     m, n = a_known.astype(float), b_known.astype(float)
-    count = np.rint(_correlated(n, m).real)
+    count = np.rint(_correlate(n, m).real)
     weight = 1.0 / np.maximum(count, 1.0)
-    sum_a, sum_b = _correlated(n, a), _correlated(b, m)  # the first conjugate
-    covariance = _correlated(b, a) - sum_a * sum_b * weight
-    power_a = _correlated(n, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * weight
-    power_b = _correlated(np.abs(b) ** 2, m).real - np.abs(sum_b) ** 2 * weight
+    sum_a, sum_b = _correlate(n, a), _correlate(b, m)  # the first conjugate
+    covariance = _correlate(b, a) - sum_a * sum_b * weight
+    power_a = _correlate(n, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * weight
+    power_b = _correlate(np.abs(b) ** 2, m).real - np.abs(sum_b) ** 2 * weight
     return Moments(count, covariance, power_a, power_b)
 
 
@@ -63,10 +65,10 @@ def autocovariance(values: Array | Complex) -> Array:
     values : ndarray, shape (n,)
         Real or complex.
     """
-    return np.asarray(_correlated(values, values)[len(values) - 1 :].real)
+    return np.asarray(_correlate(values, values)[len(values) - 1 :].real)
 
 
-def _correlated(a: Array | Complex, b: Array | Complex) -> Complex:
+def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
     """Σ a conj(b) over the overlap, for every lag."""
     # costs a tenth of a second to import: most flights have nothing to correlate
     from scipy.signal import correlate  # noqa: PLC0415

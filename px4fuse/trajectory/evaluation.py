@@ -14,12 +14,12 @@ from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
-from px4fuse.record import Maybe, Record
+from px4fuse.record import OrUnavailable, Record
 from px4fuse.trajectory import scores
-from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit, umeyama
+from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
 from px4fuse.trajectory.association import Association, Method, associate
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 from px4fuse.trajectory.offset import TimeOffset, clock_difference, estimate_time_offset
@@ -31,7 +31,7 @@ MIN_CLOCK_DOUBT_S = 0.1  # less than this may be the filter's own lag
 MAX_SPARSER = 5.0  # a reference with so much longer intervals is hardly one
 
 _DOWN, _UP = ("NED", "FRD"), ("ENU",)
-_FREE = ("slam", "unknown")  # whose world may be turned in any way
+_FREE_KINDS = ("slam", "unknown")  # whose world may be turned in any way
 _MONO = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
@@ -39,8 +39,8 @@ class AbsoluteError(Record, frozen=True):
     """ATE: of position (m), with its RMSE's interval, and of orientation (degrees)."""
 
     translation_m: Statistics
-    interval_m: Maybe[Interval]
-    rotation_deg: Maybe[Statistics]
+    interval_m: OrUnavailable[Interval]
+    rotation_deg: OrUnavailable[Statistics]
 
 
 class Score(Record, frozen=True, kw_only=True):
@@ -94,7 +94,7 @@ class Evaluation(Score, frozen=True, kw_only=True, eq=False):
         freed of; None where both are of the same body.
     """
 
-    written_as = Score
+    schema_type = Score
     rpe: tuple[scores.PairwiseError, ...]
     estimate: Trajectory
     reference: Trajectory
@@ -107,7 +107,7 @@ class Evaluation(Score, frozen=True, kw_only=True, eq=False):
     rotation_error_deg: Array | None
     body_rotation: Rotation | None
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 def evaluate(
@@ -145,14 +145,14 @@ def evaluate(
         A delta is not above zero, or not whole for frames.
     """
     offset, offset_warnings = _time_offset(estimate, reference, time_offset_s)
-    later_s = offset.offset_s or 0.0
-    x, y, matched = associate(
-        estimate, reference, method=association, max_gap_s=max_gap_s, time_offset_s=later_s
+    added_offset_s = offset.offset_s or 0.0
+    x, y, association_found = associate(
+        estimate, reference, method=association, max_gap_s=max_gap_s, time_offset_s=added_offset_s
     )
     reason = "As asked for."
     if alignment is None:
         alignment, reason = choose_alignment(x, y)
-    transform = fit(x.position_m, y.position_m, alignment)
+    transform = fit_alignment(x.position_m, y.position_m, alignment)
     aligned = x.moved(transform.apply(x.position_m), transform.rotation)
     body, notes = _body_rotation(aligned, y)
     if body is not None and aligned.rotation is not None:
@@ -161,7 +161,7 @@ def evaluate(
     error = np.linalg.norm(aligned.position_m - y.position_m, axis=1)
     both = scores.rotations_of(aligned, y, "ATE of the rotation")
     rotation_error: Array | None = None
-    rotation: Maybe[Statistics]
+    rotation: OrUnavailable[Statistics]
     if isinstance(both, Unavailable):
         rotation = both
     else:
@@ -175,7 +175,7 @@ def evaluate(
         alignment=alignment,
         alignment_reason=reason,
         transform=transform,
-        association=matched,
+        association=association_found,
         time_offset=offset,
         ate=AbsoluteError(scores.statistics(error), scores.rmse_interval(error, "ATE"), rotation),
         rpe=tuple(
@@ -191,9 +191,9 @@ def evaluate(
         body_rotation=body,
         notes=notes,
         warnings=(
-            *_swapped(estimate, reference),
+            *_swap_warnings(estimate, reference),
             *offset_warnings,
-            *_doubts(x, y, matched, alignment),
+            *_comparison_warnings(x, y, association_found, alignment),
         ),
     )
 
@@ -214,14 +214,14 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         return "none", "No alignment, as ground truth is compared as it is."
     frames = f"{estimate.frame} and {reference.frame}"
     is_upright = any({estimate.frame, reference.frame} <= set(same) for same in (_DOWN, _UP))
-    free = [one for one in (estimate, reference) if one.kind in _FREE]
-    if is_upright and estimate.kind not in _FREE:
+    unaligned = [one for one in (estimate, reference) if one.kind in _FREE_KINDS]
+    if is_upright and estimate.kind not in _FREE_KINDS:
         return "yaw", (
             f"Yaw and position (4 DoF), as z is vertical in both frames ({frames}): a tilt of the "
             "estimate is an error."
         )
     try:
-        scale = fit(estimate.position_m, reference.position_m, "sim3").scale
+        scale = fit_alignment(estimate.position_m, reference.position_m, "sim3").scale
     except TrajectoryError:
         if not is_upright:
             raise
@@ -229,17 +229,17 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             f"Yaw and position (4 DoF), as the motion is along a line and z is vertical in "
             f"both frames ({frames})."
         )
-    why = f"as the frames are {frames}, which do not share a vertical"
-    if free:
-        made = "comes from SLAM, whose world is its first key frame"
-        why = f"as {free[0].name} {made if free[0].kind == 'slam' else 'does not say what made it'}"
-    named = [one.name for one in (estimate, reference) if _MONO.search(one.name)]
-    because = [f"{name} says that it is monocular" for name in named]
+    frame_reason = f"as the frames are {frames}, which do not share a vertical"
+    if unaligned:
+        slam_note = "comes from SLAM, whose world is its first key frame"
+        frame_reason = f"as {unaligned[0].name} {slam_note if unaligned[0].kind == 'slam' else 'does not say what made it'}"
+    monocular = [one.name for one in (estimate, reference) if _MONO.search(one.name)]
+    scale_reasons = [f"{name} says that it is monocular" for name in monocular]
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
-        because.append(f"the scale is {scale:.3g}, more than {MAX_SCALE_ERROR:.0%} off")
-    if not free or not because:
-        return "se3", f"Rotation and position (6 DoF), {why}."
-    return "sim3", f"Rotation, position and scale (7 DoF), {why}, and {because[0]}."
+        scale_reasons.append(f"the scale is {scale:.3g}, more than {MAX_SCALE_ERROR:.0%} off")
+    if not unaligned or not scale_reasons:
+        return "se3", f"Rotation and position (6 DoF), {frame_reason}."
+    return "sim3", f"Rotation, position and scale (7 DoF), {frame_reason}, and {scale_reasons[0]}."
 
 
 def _time_offset(
@@ -248,32 +248,34 @@ def _time_offset(
     """What to add to the estimate's stamps."""
     if isinstance(given_s, float | int):
         return TimeOffset(offset_s=given_s, determinable=True, reason="As asked for."), []
-    clocks = clock_difference(estimate, reference)
-    by_clock = "UNIX time of both clocks" if clocks else "the stamps as they are"
-    clocked = TimeOffset(offset_s=clocks or 0.0, determinable=True, reason=f"By {by_clock}.")
-    start, end = estimate.time_s[[0, -1]] + (clocks or 0.0)
-    apart = start > reference.time_s[-1] or end < reference.time_s[0]
+    clock_offset_s = clock_difference(estimate, reference)
+    by_clock = "UNIX time of both clocks" if clock_offset_s else "the stamps as they are"
+    clock_offset = TimeOffset(
+        offset_s=clock_offset_s or 0.0, determinable=True, reason=f"By {by_clock}."
+    )
+    start, end = estimate.time_s[[0, -1]] + (clock_offset_s or 0.0)
+    no_overlap = start > reference.time_s[-1] or end < reference.time_s[0]
     # a flight's boot clock and the clock of a file have nothing to do with each other
-    unrelated = clocks is None and estimate.of_log != reference.of_log
-    sought = given_s == "auto" or apart
-    if not (sought or unrelated):
-        return clocked, []
+    unrelated_clocks = clock_offset_s is None and estimate.is_of_log != reference.is_of_log
+    is_estimated = given_s == "auto" or no_overlap
+    if not (is_estimated or unrelated_clocks):
+        return clock_offset, []
     found = estimate_time_offset(estimate, reference)
-    if sought:
+    if is_estimated:
         if found.determinable:
             return found, []
-        used = structs.replace(clocked, determinable=False, reason=found.reason)
+        used = structs.replace(clock_offset, determinable=False, reason=found.reason)
         return used, [f"{found.reason} Used {by_clock} instead."]
     offset, (low, high) = found.offset_s or 0.0, found.interval_s or (0.0, 0.0)
-    doubtful = not low <= 0.0 <= high and abs(offset) >= MIN_CLOCK_DOUBT_S
+    is_doubtful = not low <= 0.0 <= high and abs(offset) >= MIN_CLOCK_DOUBT_S
     doubt = (
         f"The stamps are used as they are, but the motions fit best with {offset:+.3f} s added to "
         "the estimate's: are the two clocks unrelated? Then give --time-offset auto."
     )
-    return clocked, [doubt] if doubtful else []
+    return clock_offset, [doubt] if is_doubtful else []
 
 
-def _swapped(estimate: Trajectory, reference: Trajectory) -> list[str]:
+def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> list[str]:
     """Warnings where the two look interchanged."""
     if reference.kind == "truth" != estimate.kind:
         return []
@@ -290,27 +292,31 @@ def _swapped(estimate: Trajectory, reference: Trajectory) -> list[str]:
     return [f"{sign}. {swap}" for sign, holds in signs.items() if holds]
 
 
-def _doubts(
-    estimate: Trajectory, reference: Trajectory, matched: Association, alignment: AlignmentKind
+def _comparison_warnings(
+    estimate: Trajectory,
+    reference: Trajectory,
+    association_found: Association,
+    alignment: AlignmentKind,
 ) -> list[str]:
     """Warnings on what was compared."""
     x, y = estimate.position_m, reference.position_m
     # of the spreads: it needs no turn that the motion would have to determine
     scale = umeyama(x, y, with_scale=True).scale
     moves = min(float(np.ptp(one, axis=0).max()) for one in (x, y)) > 0.0
-    doubts = {
-        f"Only {matched.coverage_estimate:.0%} of the estimate's poses have a reference "
-        f"({matched.outside} lie outside its span, {matched.in_gaps} in its gaps).": (
-            matched.coverage_estimate < MIN_COVERAGE
+    warnings_by_text = {
+        f"Only {association_found.coverage_estimate:.0%} of the estimate's poses have a reference "
+        f"({association_found.outside} lie outside its span, {association_found.in_gaps} in its gaps).": (
+            association_found.coverage_estimate < MIN_COVERAGE
         ),
-        f"The estimate covers only {matched.coverage_reference:.0%} of the reference's time: "
-        "errors where it has no poses do not count.": matched.coverage_reference < MIN_COVERAGE,
+        f"The estimate covers only {association_found.coverage_reference:.0%} of the reference's time: "
+        "errors where it has no poses do not count.": association_found.coverage_reference
+        < MIN_COVERAGE,
         f"The estimate's scale is off: {scale:.3g} times it would fit best, and the alignment "
         f"({alignment}) leaves that in the errors.": (
             alignment != "sim3" and moves and abs(scale - 1.0) > MAX_SCALE_ERROR
         ),
     }
-    return [doubt for doubt, holds in doubts.items() if holds]
+    return [doubt for doubt, holds in warnings_by_text.items() if holds]
 
 
 def _body_rotation(
@@ -320,11 +326,11 @@ def _body_rotation(
     if aligned.rotation is None or reference.rotation is None:
         return None, ()
     vehicles = (*_DOWN, *_UP)
-    differ = (aligned.frame == "camera") != (reference.frame == "camera") or any(
+    axes_differ = (aligned.frame == "camera") != (reference.frame == "camera") or any(
         one.kind == "slam" and other.frame in vehicles and one.frame not in vehicles
         for one, other in ((aligned, reference), (reference, aligned))
     )
-    if not differ:
+    if not axes_differ:
         return None, ()
     # chordal mean (Hartley 2013, section 5.3)
     turn = (aligned.rotation.inv() * reference.rotation).mean()

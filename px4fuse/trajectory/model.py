@@ -11,7 +11,7 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.record import Count, Record
 
 # What made it; "slam" is a system whose world is its first key frame (ORB-SLAM3 and the like)
@@ -34,22 +34,27 @@ AxisLengths = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 # Where what is negative along an axis lies
 OPPOSITE = {
-    "north": "south", "east": "west", "up": "down", "down": "up", "forward": "back",
+    "north": "south",
+    "east": "west",
+    "up": "down",
+    "down": "up",
+    "forward": "back",
     "right": "left",
-}  # fmt: skip
+}
 
 
-def in_words(vector_m: Mapping[str, float]) -> str:
+def format_vector(vector_m: Mapping[str, float]) -> str:
     """A vector by the names of the axes, without signs where the axes have a direction.
 
-    >>> in_words({"forward": 1.0, "right": -0.5}), in_words({"x": -1.0})
+    >>> format_vector({"forward": 1.0, "right": -0.5}), format_vector({"x": -1.0})
     ('1.00 m forward, 0.50 m left', '-1.00 m along x')
     """
     return ", ".join(
-        f"{value:.2f} m along {name}" if name not in OPPOSITE
+        f"{value:.2f} m along {name}"
+        if name not in OPPOSITE
         else f"{abs(value):.2f} m {OPPOSITE[name] if value < 0.0 else name}"
         for name, value in vector_m.items()
-    )  # fmt: skip
+    )
 
 
 def by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
@@ -114,43 +119,57 @@ class Trajectory:
     size_bytes: int = 0
     notes: tuple[str, ...] = ()
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     @property
-    def of_log(self) -> bool:
+    def is_of_log(self) -> bool:
         """Whether it is part of a flight log, on the autopilot's boot clock."""
         return self.name.endswith(f":{self.kind}")
 
     def __len__(self) -> int:
         return len(self.time_s)
 
-    def __getitem__(self, chosen: slice | BoolArray | IntArray) -> Trajectory:
+    def __getitem__(self, selection: slice | BoolArray | IntArray) -> Trajectory:
         """Some of its poses, in order.
 
         Parameters
         ----------
-        chosen : slice, boolean array of shape (n,), or integer array
+        selection : slice, boolean array of shape (n,), or integer array
         """
-        every = ("time_s", "position_m", "rotation", "position_variance_m2",
-                 "rotation_variance_rad2")  # fmt: skip
-        known: dict[str, Any] = {name: getattr(self, name) for name in every}
-        some = {name: values[chosen] for name, values in known.items() if values is not None}
-        return replace(self, **some)
+        array_fields = (
+            "time_s",
+            "position_m",
+            "rotation",
+            "position_variance_m2",
+            "rotation_variance_rad2",
+        )
+        known_arrays: dict[str, Any] = {name: getattr(self, name) for name in array_fields}
+        selected = {
+            name: values[selection] for name, values in known_arrays.items() if values is not None
+        }
+        return replace(self, **selected)
 
-    def moved(self, position_m: Array, turn: Rotation | None = None) -> Trajectory:
+    def moved(self, position_m: Array, world_rotation: Rotation | None = None) -> Trajectory:
         """The same poses elsewhere, of which no reported variance holds any longer.
 
-        ``turn`` is of their world: one, or one for each pose.
+        ``world_rotation`` is of their world: one, or one for each pose.
         """
-        turned = self.rotation if self.rotation is None or turn is None else turn * self.rotation
-        unknown: dict[str, Any] = {"position_variance_m2": None, "rotation_variance_rad2": None}
-        return replace(self, position_m=position_m, rotation=turned, **unknown)
+        rotated = (
+            self.rotation
+            if self.rotation is None or world_rotation is None
+            else world_rotation * self.rotation
+        )
+        no_variances: dict[str, Any] = {
+            "position_variance_m2": None,
+            "rotation_variance_rad2": None,
+        }
+        return replace(self, position_m=position_m, rotation=rotated, **no_variances)
 
     def track(self) -> Track:
         """What results say about it."""
-        own = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
+        track_fields = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
         return Track(
-            **{name: getattr(self, name) for name in own},
+            **{name: getattr(self, name) for name in track_fields},
             poses=len(self),
             start_s=float(self.time_s[0]),
             end_s=float(self.time_s[-1]),

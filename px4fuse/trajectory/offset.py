@@ -3,7 +3,7 @@
 One search serves trajectories here, and a position file against EKF2 or the IMU in
 :mod:`px4fuse.alignment.fitting`: both series are correlated over all lags (:mod:`correlation`), the
 best is refined by least squares, and is refused where another lag's residual is within
-:data:`RIVAL_RATIO` of it. What differs is what is known. Trajectories may have any frame and scale,
+:data:`MIN_SECOND_PEAK_RATIO` of it. What differs is what is known. Trajectories may have any frame and scale,
 so their speeds are correlated and a free similarity is refined; a position file is in metres with z
 vertical and has outliers, so horizontal positions are correlated, and yaw and origin refined
 robustly.
@@ -23,7 +23,7 @@ from scipy.special import stdtrit
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.record import Record, Span
 from px4fuse.trajectory.alignment import Transform, rms_m, umeyama
-from px4fuse.trajectory.association import bracketed, gap_limit, positions_at
+from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
@@ -34,12 +34,12 @@ MIN_POSES_SHARE = 0.3  # of those in the shorter one's span; gaps take some
 CANDIDATES = 12  # peaks of the correlation whose ATE is looked at
 # By which the least squares may leave a peak, and then what it found
 WINDOW_S, FINE_WINDOW_S = 0.5, 0.1
-APART_S = 1.0  # another offset, not the same peak
+MIN_SEPARATION_S = 1.0  # another offset, not the same peak
 MIN_CORRELATION = 0.3
 # Another offset fits as well where its residual (RMS) is not larger by this factor: of two sets of
 # 80 independent residuals, which is half a minute of a flight, one is larger by it in 5 % by chance
 # (F-test, F = 1.2² at 80 and 80 degrees of freedom)
-RIVAL_RATIO = 1.2
+MIN_SECOND_PEAK_RATIO = 1.2
 MAX_POSES = 2000  # in the least squares
 # Of the motion's extent: above the first nothing was matched; fits below the second are alike
 MAX_MISFIT, MIN_MISFIT = 0.5, 1e-3
@@ -113,44 +113,48 @@ def _search(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
     start_s = clock_difference(sparse, dense)
     candidates = ([] if start_s is None else [start_s]) + _candidates(sparse, dense)
     if not candidates:
-        return _unknown(
+        return _not_determinable(
             "the speeds of the two do not resemble each other at any offset (nothing moves, the "
             "speed is constant, or they are of different flights)"
         )
-    coarse = [_refine(sparse, dense, lag, WINDOW_S) for lag in candidates]
+    coarse = [_refine_offset(sparse, dense, lag, WINDOW_S) for lag in candidates]
     fits = [fit for fit in coarse if fit is not None and fit.misfit <= MAX_MISFIT]
     fits.sort(key=lambda fit: fit.misfit)
     if not fits:
-        return _unknown("where speeds resemble each other, positions do not, or too few overlap")
+        return _not_determinable(
+            "where speeds resemble each other, positions do not, or too few overlap"
+        )
     best = fits[0]
-    alike = [fit for fit in fits if fit.misfit <= RIVAL_RATIO * best.misfit]
-    apart = [fit for fit in alike if abs(fit.offset_s - best.offset_s) > APART_S]
+    similar_fits = [fit for fit in fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best.misfit]
+    distant_fits = [
+        fit for fit in similar_fits if abs(fit.offset_s - best.offset_s) > MIN_SEPARATION_S
+    ]
     if start_s is not None:
         # clocks that are set decide between offsets that fit alike
-        best = min(alike, key=lambda fit: abs(fit.offset_s - start_s))
-    elif apart:
-        return _unknown(
-            f"the motion repeats itself: {abs(apart[0].offset_s - best.offset_s):.1f} s further "
-            f"the ATE is {apart[0].rms_m:.3g} m instead of {best.rms_m:.3g} m"
+        best = min(similar_fits, key=lambda fit: abs(fit.offset_s - start_s))
+    elif distant_fits:
+        return _not_determinable(
+            f"the motion repeats itself: {abs(distant_fits[0].offset_s - best.offset_s):.1f} s further "
+            f"the ATE is {distant_fits[0].rms_m:.3g} m instead of {best.rms_m:.3g} m"
         )
     # again with the poses that are known around the offset, not around the candidate
-    best = _refine(sparse, dense, best.offset_s, FINE_WINDOW_S) or best
-    half = _half_interval(sparse, dense, best)
-    if not half <= MAX_HALF_INTERVAL_S:
-        width = f" (95 %: ±{half:.2g} s)" if np.isfinite(half) else ""
-        return _unknown(
+    best = _refine_offset(sparse, dense, best.offset_s, FINE_WINDOW_S) or best
+    half_interval_s = _half_interval(sparse, dense, best)
+    if not half_interval_s <= MAX_HALF_INTERVAL_S:
+        width = f" (95 %: ±{half_interval_s:.2g} s)" if np.isfinite(half_interval_s) else ""
+        return _not_determinable(
             f"the speed hardly changes: a shift in time is as good as one in space{width}"
         )
     return TimeOffset(
         offset_s=best.offset_s,
-        interval_s=(best.offset_s - half, best.offset_s + half),
+        interval_s=(best.offset_s - half_interval_s, best.offset_s + half_interval_s),
         determinable=True,
         reason=f"Speeds correlated over all lags, then the least ATE ({best.rms_m:.3g} m after a "
         f"free similarity, {len(best.time_s)} poses).",
     )
 
 
-def _unknown(why: str) -> TimeOffset:
+def _not_determinable(why: str) -> TimeOffset:
     return TimeOffset(determinable=False, reason=f"The time offset is not determinable: {why}.")
 
 
@@ -176,11 +180,11 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
     # key frames are interpolated too, tracking that is lost is not
-    known = bracketed(grid, time, max(10.0 * _median_step(trajectory), 0.5))
+    known = is_bracketed(grid, time, max(10.0 * _median_step(trajectory), 0.5))
     speeds = [np.linalg.norm(velocity, axis=1)]
     if trajectory.rotation is not None:
-        turned = Slerp(time, trajectory.rotation)(grid)
-        rates = (turned[:-1].inv() * turned[1:]).as_rotvec() / step_s
+        rotations = Slerp(time, trajectory.rotation)(grid)
+        rates = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
         rates = np.concatenate((rates, rates[-1:]))
         sigma = max(SMOOTHING_S, _median_step(trajectory)) / step_s
         speeds.append(np.linalg.norm(gaussian_filter1d(rates, sigma, axis=0), axis=1))
@@ -194,20 +198,20 @@ def _candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
     if min(spans) < 10 * step:
         return []
     (x, x_known), (y, y_known) = (_speeds(one, step) for one in (sparse, dense))
-    needed = max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * min(spans)) / step
-    needed = min(needed, 0.5 * min(spans) / step)
-    each = []
+    min_count = max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * min(spans)) / step
+    min_count = min(min_count, 0.5 * min(spans) / step)
+    correlations = []
     for a, b in zip(x, y, strict=False):  # angular speeds where both have them
         found = moments(a, b, x_known, y_known)
         # a stretch at rest correlates with anything once its variance is rounding
-        usable = found.count >= needed
+        is_usable = found.count >= min_count
         for values, known, power in ((a, x_known, found.power_a), (b, y_known, found.power_b)):
-            whole = float(np.var(values[known])) * np.count_nonzero(known)
-            usable &= power > 1e-3 * whole / len(values) * found.count
-        scale = np.sqrt(np.where(usable, found.power_a * found.power_b, 1.0))
-        each.append(np.where(usable, found.covariance.real / scale, 0.0))
-    total = np.mean(each, axis=0)
-    highest = maximum_filter1d(total, round(2 * APART_S / step) + 1)
+            total_power = float(np.var(values[known])) * np.count_nonzero(known)
+            is_usable &= power > 1e-3 * total_power / len(values) * found.count
+        scale = np.sqrt(np.where(is_usable, found.power_a * found.power_b, 1.0))
+        correlations.append(np.where(is_usable, found.covariance.real / scale, 0.0))
+    total = np.mean(correlations, axis=0)
+    highest = maximum_filter1d(total, round(2 * MIN_SEPARATION_S / step) + 1)
     order = np.flatnonzero((total == highest) & (total > MIN_CORRELATION))
     order = order[np.argsort(-total[order])][:CANDIDATES]
     # index k: the sparse one's first sample is at the dense one's sample k - (n - 1)
@@ -257,13 +261,13 @@ def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> fl
     # what the similarity cannot take over of a shift in time: shifts, small turns, scale
     columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred) for axis in np.eye(3)]
-    absorbed = np.stack([*columns, centred], axis=-1).reshape(3 * n, 7)
+    similarity_columns = np.stack([*columns, centred], axis=-1).reshape(3 * n, 7)
     both = np.stack((velocity, other), axis=-1).reshape(3 * n, 2)
-    both = both - absorbed @ np.linalg.lstsq(absorbed, both, rcond=None)[0]
-    (information, agreed), (_, other_information) = (both.T @ both).tolist()
+    both = both - similarity_columns @ np.linalg.lstsq(similarity_columns, both, rcond=None)[0]
+    (information, cross_information), (_, other_information) = (both.T @ both).tolist()
     if (
         information <= MIN_FREE_SHARE**2 * float((velocity**2).sum())
-        or agreed <= MIN_FREE_CORRELATION * (information * other_information) ** 0.5
+        or cross_information <= MIN_FREE_CORRELATION * (information * other_information) ** 0.5
     ):
         return float("inf")
     score = (both[:, 0].reshape(n, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
@@ -271,8 +275,8 @@ def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> fl
     lags = min(max(1, WINDOW_LENGTHS * _correlation_length(score)), n // 4)
     weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
     products = [float(score[k:] @ score[:-k]) for k in range(1, lags + 1)]
-    alone = float(score @ score)
-    variance = max(alone + 2.0 * float(weights @ products), alone)
+    own_variance = float(score @ score)
+    variance = max(own_variance + 2.0 * float(weights @ products), own_variance)
     quantile = float(stdtrit(max(n / lags - 1.0, 1.0), 0.5 + LEVEL / 2.0))
     return float(quantile * np.sqrt(variance) / information)
 
@@ -284,14 +288,16 @@ def _correlation_length(values: Array) -> int:
     return int(below[0]) if len(below) else len(values) // 4
 
 
-def _refine(
+def _refine_offset(
     sparse: Trajectory, dense: Trajectory, lag_s: float, window_s: float
 ) -> _OffsetFit | None:
     """Minimise the ATE over offsets around a given one; None where too few poses overlap."""
     time, limit = sparse.time_s, max(gap_limit(dense.time_s), 0.5 * gap_limit(sparse.time_s))
     # the same poses at every offset, else the objective jumps where poses come and go
-    around = (lag_s + edge for edge in (-window_s, 0.0, window_s))
-    known = np.all([bracketed(time + offset, dense.time_s, limit) for offset in around], axis=0)
+    window_offsets = (lag_s + edge for edge in (-window_s, 0.0, window_s))
+    known = np.all(
+        [is_bracketed(time + offset, dense.time_s, limit) for offset in window_offsets], axis=0
+    )
     chosen = np.flatnonzero(known)
     span = float(time[-1] - time[0])
     shorter = min(1.0, float(dense.time_s[-1] - dense.time_s[0]) / span)

@@ -41,12 +41,12 @@ def to_vector(q: Array) -> Array:
 
 def from_elements(*rows: tuple[Array | float, ...]) -> Array:
     """Matrices from their elements, each an array of the same shape or a number."""
-    shape = np.broadcast_shapes(*(np.shape(each) for row in rows for each in row))
-    made = np.empty((*shape, len(rows), len(rows[0])))
+    shape = np.broadcast_shapes(*(np.shape(element) for row in rows for element in row))
+    matrices = np.empty((*shape, len(rows), len(rows[0])))
     for i, row in enumerate(rows):
-        for j, each in enumerate(row):
-            made[..., i, j] = each
-    return made
+        for j, element in enumerate(row):
+            matrices[..., i, j] = element
+    return matrices
 
 
 def matrix(q: Array) -> Array:
@@ -65,16 +65,16 @@ def skew(v: Array) -> Array:
     return from_elements((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
 
 
-def running_product(turns: Array) -> Array:
+def running_product(quaternions: Array) -> Array:
     """Products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2 and so on, shape (n, 4).
 
     In √n columns side by side, so that n products take about 2√n vectorised steps.
     """
-    n = len(turns)
+    n = len(quaternions)
     width = max(1, int(np.sqrt(n)))
     rows = -(-n // width)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
-    padded = np.concatenate([turns, np.tile(identity, (rows * width - n, 1))])
+    padded = np.concatenate([quaternions, np.tile(identity, (rows * width - n, 1))])
     # row r holds turns r·width to (r+1)·width
     blocks = padded.reshape(rows, width, 4).copy()
     for column in range(1, width):
@@ -88,8 +88,8 @@ def running_product(turns: Array) -> Array:
 
 def interpolate(times: Array, known_times: Array, known: Array) -> Array:
     """Quaternions between known ones that differ little: linear, then to unit length."""
-    flips = np.sign(np.sum(known[1:] * known[:-1], axis=1))
-    signs = np.concatenate([[1.0], np.cumprod(np.where(flips == 0.0, 1.0, flips))])
-    steady = known * signs[:, None]
-    q = np.stack([np.interp(times, known_times, part) for part in steady.T], axis=-1)
+    signs_between = np.sign(np.sum(known[1:] * known[:-1], axis=1))
+    signs = np.concatenate([[1.0], np.cumprod(np.where(signs_between == 0.0, 1.0, signs_between))])
+    continuous = known * signs[:, None]
+    q = np.stack([np.interp(times, known_times, part) for part in continuous.T], axis=-1)
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Unavailable
-from px4fuse.record import Count, Maybe, NotNegative, Record, lacking
+from px4fuse.record import Count, NotNegative, OrUnavailable, Record, missing_data
 from px4fuse.trajectory.correlation import autocovariance
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
@@ -93,9 +93,9 @@ class RelativeError(Record, frozen=True):
     unit: Unit
     all_pairs: bool
     pairs_from: Literal["reference"]
-    translation_m: Maybe[Statistics]
-    interval_m: Maybe[Interval]
-    rotation_deg: Maybe[Statistics]
+    translation_m: OrUnavailable[Statistics]
+    interval_m: OrUnavailable[Interval]
+    rotation_deg: OrUnavailable[Statistics]
 
     @property
     def delta_words(self) -> str:
@@ -114,13 +114,13 @@ class PairwiseError(RelativeError, frozen=True, kw_only=True, eq=False):
         Empty where unavailable.
     """
 
-    written_as = RelativeError
+    schema_type = RelativeError
     start: IntArray
     end: IntArray
     translation_error_m: Array
     rotation_error_deg: Array
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 def statistics(errors: Array) -> Statistics:
@@ -194,22 +194,22 @@ def pairs(
             raise SettingsError(f"RPE delta {delta}: frames come whole.")
         start = np.arange(0, max(n - step, 0), 1 if all_pairs else step)
         return start, start + step
-    along = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
+    path_position = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
     if not all_pairs:
-        return _consecutive(np.diff(along), delta.value)
+        return _consecutive_pairs(np.diff(path_position), delta.value)
     start = np.arange(n - 1)
     # roundings may put the sum on the other side of one sample
-    guess = np.searchsorted(along, along + delta.value)[:-1]
-    near = np.clip(guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
-    miss = np.abs(along[near] - along[start, None] - delta.value)
-    best = np.argmin(miss, axis=1)
+    nearest_guess = np.searchsorted(path_position, path_position + delta.value)[:-1]
+    candidates = np.clip(nearest_guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
+    distance_error = np.abs(path_position[candidates] - path_position[start, None] - delta.value)
+    best = np.argmin(distance_error, axis=1)
     # of poses at rest, all equally far, the first
-    first = np.searchsorted(along, along[near[start, best]])
-    kept = miss[start, best] <= RELATIVE_TOLERANCE * delta.value
-    return start[kept], np.maximum(first, start + 1)[kept]
+    first = np.searchsorted(path_position, path_position[candidates[start, best]])
+    is_near = distance_error[start, best] <= RELATIVE_TOLERANCE * delta.value
+    return start[is_near], np.maximum(first, start + 1)[is_near]
 
 
-def _consecutive(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
+def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
     """Pairs end to end, each the shortest of at least a delta."""
     # each pair's sum starts at zero: differences of one running sum would round otherwise
     ends, travelled = [0], 0.0
@@ -218,8 +218,8 @@ def _consecutive(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
         if travelled >= delta:
             ends.append(index)
             travelled = 0.0
-    every = np.array(ends, dtype=np.intp)
-    return every[:-1], every[1:]
+    end_indices = np.array(ends, dtype=np.intp)
+    return end_indices[:-1], end_indices[1:]
 
 
 def relative_error(
@@ -241,29 +241,36 @@ def relative_error(
     """
     start, end = pairs(reference.position_m, reference.time_s, delta, all_pairs=all_pairs)
     what = f"RPE over {delta}"
-    both = rotations_of(aligned, reference, what)
-    if not isinstance(both, Unavailable) and not len(start):
-        both = Unavailable(what, f"no two poses are {delta} apart", "Ask for another delta.")
-    scores: tuple[Maybe[Statistics], Maybe[Interval], Maybe[Statistics]]
-    if isinstance(both, Unavailable):
+    rotations = rotations_of(aligned, reference, what)
+    if not isinstance(rotations, Unavailable) and not len(start):
+        rotations = Unavailable(what, f"no two poses are {delta} apart", "Ask for another delta.")
+    scores: tuple[OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]]
+    if isinstance(rotations, Unavailable):
         start = end = np.empty(0, dtype=np.intp)
         translation = rotation = np.empty(0)
-        scores = both, both, both
+        scores = rotations, rotations, rotations
     else:
-        p, q = (one[start].inv() for one in both)
+        p, q = (one[start].inv() for one in rotations)
         p_move = p.apply(aligned.position_m[end] - aligned.position_m[start])
         q_move = q.apply(reference.position_m[end] - reference.position_m[start])
         # the outer rotation of E turns its translation but does not change its length
         translation = np.linalg.norm(p_move - q_move, axis=1)
-        p_turn, q_turn = p * both[0][end], q * both[1][end]
+        p_turn, q_turn = p * rotations[0][end], q * rotations[1][end]
         rotation = np.degrees((q_turn.inv() * p_turn).magnitude())
         overlap = int(np.median(end - start)) if all_pairs else 1
         interval = rmse_interval(translation, what, min_block=overlap)
         scores = statistics(translation), interval, statistics(rotation)
     return PairwiseError(
-        delta.value, delta.unit, all_pairs, "reference", *scores,
-        start=start, end=end, translation_error_m=translation, rotation_error_deg=rotation,
-    )  # fmt: skip
+        delta.value,
+        delta.unit,
+        all_pairs,
+        "reference",
+        *scores,
+        start=start,
+        end=end,
+        translation_error_m=translation,
+        rotation_error_deg=rotation,
+    )
 
 
 def rotations_of(
@@ -303,12 +310,12 @@ def rmse_interval(
     n = len(squares)
     length = max(int(np.ceil(BLOCK_TIMES * autocorrelation_time(squares))), min_block, 1)
     if n < MIN_BLOCKS * length:
-        return lacking("rmse_correlated", what=what, length=length, n=n, min_blocks=MIN_BLOCKS)
+        return missing_data("rmse_correlated", what=what, length=length, n=n, min_blocks=MIN_BLOCKS)
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
     block_means = (sums[length:] - sums[:-length]) / length  # one for each start, round the end
     blocks = n / length
-    drawn = np.random.default_rng(SEED).integers(0, n, (resamples, round(blocks)))
-    means = block_means[drawn].mean(axis=1)
+    block_starts = np.random.default_rng(SEED).integers(0, n, (resamples, round(blocks)))
+    means = block_means[block_starts].mean(axis=1)
     quantile = float(stdtrit(blocks - 1.0, 0.5 + LEVEL / 2.0))
     tail = float(ndtr(-quantile * np.sqrt(blocks / (blocks - 1.0))))
     low, high = np.sqrt(np.maximum(np.quantile(means, [tail, 1.0 - tail]), 0.0))

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pypdf
-from pypdf.errors import LimitReachedError, PyPdfError
+from pypdf.errors import DependencyError, LimitReachedError, PyPdfError
 from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamObject
 
 from px4fuse.errors import ResultsError
@@ -37,13 +37,13 @@ MAX_VALUES = 1_000_000
 # Objects that are referred to and not there: pypdf searches the whole file for each of them
 MAX_MISSING = 100
 
-_DAMAGED = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
-_LOCKED = "encrypted, or damaged. Hand in the file px4fuse wrote."
-_COSTLY = "it takes more memory or work to open than a report can need."
+_DAMAGED_REASON = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
+_ENCRYPTED_REASON = "encrypted. Hand in the file that px4fuse wrote."
+_COSTLY_REASON = "it takes more memory or work to open than a report can need."
 
 # 900 files with a few bytes changed gave AttributeError too. What is none of these is a mistake of
 # ours, and stands as such in the row of that file
-BROKEN = (*BAD_VALUES, PyPdfError, AttributeError, zlib.error)
+BROKEN_PDF_ERRORS = (*BAD_VALUES, PyPdfError, AttributeError, zlib.error)
 
 # What acts: keys of a dictionary ... Links, comments, forms without scripts and the view to open
 # with are what programs add that save a report again
@@ -55,7 +55,7 @@ _ACTIONS = re.compile(
 
 # pypdf's defaults are for any PDF. A recovery of broken streams, filters other than Flate, chains
 # of filters and the external JBIG2 decoder are not for ours.
-_PYPDF_LIMITS: dict[str, Any] = {
+PYPDF_LIMITS: dict[str, Any] = {
     "maximum_declared_stream_length": MAX_BYTES,
     "array_based_stream_maximum_output_length": MAX_CONTENT_BYTES,
     "zlib_maximum_output_length": MAX_CONTENT_BYTES,
@@ -105,10 +105,10 @@ def read_report(pdf: bytes, name: str) -> Reported:
     """
     results = attached_results(pdf, name)
     if not isinstance(results, Reported):
-        held = "no results of a report"
+        content = "no results of a report"
         if isinstance(results, AidsResults):
-            held = "the aids of EKF2 alone, nothing of our filter"
-        raise ResultsError(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {held}.")
+            content = "the aids of EKF2 alone, nothing of our filter"
+        raise ResultsError(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {content}.")
     return results
 
 
@@ -123,40 +123,46 @@ def attached_results(pdf: bytes, name: str) -> Results:
     remedy = ""
     try:
         _check_file(pdf)
-        with pypdf.apply_configuration(**_PYPDF_LIMITS):
-            # strict: a file that needs repair is read differently by every program
-            reader = pypdf.PdfReader(
-                io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
-            )
+        with pypdf.apply_configuration(**PYPDF_LIMITS):
+            reader = opened(pdf)
             if reader.is_encrypted:
-                raise ResultsError(_LOCKED)
+                raise ResultsError(_ENCRYPTED_REASON)
             if not 0 < len(reader.pages) <= MAX_PAGES:
                 raise ResultsError(f"a PDF without pages, or with more than {MAX_PAGES}.")
             return read_results(_attachment(reader), f"{RESULTS_NAME} in it")
     except ResultsError as refusal:
         reason, remedy = f"{refusal.reason}.", refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
-        reason = _COSTLY
-    except BROKEN:
-        reason = _LOCKED if b"/Encrypt" in pdf else _DAMAGED
+        reason = _COSTLY_REASON
+    except DependencyError:  # pypdf decrypts AES with a library that px4fuse does not need
+        reason = _ENCRYPTED_REASON
+    except BROKEN_PDF_ERRORS:
+        reason = _ENCRYPTED_REASON if b"/Encrypt" in pdf else _DAMAGED_REASON
     raise ResultsError(f"{one_line(name, 200)}: {reason}", remedy)
 
 
+def opened(pdf: bytes) -> pypdf.PdfReader:
+    """Open a PDF within the limits, strictly: programs repair a damaged file in different ways."""
+    return pypdf.PdfReader(
+        io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
+    )
+
+
 def _check_file(pdf: bytes) -> None:
-    for wrong, why in (
+    for has_problem, why in (
         (len(pdf) > MAX_BYTES, f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."),
         (not pdf.startswith(b"%PDF-"), "not a PDF: hand in the file that px4fuse wrote."),
         (b"%%EOF" not in pdf[-2048:], "cut off: the end of the PDF is missing. Hand it in again."),
     ):
-        if wrong:
+        if has_problem:
             raise ResultsError(why)
     # every stream is inflated into nothing, so that no bomb reaches pypdf
-    left = MAX_DOCUMENT_BYTES
+    remaining_bytes = MAX_DOCUMENT_BYTES
     for match in _STREAM.finditer(pdf):
         # `stream` may stand anywhere, also inside a stream; each try counts towards the same limit
-        spent = _inflated_bytes(pdf, match.end(), min(left, MAX_CONTENT_BYTES))
-        left -= spent
-        if spent > MAX_CONTENT_BYTES or left < 0:
+        spent = _inflated_bytes(pdf, match.end(), min(remaining_bytes, MAX_CONTENT_BYTES))
+        remaining_bytes -= spent
+        if spent > MAX_CONTENT_BYTES or remaining_bytes < 0:
             raise ResultsError("a compressed part of it expands to more than a report can hold.")
 
 
@@ -166,20 +172,20 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
     if len(head) < 2 or head[0] & 15 != zlib.DEFLATED or int.from_bytes(head) % 31:
         return 0  # RFC 1950, section 2.2: not zlib data
     inflate = zlib.decompressobj()
-    taken = given = 0
-    while not inflate.eof and max(taken, given) <= limit:
+    input_bytes = output_bytes = 0
+    while not inflate.eof and max(input_bytes, output_bytes) <= limit:
         if not (feed := inflate.unconsumed_tail):
-            feed = pdf[start + taken : start + taken + 16_384]
-            taken += len(feed)
+            feed = pdf[start + input_bytes : start + input_bytes + 16_384]
+            input_bytes += len(feed)
         if not feed:
             break
         try:
-            given += len(inflate.decompress(feed, 1_000_000))
+            output_bytes += len(inflate.decompress(feed, 1_000_000))
         except zlib.error:  # pypdf, told not to repair, has no more use for it
             break
-    taken -= len(inflate.unused_data)
+    input_bytes -= len(inflate.unused_data)
     # the least is what a try costs, however little is there
-    return min(max(taken, given, 1000), limit + 1)
+    return min(max(input_bytes, output_bytes, 1000), limit + 1)
 
 
 def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
@@ -187,35 +193,35 @@ def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, b
 
     With whether a viewer comes there by a click alone: the action of a link or of an outline.
     """
-    seen: set[tuple[IndirectObject, bool]] = set()
-    missing = values = 0
-    left: list[tuple[Any, bool]] = [(reader.trailer, False)]
-    while left:
-        value, clicked = left.pop()
-        values += 1
+    visited: set[tuple[IndirectObject, bool]] = set()
+    missing_count = value_count = 0
+    remaining: list[tuple[Any, bool]] = [(reader.trailer, False)]
+    while remaining:
+        value, clicked = remaining.pop()
+        value_count += 1
         if isinstance(value, IndirectObject):
-            if (value, clicked) in seen:
+            if (value, clicked) in visited:
                 continue
-            seen.add((value, clicked))
+            visited.add((value, clicked))
             # in the cross-reference table, so that no search is needed for it
             number, generation = value.idnum, value.generation
-            packed = generation == 0 and number in reader.xref_objStm
-            listed = packed or number in reader.xref.get(generation, {})
-            missing += not listed
-            if len(seen) > MAX_OBJECTS or missing > MAX_MISSING:
-                raise ResultsError(_COSTLY)
+            is_packed = generation == 0 and number in reader.xref_objStm
+            is_listed = is_packed or number in reader.xref.get(generation, {})
+            missing_count += not is_listed
+            if len(visited) > MAX_OBJECTS or missing_count > MAX_MISSING:
+                raise ResultsError(_COSTLY_REASON)
             # ISO 32000-1, 7.3.10: a reference to an object that is not there is null
-            value = value.get_object() if listed else None
-        if values > MAX_VALUES:
-            raise ResultsError(_COSTLY)
+            value = value.get_object() if is_listed else None
+        if value_count > MAX_VALUES:
+            raise ResultsError(_COSTLY_REASON)
         if isinstance(value, DictionaryObject):
             yield value, clicked
-            left.extend((value.raw_get(key), key == "/A") for key in value)
+            remaining.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
-            left.extend((each, False) for each in list.__iter__(value))
+            remaining.extend((each, False) for each in list.__iter__(value))
 
 
-def _foreign(value: DictionaryObject, clicked: bool) -> Iterator[str]:
+def _foreign_features(value: DictionaryObject, clicked: bool) -> Iterator[str]:
     """What a dictionary has that a report has not."""
     yield from (key[1:] for key in value if _KEYS.fullmatch(key))
     action, kind = _name(value.get("/S")) or "", _name(value.get("/Type"))
@@ -223,24 +229,24 @@ def _foreign(value: DictionaryObject, clicked: bool) -> Iterator[str]:
         yield action[1:]
     if action == "/URI" and not clicked:
         yield "an action that opens an address"
-    stream = isinstance(value, StreamObject)
-    if ("/EF" not in value and kind in {"/Filespec", "/F"}) or (stream and "/F" in value):
+    is_stream = isinstance(value, StreamObject)
+    if ("/EF" not in value and kind in {"/Filespec", "/F"}) or (is_stream and "/F" in value):
         yield "a reference to another file"
-    if stream:
-        filters = _resolved(value.get("/Filter"))
+    if is_stream:
+        filters = _resolve(value.get("/Filter"))
         names = list(filters) if isinstance(filters, ArrayObject) else [filters]
-        used = [_name(each) for each in names if each is not None]
-        if not _FILTERS.issuperset(used) or len(set(used)) != len(used):
-            listed = " ".join(each or "?" for each in used[:3])
-            yield f"a stream packed by other means ({one_line(listed, 60)})"
+        used_names = [_name(each) for each in names if each is not None]
+        if not _FILTERS.issuperset(used_names) or len(set(used_names)) != len(used_names):
+            filter_names = " ".join(each or "?" for each in used_names[:3])
+            yield f"a stream packed by other means ({one_line(filter_names, 60)})"
 
 
-def _resolved(value: object) -> object:
+def _resolve(value: object) -> object:
     return value.get_object() if isinstance(value, IndirectObject) else value
 
 
 def _name(value: object) -> str | None:
-    value = _resolved(value)
+    value = _resolve(value)
     return str(value) if isinstance(value, str) else None
 
 
@@ -248,28 +254,33 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
     """Bytes of the one attached file; its name is compared and used for nothing else."""
     files: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
-    found: set[str] = set()
+    features: set[str] = set()
     for value, clicked in _dictionaries(reader):
-        found.update(_foreign(value, clicked))
-        parts: list[object] = [value] if _name(value.get("/Type")) == "/EmbeddedFile" else []
+        features.update(_foreign_features(value, clicked))
+        candidates: list[object] = [value] if _name(value.get("/Type")) == "/EmbeddedFile" else []
         if "/EF" in value:
             files.append(value)
-            versions = _resolved(value.get("/EF"))
-            parts += versions.values() if isinstance(versions, DictionaryObject) else ()
-        held = map(_resolved, parts)
-        streams |= {id(part): part for part in held if isinstance(part, StreamObject)}
-    if found:
-        raise ResultsError(f"it contains {', '.join(sorted(found))}; no report does.")
+            versions = _resolve(value.get("/EF"))
+            candidates += versions.values() if isinstance(versions, DictionaryObject) else ()
+        objects = map(_resolve, candidates)
+        streams |= {
+            id(candidate): candidate for candidate in objects if isinstance(candidate, StreamObject)
+        }
+    if features:
+        raise ResultsError(f"it contains {', '.join(sorted(features))}; no report does.")
     if not files and not streams:
         raise ResultsError.of("no_results_attached", name=RESULTS_NAME)
     if len(files) != 1 or len(streams) != 1:
         raise ResultsError.of("attachments_many")
     (file,), (stream,) = files, streams.values()
-    names = {str(_resolved(file.get(key))) for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
-             if key in file}  # fmt: skip
+    names = {
+        str(_resolve(file.get(key)))
+        for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
+        if key in file
+    }
     if names != {RESULTS_NAME}:
-        shown = one_line(" / ".join(sorted(names)), 80)
-        raise ResultsError(f"the attached file is called {shown!r}, not {RESULTS_NAME!r}.")
+        name_text = one_line(" / ".join(sorted(names)), 80)
+        raise ResultsError(f"the attached file is called {name_text!r}, not {RESULTS_NAME!r}.")
     data = bytes(stream.get_data())
     if len(data) > MAX_ATTACHMENT_BYTES:
         limit = MAX_ATTACHMENT_BYTES // 1_000_000

@@ -5,9 +5,15 @@ from typing import Literal
 
 # What Python raises where a value in a broken file is of another type, out of range or not there
 BAD_VALUES = (
-    ArithmeticError, AssertionError, LookupError, OSError, RuntimeError, TypeError, ValueError,
-)  # fmt: skip
-# Of the numbers; how the pages look is a result of its own
+    ArithmeticError,
+    AssertionError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+# Of the numbers; the comparison of pages is a result of its own
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
 
@@ -31,24 +37,27 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class PageDifference:
-    """A page that was handed in and does not look like the one that px4fuse draws.
+    """A difference between the handed-in PDF and the report that px4fuse draws.
 
     Attributes
     ----------
     page : int
-        Counted from 1.
+        Counted from 1; 0 for the document.
     what : str
-        In what it differs: the end of a sentence.
-    words : int
-        Places where its text is another.
-    picture : float
-        How far the pictures are apart, from 0 to 1; see :mod:`px4fuse.verification.pages`.
+        The difference: the end of a sentence.
+    structural : bool
+        The PDF has parts that px4fuse does not write, or lacks parts: another program made it, or
+        something was added.
     """
 
     page: int
     what: str
-    words: int
-    picture: float
+    structural: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """The difference with its place."""
+        return f"{f'page {self.page}' if self.page else 'document'}: {self.what}"
 
 
 @dataclass(frozen=True)
@@ -58,15 +67,16 @@ class Verdict:
     Attributes
     ----------
     status : Status
-        Of the numbers: whether the log gives them.
+        Of the numbers: whether the log gives them. "cannot verify" too if they are right, but the
+        PDF has another structure than the redrawn one.
     reasons : tuple of str
         Sentences: what differs, or why nothing can be said; for "verified" what was checked.
     with_log : bool
         Whether the analysis was run again on the log.
     page_status : {"same", "differ", "not compared"}
-        Whether the pages that were handed in look like the redrawn ones.
+        Result of the comparison of the handed-in PDF with the redrawn one.
     pages : tuple of PageDifference
-        Those that do not.
+        What differs.
     redrawn : bytes
         The report as px4fuse draws it from what the log gives, as a PDF: what to read instead of
         what was handed in. Empty where the analysis was not run again.
@@ -87,14 +97,7 @@ class Verdict:
     missing: str = ""
 
     @property
-    def page(self) -> int:
-        """The page that differs most, counted from 1; the cover where none does."""
-        most = max(self.pages, key=lambda one: (one.picture, one.words), default=None)
-        return most.page if most else 1
-
-    @property
     def outcome(self) -> str:
-        """In two words: the status, and where that is "verified" what the pages add to it."""
-        if self.status != "verified" or self.page_status == "same":
-            return self.status
-        return "page differs" if self.page_status == "differ" else "pages not compared"
+        """Status, or "page differs" if the numbers are verified and the pages are not."""
+        differ = self.status == "verified" and self.page_status == "differ"
+        return "page differs" if differ else self.status

@@ -1,257 +1,411 @@
-"""Pages of reports: pictures of them, and whether those that were handed in look like ours.
+"""Comparison of a handed-in PDF with the report that px4fuse draws again from the log.
 
-No number rests on the answer, and the instructor reads the redrawn report: it says where to look
-when somebody changed a page. Words are compared as text, everything else as a picture.
+Both files are walked in parallel from each page, the document information and the catalogue. They
+have to be equal in keys, names, numbers, texts and decoded streams: content, fonts with widths,
+encodings and ToUnicode, bookmarks, structure tree, metadata. This is an allow-list: whatever
+px4fuse does not write is a difference, without a list of what a forger may add.
 
-How far two pictures of a page are apart (:data:`DISTANCE`), measured on the report of the sample
-flight, on the page where it is largest:
-
-===========================================================  ================
-saved again by pypdf, qpdf (object streams, linearised,      0
-uncompressed, pages moved) or MuPDF (also appended to)
-saved by MuPDF with numbers rounded ("clean")                0.05
-all lines and marks 0.01, 0.05, 0.1 pt aside                 0.01, 0.03, 0.07
-curves thinned by other settings of matplotlib               0.12 to 0.16
-fonts embedded in another way (Type 3)                       0.44
-a point of a curve moved by 2 pt                             0 to 0.03
-one digit replaced (also found as a word)                    0.03 to 0.05
-all of one kind of mark larger; one mark in another colour   0.06; 0.02 to 0.07
-a text invisible, white or moved                             0.11 to 0.21
-a letter drawn as another by an altered font                 0.13 to 0.27
-a highlight or a comment over the page                       0.11 to 0.20
-a text in another font or size                               0.14 to 0.47
-a page clipped, turned, emptied or exchanged                 0.55 to 0.81
-===========================================================  ================
+Tolerated, because programs that save a PDF again change it: object numbers, compression, the
+trailer's ``/ID``, the header, unused objects, the spelling of numbers and strings, ``/Producer``
+and dates of the document information, and the same fields and the identifiers of XMP. Tolerated,
+because processors differ in the last digits: coordinates by COORDINATE_PT, and numbers in texts
+that are the rounded twins of numbers in the results. The attached results are compared as numbers,
+see :mod:`px4fuse.verification.verification`.
 """
 
-import importlib
-import io
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
-from dataclasses import dataclass
-from difflib import SequenceMatcher
-from functools import partial
-from itertools import zip_longest
-from typing import Any, TypeVar
+import re
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice, zip_longest
+from typing import Any
+from xml.etree import ElementTree
 
-import numpy as np
-import numpy.typing as npt
-from PIL import Image
-from scipy.ndimage import uniform_filter
+import pypdf
+from pypdf.errors import LimitReachedError
+from pypdf.generic import (
+    ArrayObject,
+    ByteStringObject,
+    DictionaryObject,
+    IndirectObject,
+    NameObject,
+    NullObject,
+    StreamObject,
+    TextStringObject,
+)
 
-from px4fuse.flight import Unavailable
-from px4fuse.record import lacking
-from px4fuse.results.reading import cleaned, one_line
-from px4fuse.verification.model import BAD_VALUES, PageDifference
-from px4fuse.workers import Failed, bounded
+from px4fuse.results.reading import one_line
+from px4fuse.verification.intake import BROKEN_PDF_ERRORS, MAX_VALUES, PYPDF_LIMITS, opened
+from px4fuse.verification.model import PageDifference
+from px4fuse.workers import JobFailure, run_one_bounded
 
-# Side of the square over which differences are averaged: about two digits, at a pixel per point
-SQUARE_PX = 8
-# Largest mean difference of grey (0 to 1) over such a square that does not count. Between what
-# harmless re-saves make (0.07 at the most) and what is seen as another page (from 0.11); see above
-DISTANCE = 0.07
-# A page that another program wrote may be rounded to whole points
-SIZE_PX = 2
-MAX_PAGE_TEXT = 1_000_000
-# For the pages of a PDF that was handed in; libraries take 0.6 GB of the address space
-TIMEOUT_S, MEMORY_BYTES = 10.0, 1_000_000_000
-# Less where a page is very long, or its picture does not fit into MAX_PICTURE_BYTES
-WIDTH_PX = 700
-# Enough to keep our blue, EKF2's orange and the severities apart, with smooth letters
-COLOURS = 16
-# A page of text and lines at 700 pixels takes 15 to 55 kB; a photograph is made smaller
-MAX_PICTURE_BYTES = 60_000
-MAX_PIXELS = 2_000_000
-MAX_DRAWN_COLOURS = 20_000
-# PDF's own limit is 14,400 points, or 200 inches
-MAX_POINTS = 14_400.0
-# PDFium's own errors are RuntimeErrors; the others come from ctypes and Pillow
-FAILURES = (*BAD_VALUES, MemoryError, ImportError)
+# Of coordinates (pt). Other kernels of OpenBLAS move points by at most 0.07; 0.25 is not visible
+COORDINATE_PT = 0.25
+# Of all other numbers, relative: programs that save a PDF again write 32-bit floats
+NUMBER = 1e-5
+# Of distances between letters in a text with a number that is rounded otherwise (1/1000 em)
+KERNING = 200.0
+# Factor on the length of content: every byte of a string may be an escape of four
+SPELLING = 4
+# For one comparison, which takes 3 s and 0.3 GB for the largest report
+TIMEOUT_S, MEMORY_BYTES = 12.0, 1_000_000_000
+# Differences that are listed; one is enough for the verdict
+MAX_FOUND = 20
+# Compression of a stream, and fields of the document information that other programs write
+_PACKED = frozenset(("/Length", "/Filter"))
+_STAMPS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
+_XMP_STAMPS = re.compile(
+    r"<(pdf:Producer|xmp:(?:Create|Modify|Metadata)Date|xmpMM:(?:Document|Instance)ID"
+    r"|stEvt:(?:when|instanceID))( [^>]*)?>[^<]*</\1>"
+)
+MAX_XMP_BYTES = 100_000
+# The version of Typst that set the report: 0.15.0 and 0.15.2 set the same pages
+_TYPST = re.compile(r"Typst \d+(\.\d+)*")
+_END = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
+_WORDS = {
+    "/AA": "an action",
+    "/AcroForm": "form fields",
+    "/Annots": "an annotation",
+    "/CropBox": "a crop box",
+    "/OCProperties": "layers",
+    "/OpenAction": "an action",
+    "/Outlines": "bookmarks",
+    "/Rotate": "a rotation",
+    "/UserUnit": "another unit of length",
+    "/XObject": "a picture or form",
+}
+# ISO 32000-1, 7.2 and 7.3: strings, delimiters of dictionaries, names, numbers and operators
+_TOKEN = re.compile(
+    r"\(((?:[^\\()]|\\.|\((?:[^\\()]|\\.)*+\))*+)\)|<([0-9A-Fa-f]*)>"
+    r"|(<<|>>|/?[^\0\t\n\f\r ()<>\[\]{}/%]+|[^\0\t\n\f\r ])",
+    re.DOTALL,
+)
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
+_ESCAPE = re.compile(r"\\([0-7]{1,3}|\r\n?|.)|\r\n?", re.DOTALL)
+_ESCAPED = {"n": "\n", "r": "\r", "t": "\t", "b": "\b", "f": "\f", "\n": "", "\r": "", "\r\n": ""}
+# Operators whose operands are coordinates, from the one with this number on
+_COORDINATES = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
+_TEXT = frozenset(("Tj", "TJ"))
+# In ToUnicode: glyph and letters
+_LETTERS = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
 
-NumbersAlike = Callable[[str, str], bool]
-Made = TypeVar("Made")
-
-
-@dataclass(frozen=True)
-class Look:
-    """What is seen of a page: its words in their order, and its grey values from 0 to 1."""
-
-    words: tuple[str, ...]
-    grey: npt.NDArray[np.float32]
+WordsAlike = Callable[[str, str], bool]
+# Of an operation: a number, a string, or a name, bracket or other token
+Operand = float | bytes | str
+Operation = tuple[str, tuple[Operand, ...]]
 
 
 def compare_pages(
-    submitted: bytes, redrawn: bytes, words_alike: NumbersAlike
-) -> tuple[PageDifference, ...] | Unavailable:
-    """Compare the pages of two PDFs.
+    submitted: bytes, redrawn: bytes, words_alike: WordsAlike, same_libraries: bool = True
+) -> tuple[PageDifference, ...]:
+    """Compare a handed-in PDF with the redrawn report, in a process with limits.
 
     Parameters
     ----------
     submitted : bytes
-        May be anything: its pages are drawn in a process of their own, within bounds.
-    redrawn : bytes
-        The report as px4fuse draws it.
+        A file that :func:`px4fuse.verification.intake.read_report` accepted.
     words_alike : callable
-        Whether two different words are the same up to the rounding of a number.
+        Returns True if two texts are equal up to the rounding of a number.
+    same_libraries : bool
+        False if the report was made with other versions of the libraries that draw figures: of a
+        figure only its place and texts are compared.
 
     Returns
     -------
-    tuple of PageDifference, or Unavailable
-        In the order of the pages; empty where all look the same. Unavailable without pypdfium2.
+    tuple of PageDifference
+        At most MAX_FOUND, in page order; empty if the PDF is what px4fuse writes. If the limits
+        are exceeded, that is the difference.
     """
-    ours = looks(redrawn)
-    if isinstance(ours, Unavailable):
-        return ours
-    # of a thousand pages that are handed in, not all are drawn
-    theirs = bounded(partial(looks, most=len(ours) + 1), submitted, TIMEOUT_S, MEMORY_BYTES)
-    if isinstance(theirs, Failed):
-        why = f"they cannot be drawn within bounds ({theirs.reason.rstrip('.')})"
-        return Unavailable("pages of the PDF", why, "Do not open it; read the redrawn report.")
-    if isinstance(theirs, Unavailable):
-        return (PageDifference(1, theirs.reason, 0, 1.0),)
-    return tuple(_differences(theirs, ours, words_alike))
+    job = (submitted, redrawn, words_alike, same_libraries)
+    found = run_one_bounded(_found, job, TIMEOUT_S, MEMORY_BYTES)
+    if isinstance(found, JobFailure):
+        what = f"it cannot be compared within the limits ({found.reason.rstrip('.')})"
+        return (PageDifference(0, what, True),)
+    return found
 
 
-def looks(pdf: bytes, most: int = 1000) -> tuple[Look | Unavailable, ...] | Unavailable:
-    """What is seen of the first pages of a PDF.
-
-    Unavailable stands for a page that cannot be drawn, and for all of them where the file cannot be
-    read or pypdfium2 is not installed.
-    """
-    return _of_pages(pdf, _look, slice(most))
-
-
-def _of_pages(
-    pdf: bytes, make: Callable[[Any, int], Made], which: slice
-) -> tuple[Made, ...] | Unavailable:
-    """What is made of some pages of a document of pypdfium2."""
+def _found(job: tuple[bytes, bytes, WordsAlike, bool]) -> tuple[PageDifference, ...]:
+    submitted, redrawn, words_alike, same_libraries = job
     try:
-        with closing(importlib.import_module("pypdfium2").PdfDocument(pdf)) as document:
-            return tuple(make(document, page) for page in range(len(document))[which])
-    except FAILURES as error:
-        return undrawn(error)
+        with pypdf.apply_configuration(**PYPDF_LIMITS):
+            theirs, ours = map(opened, (submitted, redrawn))
+            walk = _Walk(words_alike, same_libraries)
+            found = [PageDifference(0, what, True) for what in _tables(submitted)]
+            found += islice(walk.differences(theirs, ours), MAX_FOUND)
+            producer = (theirs.metadata or DictionaryObject()).get("/Producer")
+            if producer is not None and any(one.structural for one in found):
+                what = f"another program wrote this file ({one_line(str(producer), 60)})"
+                found.insert(0, PageDifference(0, what, True))
+            return tuple(found)
+    except (LimitReachedError, RecursionError, SyntaxError, *BROKEN_PDF_ERRORS) as error:
+        what = f"it cannot be read ({type(error).__name__})"
+        return (PageDifference(0, what, True),)
 
 
-def _look(document: Any, page: int) -> Look | Unavailable:
-    try:
-        sheet = document[page]
-        # 72 dpi: a pixel per point
-        grey = np.asarray(rendered(sheet, sheet.get_size()[0]).convert("L"), dtype=np.float32)
-        text = sheet.get_textpage().get_text_range()[:MAX_PAGE_TEXT]
-        return Look(tuple(cleaned(text.replace("\r\n", "\n")).split()), grey / 255.0)
-    except FAILURES as error:
-        return undrawn(error)
+@dataclass
+class _Walk:
+    """Parallel walk through two PDFs.
 
-
-def _differences(
-    theirs: Sequence[Look | Unavailable], ours: Sequence[Look | Unavailable], alike: NumbersAlike
-) -> Iterator[PageDifference]:
-    for number, (found, expected) in enumerate(zip_longest(theirs, ours), start=1):
-        if not (isinstance(found, Look) and isinstance(expected, Look)):
-            what = "it is missing" if found is None else f"px4fuse draws only {len(ours)} pages"
-            unseen = [one.reason for one in (found, expected) if isinstance(one, Unavailable)]
-            what = what if None in (found, expected) else unseen[0]
-            yield PageDifference(number, what, 0, 1.0)
-            continue
-        words = list(_other_words(found.words, expected.words, alike))
-        apart = _distance(found.grey, expected.grey)
-        said = []
-        if words:
-            one, other = (one_line(text, 60) or "nothing" for text in words[0])
-            places = f"{len(words)} places in its text"
-            said.append(f"{places}, first {one!r} where px4fuse prints {other!r}")
-        if apart > DISTANCE:
-            said.append(f"its picture, by {apart:.2f} of 1 (up to {DISTANCE:g} is no difference)")
-        if said:
-            yield PageDifference(number, " and ".join(said), len(words), round(apart, 3))
-
-
-def _other_words(
-    theirs: Sequence[str], ours: Sequence[str], alike: NumbersAlike
-) -> Iterator[tuple[str, str]]:
-    """Places where the words are others: what stands there, and what should."""
-    if theirs == ours:
-        return
-    matcher = SequenceMatcher(None, theirs[:20_000], ours, autojunk=False)
-    for kind, a, b, c, d in matcher.get_opcodes():
-        if kind == "equal":
-            continue
-        found, expected = theirs[a:b], ours[c:d]
-        if b - a != d - c or not all(map(alike, found, expected)):
-            yield " ".join(found), " ".join(expected)
-
-
-def _distance(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]) -> float:
-    """Largest mean difference of grey over a square of the page; 1 for pages of other sizes."""
-    if max(abs(a - b) for a, b in zip(one.shape, other.shape, strict=True)) > SIZE_PX:
-        return 1.0
-    height, width = (min(a, b) for a, b in zip(one.shape, other.shape, strict=True))
-    apart = np.abs(one[:height, :width] - other[:height, :width])
-    return float(uniform_filter(apart, SQUARE_PX).max())
-
-
-# ------------------------------------------------------------------ pictures
-
-
-def pictures(pdf: bytes, page: int | None = None) -> tuple[bytes, ...] | Unavailable:
-    """Draw the pages of a PDF, or one of them.
-
-    Needs pypdfium2. Nothing in the PDF is executed, and a picture's size is bounded whatever the
-    page's is; time and memory are not: what was handed in is for a process that has limits.
-
-    Parameters
+    Attributes
     ----------
-    pdf : bytes
-        May be anything.
-    page : int, optional
-        Counted from 0; by default all.
-
-    Returns
-    -------
-    tuple of bytes or Unavailable
-        PNGs of at most :data:`MAX_PICTURE_BYTES`; none for a page that is not there.
+    seen : set of tuple
+        Pairs of objects that were compared: number, generation, and px4fuse's number.
+    parents : list of tuple
+        Parents of pages, left for the walk from the catalogue.
+    fonts : mapping
+        Of the page that is compared, by the names that its content uses.
     """
-    which = slice(None) if page is None else slice(page, page + 1)
-    return _of_pages(pdf, lambda sheets, at: _small_png(rendered(sheets[at], WIDTH_PX)), which)
+
+    words_alike: WordsAlike
+    same_libraries: bool
+    seen: set[tuple[int, int, int]] = field(default_factory=set)
+    parents: list[tuple[Any, Any, str]] = field(default_factory=list)
+    fonts: Mapping[str, Any] = field(default_factory=dict)
+    steps: int = 0
+
+    def differences(
+        self, theirs: pypdf.PdfReader, ours: pypdf.PdfReader
+    ) -> Iterator[PageDifference]:
+        """Yield the differences of pages, document information and catalogue."""
+        pages = [_sheets(reader) for reader in (theirs, ours)]
+        for number, (one, other) in enumerate(zip_longest(*pages), start=1):
+            if one is None or other is None:
+                what = "it is missing" if one is None else f"px4fuse draws {len(pages[1])} pages"
+                yield PageDifference(number, what)
+                return
+            self.fonts = _resolved(other.get_object()["/Resources"].get("/Font", {}))
+            yield from self._compare(one, other, "/Page", number)
+        for key in ("/Info", "/Root"):
+            one, other = (dict.get(reader.trailer, key) for reader in (theirs, ours))
+            yield from self._compare(one, other, key, 0)
+        for one, other, key in self.parents:
+            yield from self._compare(one, other, key, 0)
+        if "/XRefStm" in theirs.trailer:  # two tables of objects: programs differ in which they use
+            yield PageDifference(0, "a second table of objects", True)
+
+    def _compare(self, theirs: Any, ours: Any, key: str, page: int) -> Iterator[PageDifference]:
+        """Yield the differences of two values and of all that they contain."""
+        left = [(theirs, ours, key)]
+        while left:
+            theirs, ours, key = left.pop()
+            self.steps += 1
+            if self.steps > MAX_VALUES:
+                raise LimitReachedError("too many values")
+            if isinstance(theirs, IndirectObject) and theirs.generation:  # some programs ignore it
+                yield PageDifference(page, f"{key}: an object of a later generation", True)
+            if isinstance(theirs, IndirectObject) and isinstance(ours, IndirectObject):
+                pair = theirs.idnum, theirs.generation, ours.idnum
+                if pair in self.seen:
+                    continue
+                self.seen.add(pair)
+            theirs, ours = _resolved(theirs), _resolved(ours)
+            if _kind(theirs) is not _kind(ours):
+                yield PageDifference(page, f"{key} is of another type", True)
+            elif isinstance(ours, DictionaryObject):
+                yield from self._dictionaries(theirs, ours, key, page, left)
+            elif isinstance(ours, ArrayObject):
+                if len(theirs) != len(ours):
+                    what = f"{key} has {len(theirs)} parts; px4fuse writes {len(ours)}"
+                    yield PageDifference(page, what, True)
+                    continue
+                both = zip(list.__iter__(theirs), list.__iter__(ours), strict=True)
+                left += [(one, other, key) for one, other in both][::-1]
+            elif not self._same(theirs, ours):
+                found, drawn = (one_line(str(each), 60) for each in (theirs, ours))
+                yield PageDifference(page, f"{key} is {found!r}; px4fuse writes {drawn!r}")
+
+    def _dictionaries(
+        self,
+        theirs: DictionaryObject,
+        ours: DictionaryObject,
+        key: str,
+        page: int,
+        left: list[tuple[Any, Any, str]],
+    ) -> Iterator[PageDifference]:
+        """Yield the differences of keys and streams; the values are put on the list."""
+        found, drawn = (_keys(each, key) for each in (theirs, ours))
+        for name in sorted(found ^ drawn):
+            said = _WORDS.get(name, f"an entry {one_line(name, 40)}")
+            what = "that px4fuse does not write" if name in found else "is missing"
+            yield PageDifference(page, f"{said} {what}", True)
+        for name in sorted(found & drawn, reverse=True):
+            pair = theirs.raw_get(name), ours.raw_get(name), name
+            (self.parents if page and name == "/Parent" else left).append(pair)
+        if isinstance(theirs, StreamObject) and isinstance(ours, StreamObject):
+            yield from self._streams(theirs, ours, key, page)
+
+    def _same(self, theirs: Any, ours: Any) -> bool:
+        if _kind(ours) is float:
+            return math.isclose(theirs, ours, rel_tol=NUMBER, abs_tol=NUMBER)
+        if _kind(ours) is str and _TYPST.fullmatch(str(theirs)) and _TYPST.fullmatch(str(ours)):
+            return True
+        if _kind(ours) is str:
+            one, other = (
+                str(each) if isinstance(each, str) else each.decode("latin-1")
+                for each in (theirs, ours)
+            )
+            return one == other or self.words_alike(one, other)
+        return bool(theirs == ours)
+
+    def _streams(
+        self, theirs: StreamObject, ours: StreamObject, key: str, page: int
+    ) -> Iterator[PageDifference]:
+        kind = ours.get("/Type")
+        if kind == "/EmbeddedFile":  # results.json, which intake has read
+            return
+        packed = _resolved(theirs.get("/Filter"))
+        if packed not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf leaves a JPEG as it is
+            yield PageDifference(page, f"{key} is packed by other means", True)
+            return
+        one, other = theirs.get_data(), ours.get_data()
+        if one == other or (kind == "/Metadata" and _xmp(one) == _xmp(other)):
+            return
+        if (key != "/Contents" and kind != "/Pattern") or len(one) > SPELLING * len(other):
+            yield PageDifference(page, f"{key}: its content is not what px4fuse writes")
+        elif what := self._other_operation(one, other):
+            yield PageDifference(page, what)
+
+    def _other_operation(self, theirs: bytes, ours: bytes) -> str:
+        """Describe the first operation that differs; empty if none does."""
+        both = [_operations(each) for each in (theirs, ours)]
+        if not self.same_libraries:
+            both = [_without_drawings(each) for each in both]
+        font = ""
+        for number, pair in enumerate(zip_longest(*both, fillvalue=("", ())), start=1):
+            (one, found), (other, drawn) = pair
+            if other == "Tf":
+                font = str(drawn[0])
+            if pair[0] == pair[1] or (one == other and _near(one, found, drawn)):
+                continue
+            if {one, other} <= _TEXT:
+                texts = [self._text(operands, font) for operands in (found, drawn)]
+                widest = max((abs(each) for each in found if isinstance(each, float)), default=0.0)
+                if texts[0] != texts[1] and widest < KERNING and self.words_alike(*texts):
+                    continue
+                shown = [one_line(text, 60) for text in texts]
+                return f"its text has {shown[0]!r} where px4fuse prints {shown[1]!r}"
+            return f"drawing operation {number} is not what px4fuse draws ({one_line(other, 9)})"
+        return ""
+
+    def _text(self, operands: tuple[Operand, ...], font: str) -> str:
+        """Return the letters of Tj or TJ by the ToUnicode of its font; ? for other glyphs."""
+        cmap = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
+        letters = {int(glyph, 16): bytes.fromhex(text) for glyph, text in _LETTERS.findall(cmap)}
+        glyphs = b"".join(each for each in operands if isinstance(each, bytes))
+        numbers = struct.unpack(f">{len(glyphs) // 2}H", glyphs[: len(glyphs) // 2 * 2])
+        return b"".join(letters.get(each, b"\0?") for each in numbers).decode(
+            "utf-16-be", "replace"
+        )
 
 
-def undrawn(error: BaseException) -> Unavailable:
-    """What stands for a page or file that raised one of FAILURES."""
-    if isinstance(error, ImportError):
-        return lacking("no_pdfium")
-    return lacking("page_not_drawn", why=one_line(str(error), 80))
+def _tables(pdf: bytes) -> Iterator[str]:
+    """Describe why programs may read different objects: they start from different tables."""
+    end = _END.search(pdf[-1024:])
+    if end is None:
+        yield "bytes after its end"
+    elif b"/Linearized" in pdf[:1024]:
+        # the first table in the file has to be the one that its end refers to
+        begin = pdf.find(b"endobj") + len(b"endobj")
+        if pdf[begin : int(end[1])].strip():
+            yield "a second table of objects"
 
 
-def rendered(sheet: Any, width_px: float) -> Image.Image:
-    """A page of pypdfium2's in RGB, on white, at most :data:`MAX_PIXELS` large.
+def _sheets(reader: pypdf.PdfReader) -> list[Any]:
+    """References to the pages, in order, of a page tree with one level, as px4fuse writes it."""
+    tree: Any = reader.root_object["/Pages"]
+    return list(list.__iter__(tree["/Kids"]))
 
-    With the comments that lie over it, since a viewer shows them; without what was typed into
-    forms, which pypdfium2 draws only on request.
 
-    Raises
-    ------
-    one of FAILURES
-        It cannot be drawn.
+def _resolved(value: Any) -> Any:
+    return value.get_object() if isinstance(value, IndirectObject) else value
+
+
+def _kind(value: Any) -> type:
+    """Type of a PDF value: a name is no string, a stream no dictionary, a flag no number."""
+    kinds = StreamObject, DictionaryObject, ArrayObject, NameObject
+    if isinstance(value, TextStringObject | ByteStringObject):
+        return str
+    if isinstance(value, int | float):
+        return float
+    return next((kind for kind in kinds if isinstance(value, kind)), type(value))
+
+
+def _keys(value: DictionaryObject, key: str) -> set[str]:
+    """Return the keys of a dictionary that are compared; a null counts as absent."""
+    left_out = set(_PACKED) if isinstance(value, StreamObject) else set()
+    left_out |= _STAMPS if key == "/Info" else set()
+    left_out |= {"/Params"} if value.get("/Type") == "/EmbeddedFile" else set()
+    return {each for each in value if not isinstance(value.raw_get(each), NullObject)} - left_out
+
+
+def _xmp(data: bytes) -> str:
+    """Return metadata in one spelling, without what other programs write into it."""
+    if len(data) > MAX_XMP_BYTES or b"<!" in data:  # no document types, whose entities expand
+        return data.decode("latin-1")
+    packet = re.sub(r"<\?.*?\?>", "", data.decode("utf-8", "replace"))
+    spelt = ElementTree.canonicalize(packet.strip(), strip_text=True)
+    return _TYPST.sub("Typst", _XMP_STAMPS.sub("", spelt))
+
+
+def _operations(content: bytes) -> Iterator[Operation]:
+    """Read content as operators with their operands."""
+    operands: list[Operand] = []
+    for match in _TOKEN.finditer(content.decode("latin-1")):
+        literal, digits, token = match.groups("")
+        if not token:
+            operands.append(
+                bytes.fromhex(digits + "0" * (len(digits) % 2))
+                if digits
+                else _ESCAPE.sub(_unescaped, literal).encode("latin-1")
+            )
+        elif _NUMBER.fullmatch(token):
+            operands.append(float(token))
+        elif token[0] in "/[]<>{}":
+            operands.append(token)
+        else:
+            yield token, tuple(operands)
+            operands.clear()
+    yield "", tuple(operands)
+
+
+def _unescaped(match: re.Match[str]) -> str:
+    escaped = match[1]
+    if escaped is None:  # an end of line, however it is written
+        return "\n"
+    if escaped[0] in "01234567":
+        return chr(int(escaped, 8) & 255)
+    return _ESCAPED.get(escaped, escaped)
+
+
+def _near(operator: str, theirs: Sequence[Operand], ours: Sequence[Operand]) -> bool:
+    """Return True if operands are equal, coordinates within COORDINATE_PT."""
+    first = _COORDINATES.get(operator, len(ours))
+    return len(theirs) == len(ours) and all(
+        one == other
+        or (
+            isinstance(one, float)
+            and isinstance(other, float)
+            and math.isclose(
+                one, other, rel_tol=NUMBER, abs_tol=COORDINATE_PT if at >= first else NUMBER
+            )
+        )
+        for at, (one, other) in enumerate(zip(theirs, ours, strict=True))
+    )
+
+
+def _without_drawings(operations: Iterator[Operation]) -> Iterator[Operation]:
+    """Leave out what figures draw within their clip, except texts.
+
+    Typst marks a figure by its description (/Alt) and clips it to its place.
     """
-    width, height = sheet.get_size()
-    if not (0.0 < width <= MAX_POINTS and 0.0 < height <= MAX_POINTS):
-        raise ValueError(f"its size is {width:g} by {height:g} points")
-    scale = min(width_px / width, math.sqrt(MAX_PIXELS / (width * height)))
-    bitmap = sheet.render(scale=scale, may_draw_forms=False)
-    return bitmap.to_pil().convert("RGB").copy()  # type: ignore[no-any-return]
-
-
-def _small_png(image: Image.Image) -> bytes:
-    while True:
-        # Choosing by coverage is truer to text and lines, and takes minutes on a photograph
-        drawn = image.getcolors(MAX_DRAWN_COLOURS) is not None
-        method = Image.Quantize.MAXCOVERAGE if drawn else Image.Quantize.FASTOCTREE
-        reduced = image.quantize(COLOURS, method, dither=Image.Dither.NONE)
-        out = io.BytesIO()
-        reduced.save(out, "PNG")
-        if out.tell() <= MAX_PICTURE_BYTES:
-            return out.getvalue()
-        ratio = min(0.9, math.sqrt(MAX_PICTURE_BYTES / out.tell()))
-        width, height = (max(1, int(ratio * side)) for side in image.size)
-        image = image.resize((width, height), Image.Resampling.LANCZOS)
+    figure = clipped = False
+    depth = 0
+    for operator, operands in operations:
+        if operator == "BDC" and not clipped:
+            figure, depth = "/Alt" in operands, 0
+        depth += (operator == "q") - (operator == "Q")
+        clipped = clipped and depth > 0
+        if not clipped or operator in _TEXT or operator == "Tf":
+            yield operator, operands
+        clipped = clipped or (figure and operator == "n" and depth > 0)

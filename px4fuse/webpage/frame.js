@@ -84,24 +84,6 @@
     }
     return made;
   };
-  const pictures = (lines) => {
-    const made = make("div", "", lines.length > 1 ? "sheets" : "sheets one");
-    for (const [said, alt, source] of lines) {
-      const sheet = make("figure");
-      const picture = make("img");
-      const large = make("a");
-      picture.alt = alt;
-      picture.loading = "lazy";
-      picture.width = 700;
-      picture.height = 990;
-      picture.src = source;
-      large.href = source;
-      large.append(picture);
-      sheet.append(large, make("figcaption", said));
-      made.append(sheet);
-    }
-    return made;
-  };
   // What is typed in boxes, by whom it is about and its name; it leaves the page as a download only
   const typed = new Map();
   let unsaved = false;
@@ -150,7 +132,7 @@
     const all = [["id", "item", "points", "comment"], ...lines.values()];
     return "\ufeff" + all.map((line) => line.map(quoted).join(",") + "\r\n").join("");
   };
-  const makers = { list, prose, pairs, table, links, pictures, boxes };
+  const makers = { list, prose, pairs, table, links, boxes };
 
   const section = (parts, name) => {
     const made = make("section", "", name);

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from px4fuse.webpage.safe import cleaned, inert_json, part, policy_hash, template
+from px4fuse.webpage.safe import clean_values, inert_json, part, policy_hash, template
 
 # Rows that the script draws at once, and that are there without it
-PAGE_ROWS = 100
-PLAIN_ROWS = 300
+MAX_PAGE_ROWS = 100
+MAX_PLAIN_ROWS = 300
 
 
 @dataclass(frozen=True)
@@ -26,14 +26,14 @@ class Column:
         How it is sorted; a line is text that stays in one, a rank is text sorted by a number.
     group : str
         Shown only while the box of this group is ticked; "" for always.
-    narrow : {"always", "tablet", "desk"}
+    visible_from : {"always", "tablet", "desk"}
         The smallest screen on which it is shown.
     """
 
     title: str
     kind: Literal["text", "line", "number", "rank"] = "text"
     group: str = ""
-    narrow: Literal["always", "tablet", "desk"] = "always"
+    visible_from: Literal["always", "tablet", "desk"] = "always"
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Cell:
         By which it is sorted; None comes last both ways.
     below : str
         A second, small line.
-    look : str
+    style_class : str
         "" for text, "flags" for one flag per line, else the class of a chip.
     bar : float or None
         Length of a bar below the text, from 0 to 1.
@@ -55,16 +55,16 @@ class Cell:
     text: str = ""
     value: float | str | None = None
     below: str = ""
-    look: str = ""
+    style_class: str = ""
     bar: float | None = None
 
 
-def words(text: str, below: str = "") -> Cell:
+def text_cell(text: str, below: str = "") -> Cell:
     """A cell that is sorted by its text."""
     return Cell(text, text or None, below)
 
 
-def figure(value: float | None, text: str | None = None, below: str = "") -> Cell:
+def number_cell(value: float | None, text: str | None = None, below: str = "") -> Cell:
     """A cell that is sorted by a number; empty for what is absent or not finite."""
     if value is None or not math.isfinite(value):
         return Cell()
@@ -84,36 +84,36 @@ class Row:
         One per column; the first names the row and unfolds it.
     tags : tuple of str
         What filters look for.
-    details, beside : tuple of Part
-        What it unfolds to, and what stands at the right of it: of :func:`listed` and the like;
+    details, side_parts : tuple of Part
+        What it unfolds to, and what stands at the right of it: of :func:`list_part` and the like;
         those with nothing in them are left out.
     """
 
     cells: tuple[Cell, ...]
     tags: tuple[str, ...] = ()
     details: tuple[Part, ...] = ()
-    beside: tuple[Part, ...] = ()
+    side_parts: tuple[Part, ...] = ()
 
 
 # ------------------------------------------------------------------ what a row unfolds to
 
 
-def listed(title: str, texts: Sequence[str], warn: bool = False) -> Part:
+def list_part(title: str, texts: Sequence[str], warn: bool = False) -> Part:
     """A list of sentences."""
     return ["list", title, texts, warn]
 
 
-def prose(title: str, text: str) -> Part:
+def prose_part(title: str, text: str) -> Part:
     """Text with its own lines."""
     return ["prose", title, text]
 
 
-def pairs(title: str, rows: Sequence[tuple[str, str]]) -> Part:
+def pairs_part(title: str, rows: Sequence[tuple[str, str]]) -> Part:
     """Names and what they are; those without a value are left out."""
     return ["pairs", title, [row for row in rows if row[1]]]
 
 
-def tabled(
+def table_part(
     title: str,
     heads: Sequence[str],
     rows: Sequence[Sequence[str]],
@@ -123,21 +123,16 @@ def tabled(
     return ["table", title, heads, rows, list(numeric)]
 
 
-def links(title: str, rows: Sequence[tuple[str, str]]) -> Part:
+def links_part(title: str, rows: Sequence[tuple[str, str]]) -> Part:
     """Words and where they lead: addresses of :func:`px4fuse.webpage.safe.local_link` only."""
     return ["links", title, [row for row in rows if row[1]]]
 
 
-def pictures(title: str, rows: Sequence[tuple[str, str, str]]) -> Part:
-    """Caption, words for who does not see it, and address (local)."""
-    return ["pictures", title, rows]
-
-
-def boxes(
+def boxes_part(
     title: str,
     owner: str,
     rows: Sequence[tuple[str, float, float | None, str]],
-    kept: Sequence[tuple[str, float | None, str]] = (),
+    other_rows: Sequence[tuple[str, float | None, str]] = (),
 ) -> Part:
     """Boxes for points and words, which the page gives as a table to download.
 
@@ -146,10 +141,10 @@ def boxes(
     owner : str
         Whose they are, as the table says it.
     rows : sequence of (name, most, points, words)
-    kept : sequence of (name, points, words)
+    other_rows : sequence of (name, points, words)
         What the table holds besides.
     """
-    return ["boxes", title, owner, rows, kept]
+    return ["boxes", title, owner, rows, other_rows]
 
 
 # ------------------------------------------------------------------ the page
@@ -166,7 +161,7 @@ def page(
     filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
     groups: Sequence[tuple[str, str]] = (),
     placeholder: str,
-    otherwise: str,
+    full_table_note: str,
 ) -> str:
     """Lay out a page.
 
@@ -182,7 +177,7 @@ def page(
         Boxes that show more columns.
     placeholder : str
         What one may search for.
-    otherwise : str
+    full_table_note : str
         Sentence: where all rows are for whom the page shows only some of them.
 
     Returns
@@ -193,16 +188,16 @@ def page(
     style = part("base.css") + part("frame.css")
     script = part("frame.js")
     content = {
-        "columns": [(c.title, c.kind, c.group, c.narrow) for c in columns],
+        "columns": [(c.title, c.kind, c.group, c.visible_from) for c in columns],
         "rows": [
             (
                 [_compact(cell) for cell in row.cells],
                 row.tags,
-                *([part for part in side if part[2]] for side in (row.details, row.beside)),
+                *([part for part in side if part[2]] for side in (row.details, row.side_parts)),
             )
             for row in rows
         ],
-        "size": PAGE_ROWS,
+        "size": MAX_PAGE_ROWS,
         "nouns": noun,
     }
     return template("webpage/frame.html").render(
@@ -219,9 +214,9 @@ def page(
         noun=noun,
         columns=columns,
         rows=rows,
-        plain_rows=PLAIN_ROWS,
-        otherwise=otherwise,
-        content=inert_json(cleaned(content)),
+        plain_rows=MAX_PLAIN_ROWS,
+        full_table_note=full_table_note,
+        content=inert_json(clean_values(content)),
     )
 
 
@@ -229,7 +224,7 @@ def _compact(cell: Cell) -> list[Any]:
     """Its fields without those at the end that are empty; true stands for a value like its text."""
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     bar = "" if cell.bar is None else round(cell.bar, 3)
-    fields = [cell.text, value, cell.below, cell.look, bar]
+    fields = [cell.text, value, cell.below, cell.style_class, bar]
     while fields and fields[-1] == "":
         fields.pop()
     return fields

@@ -14,27 +14,32 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 MAX_CHARACTERS = 20_000
 # Controls but for tab and line end, surrogates, and what turns the direction of all that follows
-HARMFUL = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]")
+HARMFUL_CHARACTERS = re.compile(
+    "[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
+)
 
 
-def clean(text: str, most: int = MAX_CHARACTERS) -> str:
+def clean(text: str, max_length: int = MAX_CHARACTERS) -> str:
     r"""Text without what HTML cannot hold and what turns the direction of others; cut when long.
 
     >>> clean("a\x1b\u202eb", 10), clean("abcdef", 3)
     ('a��b', 'abc…')
     """
-    text = text if len(text) <= most else text[:most] + "…"
-    return HARMFUL.sub("\N{REPLACEMENT CHARACTER}", text)
+    text = text if len(text) <= max_length else text[:max_length] + "…"
+    return HARMFUL_CHARACTERS.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
-def cleaned(value: Any, most: int = MAX_CHARACTERS) -> Any:
+def clean_values(value: Any, max_length: int = MAX_CHARACTERS) -> Any:
     """The same with every text in it clean, and numbers of numpy as Python's."""
     if isinstance(value, str):
-        return clean(value, most)
+        return clean(value, max_length)
     if isinstance(value, dict):
-        return {clean(str(name), most): cleaned(part, most) for name, part in value.items()}
+        return {
+            clean(str(name), max_length): clean_values(element, max_length)
+            for name, element in value.items()
+        }
     if isinstance(value, list | tuple):
-        return [cleaned(part, most) for part in value]
+        return [clean_values(element, max_length) for element in value]
     return value.item() if hasattr(value, "item") else value
 
 
@@ -66,10 +71,12 @@ def local_link(path: str) -> str:
 def template(name: str) -> Template:
     """A template of the package: text from data is clean and escaped in it, whatever it is."""
     environment = Environment(
-        loader=PackageLoader("px4fuse", ""), autoescape=True, trim_blocks=True,
+        loader=PackageLoader("px4fuse", ""),
+        autoescape=True,
+        trim_blocks=True,
         finalize=lambda value: clean(value) if type(value) is str else value,
         undefined=StrictUndefined,
-    )  # fmt: skip
+    )
     return environment.get_template(name)
 
 

@@ -27,7 +27,7 @@ def main() -> None:
     from px4fuse.comparison.comparison import compare
     from px4fuse.comparison.estimates import noises_and_clock
     from px4fuse.filter.kalman import replay
-    from px4fuse.filter.likelihood import preintegrate, total_over_grid
+    from px4fuse.filter.likelihood import preintegrate, score_grid
     from px4fuse.filter.settings import Settings
     from px4fuse.filter.tuning import HORIZONTAL, tune
     from px4fuse.readers import read_log
@@ -37,7 +37,7 @@ def main() -> None:
     legs = preintegrate(axis, Settings())
     weight = np.ones(len(legs.measurement_m))
     a, z = np.geomspace(0.05, 5.0, 64)[:, None], np.geomspace(0.01, 1.0, 64)
-    grid = seconds(lambda: total_over_grid([preintegrate(axis, Settings())], a, z, weight), RUNS)
+    grid = seconds(lambda: score_grid([preintegrate(axis, Settings())], a, z, weight), RUNS)
     print(
         f"64 x 64 settings, {len(weight)} measurements: {grid:.2f} s, {4096 / grid:.0f} a second; "
         f"filterpy {single:.2f} s for one; {4096 * single / grid:.0f} times as fast"

@@ -19,7 +19,7 @@ from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.flight import Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import Kind, scenario_of
+from px4fuse.simulation.scenario import Kind, make_scenario
 
 NIS_WITHIN, REJECTED_WITHIN, ERROR_WITHIN = 0.10, 0.03, 0.10
 # Of a mistake of ``simulate``: PX4's parameter, what it is without the mistake, what is flown, and
@@ -53,7 +53,7 @@ def pairs(seeds: int, kind: Kind = "aisle") -> Iterator[Pair]:
 
 def opened(kind: Kind, seed: int, mistake: str) -> Model | Unavailable:
     """EKF2 as flown with a mistake, made ready for replays."""
-    scenario = scenario_of(kind, seed=seed, passes=3)
+    scenario = make_scenario(kind, seed=seed, passes=3)
     return open_model(simulate_flight(scenario, parse((mistake,) if mistake else ())))
 
 

@@ -24,16 +24,16 @@ from scipy.stats import binomtest
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import noises_and_clock, turned_frame
+from px4fuse.comparison.estimates import estimate_frame_rotation, noises_and_clock
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, find_loop
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.loop.analysis import analyse, loop_in
+from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
-from px4fuse.simulation.scenario import Scenario, scenario_of
+from px4fuse.simulation.scenario import Scenario, make_scenario
 
 TABLE = Path(__file__).with_name("rates.csv")
 CLEAN = "none"
@@ -141,7 +141,7 @@ class Condition:
             kind = type(getattr(Scenario(), name))
             given[name] = kind(value) if kind in (int, float) else value
         kind_flown = given.pop("kind", "aisle")
-        return scenario_of(kind_flown, **given, ekf2=self.ekf2, seed=seed)
+        return make_scenario(kind_flown, **given, ekf2=self.ekf2, seed=seed)
 
 
 def rates() -> pd.DataFrame:
@@ -213,10 +213,10 @@ def _explain(flight: Flight, condition: Condition) -> Analysis:
     comparison = compare(flight, condition.settings, axes=("north", "east"))
     tuning, clock = noises_and_clock(comparison)
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
-    heading = turned_frame(comparison, tuning, clock)
+    heading = estimate_frame_rotation(comparison, tuning, clock)
     return Analysis(
         **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, why={},
-        loop=loop_in(flight), heading=heading,
+        loop=analyse_flight_loop(flight), heading=heading,
     )  # fmt: skip
 
 

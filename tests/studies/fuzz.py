@@ -41,9 +41,9 @@ from class_tools import in_turn  # noqa: E402
 from conftest import page_of  # noqa: E402
 
 from px4fuse import answers, workers  # noqa: E402
-from px4fuse.analysis import run_or_judge_aids  # noqa: E402
+from px4fuse.analysis import run_or_evaluate_aids  # noqa: E402
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
-from px4fuse.assignment.roster import people_of_sheet, read_roster  # noqa: E402
+from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
 from px4fuse.assignment.sheet import read_sheet  # noqa: E402
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
@@ -55,7 +55,7 @@ from px4fuse.readers.g2o import read_g2o  # noqa: E402
 from px4fuse.readers.position_csv import read_position_csv  # noqa: E402
 from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
 from px4fuse.request import ComparisonRequest  # noqa: E402
-from px4fuse.results.build import judged_results  # noqa: E402
+from px4fuse.results.build import outcome_results  # noqa: E402
 from px4fuse.results.contract import to_json  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402
 from px4fuse.trajectory.graph.analysis import analyse_graph  # noqa: E402
@@ -208,7 +208,7 @@ def _key() -> list[bytes]:
 
 
 def _class_list(path: Path) -> object:
-    return people_of_sheet(read_sheet(path))
+    return read_people(read_sheet(path))
 
 
 TARGETS = (
@@ -273,7 +273,7 @@ def _flights() -> list[bytes]:
 def _compared(path: Path) -> object:
     """All of ``compare`` but the drawing: findings and results of a log."""
     request = ComparisonRequest(log=str(path))
-    return to_json(judged_results(request, run_or_judge_aids(request)))
+    return to_json(outcome_results(request, run_or_evaluate_aids(request)))
 
 
 LOG = str(REPOSITORY / "sample_logs/aisle_uwb.ulg")

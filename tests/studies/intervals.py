@@ -19,7 +19,7 @@ from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
-from px4fuse.filter.clock import CHANGE_P, ClockOffset
+from px4fuse.filter.clock import MAX_CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.source_clock import OFFSET_S
 from px4fuse.simulation.flights import simulate_flight
@@ -46,12 +46,12 @@ def measured(job: Job) -> tuple[float, ...] | None:
     if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
         return None
     low, high = clock.interval_s
-    false = abs(clock.offset_s) > max(clock.chance_s, OFFSET_S)
+    false = abs(clock.offset_s) > max(clock.three_sigma_s, OFFSET_S)
     return (
         (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
         covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),
         clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.determinable,
-        clock.determinable and false, clock.change_p is not None and clock.change_p < CHANGE_P,
+        clock.determinable and false, clock.change_p is not None and clock.change_p < MAX_CHANGE_P,
     )  # fmt: skip
 
 

@@ -173,7 +173,7 @@ def laid_over(
 ) -> Flight:  # fmt: skip
     """The flight with a source of such errors, and without EKF2."""
     rng = np.random.default_rng(seed)
-    first = next(track for track in flight.positions if track.origin.automatic)
+    first = next(track for track in flight.positions if track.origin.is_automatic)
     start, end = max(known.x[0], 0.0), known.x[-1]
     count = int((end - start) * rate_hz)
     # measured near a regular time, as a tag that takes turns

@@ -12,7 +12,7 @@ from px4fuse.trajectory.graph.covariance import GateResult, gate
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Robust, Solution, solve
 
-MANY_CLOSURES = 1000
+MAX_ROBUST_CLOSURES = 1000
 # What the solutions of the pose graph are called
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
@@ -56,7 +56,7 @@ class SolvedGraph(Graph, frozen=True, kw_only=True, eq=False):
         With the poses of the plain solution.
     """
 
-    written_as = Graph
+    schema_type = Graph
     solutions: Mapping[str, Solution]
     graph: PoseGraph
 
@@ -94,7 +94,7 @@ def analyse_graph(
     except TrajectoryError as error:
         gates = Unavailable("gate", str(error), "It needs an odometry edge between all successors.")
     count = int(np.count_nonzero(closures))
-    if count > 1 and (count <= MANY_CLOSURES if robust is None else robust):
+    if count > 1 and (count <= MAX_ROBUST_CLOSURES if robust is None else robust):
         for key, method in ROBUST.items():
             progress(f"solving: {SOLUTIONS[key]}")
             solutions[key] = solve(graph, robust=method, loops=closures)

@@ -74,52 +74,64 @@ def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list
     chain = model.odometry_chain(graph, tested)
     a, b = graph.first[tested], graph.second[tested]
     low, high = int(min(a.min(), b.min())), int(max(a.max(), b.max()))
-    used = chain[low:high]
-    gap = np.flatnonzero(used < 0)
+    chain_edges = chain[low:high]
+    gap = np.flatnonzero(chain_edges < 0)
     if len(gap):
         at = low + int(gap[0])
         raise TrajectoryError.of("odometry_gap", one=graph.ids[at], two=graph.ids[at + 1])
-    poses = lie.chain(model.odometry_steps(graph, used))
-    carry = lie.adjoint(poses[1:])
-    worlds = carry @ _covariances(graph, used) @ carry.transpose(0, 2, 1)  # in the axes of low
-    total = np.concatenate([np.zeros((1, *worlds.shape[1:])), np.cumsum(worlds, axis=0)])
-    span = total[np.maximum(a, b) - low] - total[np.minimum(a, b) - low]
+    poses = lie.chain(model.odometry_steps(graph, chain_edges))
+    step_adjoints = lie.adjoint(poses[1:])
+    step_covariances = (
+        step_adjoints @ _covariances(graph, chain_edges) @ step_adjoints.transpose(0, 2, 1)
+    )  # in the axes of low
+    cumulative_covariance = np.concatenate(
+        [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
+    )
+    chain_covariance = (
+        cumulative_covariance[np.maximum(a, b) - low]
+        - cumulative_covariance[np.minimum(a, b) - low]
+    )
     to_end = lie.adjoint(lie.inverse(poses[b - low]))
-    covariance = to_end @ span @ to_end.transpose(0, 2, 1)
+    covariance = to_end @ chain_covariance @ to_end.transpose(0, 2, 1)
     relative = lie.between(poses[a - low], poses[b - low])
     residual = lie.log(lie.between(graph.measurements[tested], relative))
     jacobian = lie.right_jacobian_inverse(residual)
     covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
-    each = zip(tested.tolist(), residual, covariance, strict=True)
-    return [_tested(graph, edge, r, sigma) for edge, r, sigma in each]
+    edge_residuals = zip(tested.tolist(), residual, covariance, strict=True)
+    return [_test_edge(graph, edge, r, sigma) for edge, r, sigma in edge_residuals]
 
 
-def _tested(graph: model.PoseGraph, edge: int, residual: Array, covariance: Array) -> GateResult:
+def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: Array) -> GateResult:
     ends = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
-    directions, variance = model.observed_directions(graph.information[edge])
+    directions, variance = model.information_eigenvectors(graph.information[edge])
     freedom = len(variance)
-    seen = directions.T @ residual
+    observed_residual = directions.T @ residual
     spread = directions.T @ covariance @ directions + np.diag(variance)
-    known = freedom and np.isfinite(spread).all()
-    if not known or np.linalg.eigvalsh(model.unit_diagonal(spread)[1])[0] <= _SINGULAR:
+    is_testable = freedom and np.isfinite(spread).all()
+    if (
+        not is_testable
+        or np.linalg.eigvalsh(model.scale_to_unit_diagonal(spread)[1])[0] <= _SINGULAR
+    ):
         raise TrajectoryError.of("closure_untestable", one=ends[0], two=ends[1])
-    d2 = float(seen @ np.linalg.solve(spread, seen))
+    d2 = float(observed_residual @ np.linalg.solve(spread, observed_residual))
     p = float(chdtrc(freedom, d2))
     return GateResult(*ends, d2, freedom, p, p >= GATE_ALPHA)
 
 
-def _covariances(graph: model.PoseGraph, used: IntArray) -> Array:
+def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:
     """Covariances of odometry edges in the axes of the later pose."""
-    scale, scaled = model.unit_diagonal(graph.information[used])
-    whole = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
-    if not np.all(whole):
-        edge = used[int(np.argmin(whole))]
+    scale, scaled = model.scale_to_unit_diagonal(graph.information[chain_edges])
+    is_full_rank = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
+    if not np.all(is_full_rank):
+        edge = chain_edges[int(np.argmin(is_full_rank))]
         raise TrajectoryError.of(
             "edge_unbound", one=graph.ids[graph.first[edge]], two=graph.ids[graph.second[edge]]
         )
     covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-    back = graph.first[used] > graph.second[used]
+    is_backward = graph.first[chain_edges] > graph.second[chain_edges]
     # (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
-    turn = lie.adjoint(graph.measurements[used[back]])
-    covariance[back] = turn @ covariance[back] @ turn.transpose(0, 2, 1)
+    measured_adjoint = lie.adjoint(graph.measurements[chain_edges[is_backward]])
+    covariance[is_backward] = (
+        measured_adjoint @ covariance[is_backward] @ measured_adjoint.transpose(0, 2, 1)
+    )
     return covariance

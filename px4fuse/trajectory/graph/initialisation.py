@@ -39,11 +39,11 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     """
     if np.any(model.odometry_chain(graph) < 0):
         return _chordal(graph)
-    started = model.composed(graph)
+    composed_graph = model.compose_odometry(graph)
     try:
-        return min(started, _chordal(graph), key=model.cost)
+        return min(composed_graph, _chordal(graph), key=model.cost)
     except TrajectoryError:  # rotations that only odometry tells
-        return started
+        return composed_graph
 
 
 def _chordal(graph: PoseGraph) -> PoseGraph:
@@ -55,22 +55,28 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
         If the edges that tell a rotation do not join all poses, or poses are not determined.
     """
     d = graph.dimension
-    spin = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
-    model.require_connected(graph, spin > 0.0, "edges that tell a rotation")
-    measured = lie.rotation_matrix(graph.measurements)
-    eye = np.broadcast_to(np.eye(d), measured.shape)
+    rotation_information = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
+    model.require_connected(graph, rotation_information > 0.0, "edges that tell a rotation")
+    measured_rotation = lie.rotation_matrix(graph.measurements)
+    eye = np.broadcast_to(np.eye(d), measured_rotation.shape)
     # of the transposed rotations Y: sum of spin |Z' Y_i - Y_j|^2
-    relaxed = _solved(
-        graph, measured.transpose(0, 2, 1), -eye, spin[:, None, None] * eye, 0.0 * measured,
+    relaxed_rotation = _solve_positions(
+        graph,
+        measured_rotation.transpose(0, 2, 1),
+        -eye,
+        rotation_information[:, None, None] * eye,
+        0.0 * measured_rotation,
         lie.rotation_matrix(graph.poses[0]).T,
-    )  # fmt: skip
-    rotation = _nearest_rotations(relaxed.transpose(0, 2, 1))
+    )
+    rotation = _nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
     # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
     from_i = rotation[graph.first]
-    axes = from_i @ measured
+    axes = from_i @ measured_rotation
     information = axes @ graph.information[:, :d, :d] @ axes.transpose(0, 2, 1)
-    way = from_i @ graph.measurements[:, :d, None]
-    position = _solved(graph, -eye, eye, information, way, graph.poses[0, :d, None])[..., 0]
+    translation = from_i @ graph.measurements[:, :d, None]
+    position = _solve_positions(
+        graph, -eye, eye, information, translation, graph.poses[0, :d, None]
+    )[..., 0]
     if d == 2:
         heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         poses = np.column_stack([position, heading])
@@ -80,15 +86,21 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     return replace(graph, poses=poses, initialised=model.FROM_CHORDAL)
 
 
-def _solved(
-    graph: PoseGraph, of_first: Array, of_second: Array, information: Array, value: Array,
-    held: Array,
-) -> Array:  # fmt: skip
+def _solve_positions(
+    graph: PoseGraph,
+    of_first: Array,
+    of_second: Array,
+    information: Array,
+    value: Array,
+    first_pose: Array,
+) -> Array:
     """Least squares as :func:`normal_equations` has them, shape (n, d, k)."""
-    found = solve_with(*normal_equations(graph, of_first, of_second, information, value, held))
-    if found is None:
+    solution = solve_with(
+        *normal_equations(graph, of_first, of_second, information, value, first_pose)
+    )
+    if solution is None:
         raise TrajectoryError("The edges do not determine where to start", "Give VERTEX lines.")
-    return np.concatenate([held[None], found.reshape(-1, *held.shape)])
+    return np.concatenate([first_pose[None], solution.reshape(-1, *first_pose.shape)])
 
 
 def _nearest_rotations(matrices: Array) -> Array:

@@ -17,7 +17,7 @@ from px4fuse.arrays import Array
 from px4fuse.trajectory.rotation import from_elements, skew
 
 # Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
-SMALL = 0.3
+SMALL_ANGLE_RAD = 0.3
 _C = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _C_SLOPE = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
@@ -43,7 +43,7 @@ def rotation_matrix(pose: Array) -> Array:
     if pose.shape[-1] == 3:
         c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
         return from_elements((c, -s), (s, c))
-    return _turn(pose).as_matrix()
+    return _rotation_of(pose).as_matrix()
 
 
 def identity(width: int) -> Array:
@@ -54,9 +54,9 @@ def identity(width: int) -> Array:
     width : int
         3 in the plane, 7 in space.
     """
-    made = np.zeros(width)
-    made[6:] = 1.0  # w of the quaternion
-    return made
+    pose = np.zeros(width)
+    pose[6:] = 1.0  # w of the quaternion
+    return pose
 
 
 def compose(a: Array, b: Array) -> Array:
@@ -68,8 +68,8 @@ def compose(a: Array, b: Array) -> Array:
         Quaternions are normalised in the result; headings are not wrapped.
     """
     d = _dimension(a)
-    turn = a[..., 2:] + b[..., 2:] if d == 2 else (_turn(a) * _turn(b)).as_quat()
-    return np.concatenate([a[..., :d] + _times(rotation_matrix(a), b[..., :d]), turn], axis=-1)
+    turn = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
+    return np.concatenate([a[..., :d] + _multiply(rotation_matrix(a), b[..., :d]), turn], axis=-1)
 
 
 def inverse(pose: Array) -> Array:
@@ -79,9 +79,11 @@ def inverse(pose: Array) -> Array:
 
 def between(a: Array, b: Array) -> Array:
     """Poses b as seen from a: the inverse of a, composed with b."""
-    d, back = _dimension(a), np.swapaxes(rotation_matrix(a), -1, -2)
-    turn = b[..., 2:] - a[..., 2:] if d == 2 else (_turn(a).inv() * _turn(b)).as_quat()
-    return np.concatenate([_times(back, b[..., :d] - a[..., :d]), turn], axis=-1)
+    d, inverse_rotation = _dimension(a), np.swapaxes(rotation_matrix(a), -1, -2)
+    turn = (
+        b[..., 2:] - a[..., 2:] if d == 2 else (_rotation_of(a).inv() * _rotation_of(b)).as_quat()
+    )
+    return np.concatenate([_multiply(inverse_rotation, b[..., :d] - a[..., :d]), turn], axis=-1)
 
 
 def exp(tangent: Array) -> Array:
@@ -94,7 +96,7 @@ def exp(tangent: Array) -> Array:
     """
     d = _dimension(tangent)
     rho, phi = tangent[..., :d], tangent[..., d:]
-    position = np.linalg.solve(_bent_inverse(phi), rho[..., None])[..., 0]
+    position = np.linalg.solve(_left_jacobian_inverse(phi), rho[..., None])[..., 0]
     turn = phi if d == 2 else Rotation.from_rotvec(phi).as_quat()
     return np.concatenate([position, turn], axis=-1)
 
@@ -108,8 +110,8 @@ def log(pose: Array) -> Array:
         Quaternions normalised; q and -q are the same rotation.
     """
     d = _dimension(pose)
-    phi = wrap(pose[..., 2:]) if d == 2 else _turn(pose).as_rotvec()
-    return np.concatenate([_times(_bent_inverse(phi), pose[..., :d]), phi], axis=-1)
+    phi = wrap(pose[..., 2:]) if d == 2 else _rotation_of(pose).as_rotvec()
+    return np.concatenate([_multiply(_left_jacobian_inverse(phi), pose[..., :d]), phi], axis=-1)
 
 
 def adjoint(pose: Array) -> Array:
@@ -121,15 +123,15 @@ def adjoint(pose: Array) -> Array:
     """
     rotation = rotation_matrix(pose)
     if pose.shape[-1] == 3:
-        made = np.zeros((*pose.shape, 3))
-        made[..., :2, :2] = rotation
-        made[..., 0, 2], made[..., 1, 2] = pose[..., 1], -pose[..., 0]
-        made[..., 2, 2] = 1.0
-        return made
-    made = np.zeros((*pose.shape[:-1], 6, 6))
-    made[..., :3, :3] = made[..., 3:, 3:] = rotation
-    made[..., :3, 3:] = skew(pose[..., :3]) @ rotation
-    return made
+        adjoint_matrix = np.zeros((*pose.shape, 3))
+        adjoint_matrix[..., :2, :2] = rotation
+        adjoint_matrix[..., 0, 2], adjoint_matrix[..., 1, 2] = pose[..., 1], -pose[..., 0]
+        adjoint_matrix[..., 2, 2] = 1.0
+        return adjoint_matrix
+    adjoint_matrix = np.zeros((*pose.shape[:-1], 6, 6))
+    adjoint_matrix[..., :3, :3] = adjoint_matrix[..., 3:, 3:] = rotation
+    adjoint_matrix[..., :3, 3:] = skew(pose[..., :3]) @ rotation
+    return adjoint_matrix
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
@@ -144,13 +146,17 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     -------
     ndarray, shape (..., 3, 3) or (..., 6, 6)
     """
-    once = _commutator(tangent)
-    twice = once @ once
+    commutator = _commutator(tangent)
+    commutator_squared = commutator @ commutator
     theta = np.linalg.norm(tangent[..., _dimension(tangent) :], axis=-1)[..., None, None]
     c, slope = _c(theta), 0.5 * _c_slope(theta)
     # x / (1 - exp(-x)) of it, as ad^5 = -2 theta^2 ad^3 - theta^4 ad
-    made: Array = np.eye(once.shape[-1]) + 0.5 * once + (c - theta * theta * slope) * twice
-    return made - slope * (twice @ twice)
+    jacobian: Array = (
+        np.eye(commutator.shape[-1])
+        + 0.5 * commutator
+        + (c - theta * theta * slope) * commutator_squared
+    )
+    return jacobian - slope * (commutator_squared @ commutator_squared)
 
 
 def _commutator(tangent: Array) -> Array:
@@ -158,10 +164,10 @@ def _commutator(tangent: Array) -> Array:
     if tangent.shape[-1] == 3:
         x, y, theta = np.moveaxis(tangent, -1, 0)
         return from_elements((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
-    made = np.zeros((*tangent.shape, 6))
-    made[..., :3, :3] = made[..., 3:, 3:] = skew(tangent[..., 3:])
-    made[..., :3, 3:] = skew(tangent[..., :3])
-    return made
+    commutator = np.zeros((*tangent.shape, 6))
+    commutator[..., :3, :3] = commutator[..., 3:, 3:] = skew(tangent[..., 3:])
+    commutator[..., :3, 3:] = skew(tangent[..., :3])
+    return commutator
 
 
 def chain(steps: Array) -> Array:
@@ -177,12 +183,12 @@ def chain(steps: Array) -> Array:
     -------
     ndarray, shape (n + 1, 3) or (n + 1, 7)
     """
-    made = np.vstack([identity(steps.shape[-1]), steps])
-    reach = 1
-    while reach < len(made):
-        made[reach:] = compose(made[:-reach], made[reach:])
-        reach *= 2
-    return made
+    poses = np.vstack([identity(steps.shape[-1]), steps])
+    length = 1
+    while length < len(poses):
+        poses[length:] = compose(poses[:-length], poses[length:])
+        length *= 2
+    return poses
 
 
 def _dimension(values: Array) -> int:
@@ -190,35 +196,37 @@ def _dimension(values: Array) -> int:
     return 2 if values.shape[-1] == 3 else 3
 
 
-def _turn(pose: Array) -> Rotation:
+def _rotation_of(pose: Array) -> Rotation:
     """Rotation of poses in space."""
     return Rotation.from_quat(pose[..., 3:])
 
 
-def _times(matrix: Array, vector: Array) -> Array:
+def _multiply(matrix: Array, vector: Array) -> Array:
     return (matrix @ vector[..., None])[..., 0]
 
 
-def _bent_inverse(phi: Array) -> Array:
+def _left_jacobian_inverse(phi: Array) -> Array:
     """Inverse of the matrix by which a turn bends a motion (Barfoot 2017, 7.37)."""
     if phi.shape[-1] == 1:
-        once = from_elements((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
+        skew_matrix = from_elements((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
     else:
-        once = skew(phi)
+        skew_matrix = skew(phi)
     theta = np.linalg.norm(phi, axis=-1)[..., None, None]
-    return np.eye(once.shape[-1]) - 0.5 * once + _c(theta) * (once @ once)
+    return (
+        np.eye(skew_matrix.shape[-1]) - 0.5 * skew_matrix + _c(theta) * (skew_matrix @ skew_matrix)
+    )
 
 
 def _c(theta: Array) -> Array:
     """(1 - theta/2 cot(theta/2)) / theta^2."""
-    t = np.where(theta < SMALL, 1.0, theta)
+    t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     exact = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
-    return np.where(theta < SMALL, polyval(theta * theta, _C), exact)
+    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _C), exact)
 
 
 def _c_slope(theta: Array) -> Array:
     """Derivative of c by theta, over theta."""
-    t = np.where(theta < SMALL, 1.0, theta)
+    t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     g_slope = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     exact = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
-    return np.where(theta < SMALL, polyval(theta * theta, _C_SLOPE), exact)
+    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _C_SLOPE), exact)

@@ -9,12 +9,12 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
 # An information matrix, scaled to a unit diagonal, sees the directions whose eigenvalue is above
-OBSERVED = 1e-9
+MIN_OBSERVED_EIGENVALUE = 1e-9
 FROM_FILE = "the file's vertices"
 FROM_ODOMETRY = "odometry edges composed"
 FROM_CHORDAL = "chordal initialisation"
@@ -55,12 +55,12 @@ class PoseGraph:
     information: Array
     initialised: str = FROM_FILE
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def of_edges(self, chosen: BoolArray) -> PoseGraph:
+    def select_edges(self, chosen: BoolArray) -> PoseGraph:
         """The graph with some of its edges, shape (m,)."""
         edges = ("first", "second", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[chosen] for name in edges})
@@ -113,7 +113,7 @@ def cost(graph: PoseGraph) -> float:
     return 0.5 * float(np.sum(residuals(graph, graph.poses).chi2))
 
 
-def observed_directions(information: Array) -> tuple[Array, Array]:
+def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     """Functionals of the residual that an information matrix tells about, and their variances.
 
     Translation and rotation have different units, so the matrix is scaled to a unit diagonal
@@ -130,13 +130,13 @@ def observed_directions(information: Array) -> tuple[Array, Array]:
     variance : ndarray, shape (k,)
         ``information == directions @ diag(1 / variance) @ directions.T``.
     """
-    scale, scaled = unit_diagonal(information)
+    scale, scaled = scale_to_unit_diagonal(information)
     values, vectors = np.linalg.eigh(scaled)
-    seen = values > OBSERVED
-    return scale[:, None] * vectors[:, seen], 1.0 / values[seen]
+    is_observed = values > MIN_OBSERVED_EIGENVALUE
+    return scale[:, None] * vectors[:, is_observed], 1.0 / values[is_observed]
 
 
-def unit_diagonal(matrices: Array) -> tuple[Array, Array]:
+def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
     """Roots of the diagonals of matrices, and the matrices divided by them; what is 0 stays 0."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
@@ -160,18 +160,22 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
     """
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
-    tells = used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
-    ends, n = (graph.first[tells], graph.second[tells]), len(graph)
+    is_informative = used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
+    ends, n = (graph.first[is_informative], graph.second[is_informative]), len(graph)
     links = sparse.coo_array((np.ones(len(ends[0])), ends), shape=(n, n))
-    parts, part = connected_components(links, directed=False)
-    if parts > 1:
-        apart = graph.ids[np.flatnonzero(part != part[0])[0]]
+    component_count, component = connected_components(links, directed=False)
+    if component_count > 1:
+        other_vertex = graph.ids[np.flatnonzero(component != component[0])[0]]
         raise TrajectoryError.of(
-            "graph_in_parts", parts=parts, apart=apart, first=graph.ids[0], what=what
+            "graph_in_parts",
+            component_count=component_count,
+            other_vertex=other_vertex,
+            first=graph.ids[0],
+            what=what,
         )
 
 
-def composed(graph: PoseGraph) -> PoseGraph:
+def compose_odometry(graph: PoseGraph) -> PoseGraph:
     """The same graph with poses along its odometry, which has no gap, from the first pose on."""
     steps = odometry_steps(graph, odometry_chain(graph))
     poses = lie.compose(graph.poses[:1], lie.chain(steps))
@@ -190,14 +194,16 @@ def odometry_chain(graph: PoseGraph, without: IntArray | None = None) -> IntArra
     -------
     ndarray of int, shape (n - 1,)
     """
-    among = np.flatnonzero(graph.successive)
+    odometry_edges = np.flatnonzero(graph.successive)
     if without is not None:
-        among = np.setdiff1d(among, without)
-    made = np.full(len(graph) - 1, -1, dtype=np.intp)
+        odometry_edges = np.setdiff1d(odometry_edges, without)
+    next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
     # Backwards, so that of several edges the first one is what stays
-    among = among[::-1]
-    made[np.minimum(graph.first[among], graph.second[among])] = among
-    return made
+    odometry_edges = odometry_edges[::-1]
+    next_edge[np.minimum(graph.first[odometry_edges], graph.second[odometry_edges])] = (
+        odometry_edges
+    )
+    return next_edge
 
 
 def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
@@ -213,6 +219,6 @@ def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
     ndarray, shape (k, 3) or (k, 7)
     """
     steps = graph.measurements[chain].copy()
-    back = graph.first[chain] > graph.second[chain]
-    steps[back] = lie.inverse(steps[back])
+    is_backward = graph.first[chain] > graph.second[chain]
+    steps[is_backward] = lie.inverse(steps[is_backward])
     return steps

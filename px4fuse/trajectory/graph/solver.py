@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import brief
+from px4fuse.display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.graph import lie, model
@@ -23,8 +23,8 @@ Kernel = Callable[[Array], tuple[Array, Array]]
 
 MAX_ITERATIONS = 100
 # GTSAM's LevenbergMarquardtParams
-_FIRST_DAMPING, _DAMPING_FACTOR, _MOST_DAMPING = 1e-5, 10.0, 1e5
-_LEAST_FIDELITY = 1e-3
+_INITIAL_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-5, 10.0, 1e5
+_MIN_FIDELITY = 1e-3
 _TOLERANCE = 1e-10
 _EPSILON = float(np.finfo(float).eps)
 # Stages of graduated non-convexity only lead to the last one
@@ -35,7 +35,9 @@ GNC_PROBABILITY = 0.99  # a true closure is within the truncation with this prob
 DROP_PROBABILITY = 0.999  # the gate's
 _GNC_FACTOR = 1.4  # Yang 2020, section V
 _GNC_STAGES = 100
-_SECOND_LOOKS = 20  # dropped closures, those that fit best first; each costs one minimisation
+_MAX_RETRIED_CLOSURES = (
+    20  # dropped closures, those that fit best first; each costs one minimisation
+)
 _TLS_ROUNDS = 20
 
 
@@ -74,11 +76,11 @@ class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
         Factors on each edge's information, from 0 (set aside) to 1.
     """
 
-    written_as = GraphSolution
+    schema_type = GraphSolution
     poses: Array
     weights: Array
 
-    __repr__ = brief
+    __repr__ = one_line_repr
 
 
 @dataclass(frozen=True)
@@ -133,27 +135,29 @@ def solve(
         sets aside every edge to some of its poses.
     """
     model.require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
-    doubtful = ~graph.successive if loops is None else loops
+    is_doubtful = ~graph.successive if loops is None else loops
     start = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError.of("graph_not_finite")
-    plain = _minimise(graph, start, _least_squares(np.ones(len(doubtful))))
-    weights = np.ones(len(doubtful))
-    run = plain
-    if robust != "none" and np.any(doubtful):
-        run, weights = _gnc(graph, start, plain, doubtful)
+    plain_descent = _minimise(graph, start, _least_squares_kernel(np.ones(len(is_doubtful))))
+    weights = np.ones(len(is_doubtful))
+    descent = plain_descent
+    if robust != "none" and np.any(is_doubtful):
+        descent, weights = _solve_gnc(graph, start, plain_descent, is_doubtful)
         if robust == "dcs":
-            kernel = _dcs(doubtful)
-            last = _minimise(graph, run.state, kernel)
-            run = _Descent(last.state, last.cost, run.iterations + last.iterations, last.converged)
-            weights = kernel(run.state.chi2)[0]
+            kernel = _dcs_kernel(is_doubtful)
+            last = _minimise(graph, descent.state, kernel)
+            descent = _Descent(
+                last.state, last.cost, descent.iterations + last.iterations, last.converged
+            )
+            weights = kernel(descent.state.chi2)[0]
     return Solution(
-        poses=run.state.poses,
-        cost=0.5 * float(np.sum(weights * run.state.chi2)),
+        poses=descent.state.poses,
+        cost=0.5 * float(np.sum(weights * descent.state.chi2)),
         cost_initial=cost_initial,
-        iterations=run.iterations,
-        converged=run.converged,
+        iterations=descent.iterations,
+        converged=descent.converged,
         dropped=int(np.count_nonzero(weights < 0.5)),
         weights=weights,
     )
@@ -167,94 +171,97 @@ def _minimise(
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Descent:
     """Walk down from some poses, as GTSAM's LevenbergMarquardtOptimizer does."""
-    damping, iterations = _FIRST_DAMPING, 0
+    damping, iterations = _INITIAL_DAMPING, 0
     weights, costs = kernel(state.chi2)
     cost = float(np.sum(costs))
     while iterations < max_iterations and cost > _TOLERANCE:
         # d r / d x_j = J, d r / d x_i = -J A with A the adjoint of x_j's view of x_i
         jacobian = lie.right_jacobian_inverse(state.residual)
-        back = jacobian @ lie.adjoint(lie.inverse(state.relative))
-        matrix, downhill = normal_equations(
-            graph, -back, jacobian, weights[:, None, None] * graph.information,
+        first_jacobian = jacobian @ lie.adjoint(lie.inverse(state.relative))
+        matrix, gradient = normal_equations(
+            graph,
+            -first_jacobian,
+            jacobian,
+            weights[:, None, None] * graph.information,
             -state.residual[..., None],
-        )  # fmt: skip
+        )
         while True:
-            drop, promised, flat = 0.0, 0.0, False
-            step = solve_with(matrix, downhill, damping)
+            drop, predicted_drop, is_flat = 0.0, 0.0, False
+            step = solve_with(matrix, gradient, damping)
             if step is not None:
                 # how much it lowers the linearised cost
-                promised = 0.5 * float(np.sum(step * (damping * step + downhill)))
-                moved = np.concatenate([np.zeros(graph.freedom), step[:, 0]])
-                turned = lie.exp(moved.reshape(len(graph), -1))
-                tried = model.residuals(graph, lie.compose(state.poses, turned))
-                tried_weights, costs = kernel(tried.chi2)
+                predicted_drop = 0.5 * float(np.sum(step * (damping * step + gradient)))
+                tangent = np.concatenate([np.zeros(graph.freedom), step[:, 0]])
+                motion = lie.exp(tangent.reshape(len(graph), -1))
+                trial = model.residuals(graph, lie.compose(state.poses, motion))
+                trial_weights, costs = kernel(trial.chi2)
                 drop = cost - float(np.sum(costs))
-                flat = abs(drop) < tolerance * cost
-            accepted = promised > _EPSILON * cost and drop > _LEAST_FIDELITY * promised
-            if accepted or flat or damping >= _MOST_DAMPING:
+                is_flat = abs(drop) < tolerance * cost
+            is_accepted = predicted_drop > _EPSILON * cost and drop > _MIN_FIDELITY * predicted_drop
+            if is_accepted or is_flat or damping >= _MAX_DAMPING:
                 break
             damping *= _DAMPING_FACTOR
-        if not accepted:
-            return _Descent(state, cost, iterations, flat)
-        state, weights, before, cost = tried, tried_weights, cost, cost - drop
+        if not is_accepted:
+            return _Descent(state, cost, iterations, is_flat)
+        state, weights, cost_before, cost = trial, trial_weights, cost, cost - drop
         iterations += 1
         damping /= _DAMPING_FACTOR
-        if drop <= max(tolerance * before, _TOLERANCE):
+        if drop <= max(tolerance * cost_before, _TOLERANCE):
             return _Descent(state, cost, iterations, True)
     return _Descent(state, cost, iterations, cost <= _TOLERANCE)
 
 
-def _least_squares(weights: Array) -> Kernel:
+def _least_squares_kernel(weights: Array) -> Kernel:
     return lambda chi2_: (weights, 0.5 * weights * chi2_)
 
 
-def _dcs(doubtful: BoolArray) -> Kernel:
+def _dcs_kernel(is_doubtful: BoolArray) -> Kernel:
     """Dynamic covariance scaling of the doubtful edges."""
 
     def kernel(chi2_: Array) -> tuple[Array, Array]:
-        beyond = doubtful & (chi2_ > DCS_PHI)
-        scale = np.where(beyond, 2.0 * DCS_PHI / (DCS_PHI + chi2_), 1.0)
-        return scale**2, np.where(beyond, scale * chi2_ - 0.5 * DCS_PHI, 0.5 * chi2_)
+        is_beyond = is_doubtful & (chi2_ > DCS_PHI)
+        scale = np.where(is_beyond, 2.0 * DCS_PHI / (DCS_PHI + chi2_), 1.0)
+        return scale**2, np.where(is_beyond, scale * chi2_ - 0.5 * DCS_PHI, 0.5 * chi2_)
 
     return kernel
 
 
-def _gnc(
-    graph: PoseGraph, start: Residuals, plain: _Descent, doubtful: BoolArray
+def _solve_gnc(
+    graph: PoseGraph, start: Residuals, plain_descent: _Descent, is_doubtful: BoolArray
 ) -> tuple[_Descent, Array]:
     """Truncated least squares over the doubtful edges, from two starts."""
-    _, scaled = model.unit_diagonal(graph.information)
-    freedom = np.sum(np.linalg.eigvalsh(scaled) > model.OBSERVED, axis=1)
-    bound = np.full(len(doubtful), np.inf)
-    price = np.zeros(len(doubtful))
-    told = doubtful & (freedom > 0)
-    bound[told] = 2.0 * gammaincinv(freedom[told] / 2.0, GNC_PROBABILITY)
-    price[told] = 2.0 * gammaincinv(freedom[told] / 2.0, DROP_PROBABILITY)
+    _, scaled = model.scale_to_unit_diagonal(graph.information)
+    freedom = np.sum(np.linalg.eigvalsh(scaled) > model.MIN_OBSERVED_EIGENVALUE, axis=1)
+    bound = np.full(len(is_doubtful), np.inf)
+    drop_cost = np.zeros(len(is_doubtful))
+    is_testable = is_doubtful & (freedom > 0)
+    bound[is_testable] = 2.0 * gammaincinv(freedom[is_testable] / 2.0, GNC_PROBABILITY)
+    drop_cost[is_testable] = 2.0 * gammaincinv(freedom[is_testable] / 2.0, DROP_PROBABILITY)
 
-    def priced(state: Residuals, kept: Array) -> float:
-        return 0.5 * float(np.sum(np.where(kept > 0.0, state.chi2, price)))
+    def truncated_cost(state: Residuals, edge_weights: Array) -> float:
+        return 0.5 * float(np.sum(np.where(edge_weights > 0.0, state.chi2, drop_cost)))
 
-    spent, found = plain.iterations, []
-    for first in (plain.state, start):
-        run, weights = _graduated(graph, first, bound)
-        spent += run.iterations
-        found.append((priced(run.state, weights), run, weights))
-    lowest, run, weights = min(found, key=lambda each: each[0])
+    iteration_count, solutions = plain_descent.iterations, []
+    for first in (plain_descent.state, start):
+        descent, weights = _descend_graduated(graph, first, bound)
+        iteration_count += descent.iterations
+        solutions.append((truncated_cost(descent.state, weights), descent, weights))
+    lowest, descent, weights = min(solutions, key=lambda solution: solution[0])
     dropped = np.flatnonzero(weights == 0.0)
-    for edge in dropped[np.argsort(run.state.chi2[dropped])][:_SECOND_LOOKS]:
-        again = weights.copy()
-        again[edge] = 1.0
-        trial = _minimise(graph, run.state, _least_squares(again))
-        spent += trial.iterations
-        if (cost := priced(trial.state, again)) < lowest:
-            lowest, run, weights = cost, trial, again
+    for edge in dropped[np.argsort(descent.state.chi2[dropped])][:_MAX_RETRIED_CLOSURES]:
+        trial_weights = weights.copy()
+        trial_weights[edge] = 1.0
+        trial = _minimise(graph, descent.state, _least_squares_kernel(trial_weights))
+        iteration_count += trial.iterations
+        if (cost := truncated_cost(trial.state, trial_weights)) < lowest:
+            lowest, descent, weights = cost, trial, trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that gnc did not set aside")
-    return _Descent(run.state, run.cost, spent, run.converged), weights
+    return _Descent(descent.state, descent.cost, iteration_count, descent.converged), weights
 
 
-def _graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Descent, Array]:
+def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Descent, Array]:
     """One descent of graduated non-convexity (Yang 2020, algorithm 1, eq. 13 and 14)."""
-    state, spent = start, 0
+    state, iteration_count = start, 0
     # Infinite bounds are edges that are not doubted
     excess = 2.0 * state.chi2 / bound - 1.0
     if np.max(excess) > 0.0:
@@ -263,19 +270,19 @@ def _graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Desce
             ratio = np.maximum(state.chi2 / bound, 1e-200)  # where the weight is 1 anyway
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
             stage = _minimise(
-                graph, state, _least_squares(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS
+                graph, state, _least_squares_kernel(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS
             )
-            state, spent = stage.state, spent + stage.iterations
+            state, iteration_count = stage.state, iteration_count + stage.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
                 break
             control *= _GNC_FACTOR
     weights = (state.chi2 <= bound).astype(float)
     for _ in range(_TLS_ROUNDS):
-        run = _minimise(graph, state, _least_squares(weights))
-        state, spent = run.state, spent + run.iterations
+        descent = _minimise(graph, state, _least_squares_kernel(weights))
+        state, iteration_count = descent.state, iteration_count + descent.iterations
         # Lowers the truncated cost every time, so it ends
-        again = (state.chi2 <= bound).astype(float)
-        if np.array_equal(again, weights):
+        new_weights = (state.chi2 <= bound).astype(float)
+        if np.array_equal(new_weights, weights):
             break
-        weights = again
-    return _Descent(state, run.cost, spent, run.converged), weights
+        weights = new_weights
+    return _Descent(state, descent.cost, iteration_count, descent.converged), weights

@@ -21,7 +21,7 @@ def normal_equations(
     of_second: Array,
     information: Array,
     value: Array,
-    held: Array | float = 0.0,
+    first_value: Array | float = 0.0,
 ) -> tuple[Matrix, Array]:
     """Normal equations of ``A x_i + B x_j = value`` for every edge; x of the first pose is held.
 
@@ -31,7 +31,7 @@ def normal_equations(
     of_first, of_second, information : ndarray, shape (m, d, d)
         A, B, and how much the parts of each equation count.
     value : ndarray, shape (m, d, k)
-    held : ndarray, shape (d, k), or 0
+    first_value : ndarray, shape (d, k), or 0
 
     Returns
     -------
@@ -44,10 +44,12 @@ def normal_equations(
     rows = sparse.bsr_array((blocks, ends, 2 * edges), shape=(d * edges[-1], d * len(graph)))
     weights = sparse.bsr_array((information, edges[:-1], edges))
     columns = rows.tocsc()
-    of_held, free = columns[:, :d], columns[:, d:]
-    weighted = free.T @ weights
-    left = value.reshape(-1, value.shape[-1]) - of_held @ np.broadcast_to(held, value.shape[1:])
-    return (weighted @ free).tocsc(), weighted @ left
+    first_columns, free_columns = columns[:, :d], columns[:, d:]
+    weighted = free_columns.T @ weights
+    right_side = value.reshape(-1, value.shape[-1]) - first_columns @ np.broadcast_to(
+        first_value, value.shape[1:]
+    )
+    return (weighted @ free_columns).tocsc(), weighted @ right_side
 
 
 def solve_with(matrix: Matrix, right: Array, damping: float = 0.0) -> Array | None:
@@ -64,5 +66,5 @@ def solve_with(matrix: Matrix, right: Array, damping: float = 0.0) -> Array | No
         )
     except RuntimeError:  # exactly singular
         return None
-    found: Array = factors.solve(right)
-    return found if np.all(np.isfinite(found)) else None
+    solution: Array = factors.solve(right)
+    return solution if np.all(np.isfinite(solution)) else None

@@ -1,0 +1,191 @@
+"""Runs that aim outputs at inputs: by path, link, folder and letters, over all commands."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import os
+import random
+import shutil
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from class_tools import report_of
+from conftest import REPORT, SAMPLES
+from ulog_tools import make_log
+
+from px4fuse.answers import form_text
+from px4fuse.assignment.key import AnswerKey, key_text
+
+# Command, the files that it reads, its options for one file with the ending that they require, and
+# the names that it writes into the folder of -o: "" for the folder itself
+RUNS = [
+    ("compare l.ulg --mavlink m.tlog", "l.ulg m.tlog", "--json -o.pdf", None),
+    ("compare l.ulg --position pos.csv", "l.ulg pos.csv", "--json -o.pdf", None),
+    ("compare l.ulg --notes notes.md --answers form.toml", "notes.md form.toml", "--json", None),
+    ("diff r.pdf q.json", "r.pdf q.json", "--json -o.pdf", None),
+    ("explore l.ulg k.ulg", "l.ulg k.ulg", "-o.html", None),
+    ("info l.ulg", "l.ulg", "--json", None),
+    ("tune l.ulg --position pos.csv", "l.ulg pos.csv", "--json", None),
+    ("sync l.ulg", "l.ulg", "--json", None),
+    ("whatif l.ulg", "l.ulg", "--json -o.pdf", None),
+    ("loop l.ulg:ekf2", "l.ulg", "--json -o.pdf --tum --g2o", None),
+    ("loop a.tum --reference b.tum", "a.tum b.tum", "--json -o.pdf --tum --g2o", None),
+    ("loop g.g2o", "g.g2o", "--json --g2o", None),
+    ("evaluate a.tum l.ulg:truth", "a.tum l.ulg", "--json -o.pdf", None),
+    ("verify r.pdf l.ulg", "r.pdf l.ulg", "--json -o.pdf", None),
+    ("verify r.pdf logs", "logs/x.ulg", "--json -o.pdf", None),
+    ("answers l.ulg", "l.ulg", "-o", None),
+    ("extract l.ulg", "l.ulg", "", ("", "flight.json")),
+    ("batch l.ulg", "l.ulg", "", ("", "fleet.csv", "results/", "rows/")),
+    ("batch logs", "logs/x.ulg", "", ("", "fleet.html", "results/", "rows/")),
+    ("batch {desk}/log*/*.ulg", "logs/x.ulg", "", ("", "fleet.csv", "results/", "rows/")),
+    ("grade subs", "subs/s1.pdf subs/in/s2.pdf", "", ("", "reports/", "records/", "feedback/")),
+    ("grade class.zip r.pdf", "class.zip r.pdf", "", ("", "class.csv", "reports/", "grades/")),
+    ("grade subs --logs logs --key key.json --rubric rubric.toml",
+     "logs/x.ulg key.json rubric.toml", "", ("", "class.csv", "records/")),
+    ("grade subs --roster tables/roster.csv --worksheet tables/sheet.csv",
+     "tables/roster.csv tables/sheet.csv", "", ("", "names.csv", "class.csv", "grades/")),
+    ("simulate --assignment tables/roster.csv --secret-file secret.txt",
+     "tables/roster.csv secret.txt", "", ("",)),
+    ("simulate --assignment tables/roster.csv --secret-file secret.txt -o {place}/flights",
+     "tables/roster.csv secret.txt", "--answer", None),
+]  # fmt: skip
+PATHS = ("typed", "relative", "absolute", "link", "link to link", "hard link", "folder", "letters")
+
+
+def made_desk(folder: Path) -> Path:
+    """Every kind of input; a folder per kind of table."""
+    log = make_log("v1.16", 20.0).encode()
+    report = report_of("Ada", "1")
+    for name, content in {
+        "l.ulg": log, "logs/x.ulg": log, "k.ulg": make_log("v1.14", 20.0).encode(),
+        "m.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes()[:200_000],
+        "pos.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
+        "notes.md": b"words", "form.toml": form_text("l.ulg", "0" * 64).encode(),
+        "r.pdf": report, "subs/s1.pdf": report,
+        "subs/in/s2.pdf": report, "q.json": REPORT.with_suffix(".json").read_bytes(),
+        "a.tum": (SAMPLES / "loop_slam.tum").read_bytes(),
+        "b.tum": (SAMPLES / "loop_slam.tum").read_bytes(),
+        "g.g2o": b"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n",
+        "key.json": key_text(AnswerKey("aisle", ())).encode(), "rubric.toml": b"",
+        "secret.txt": b"a secret that is long enough",
+        "tables/roster.csv": b"id,name\n1,Ada\n", "tables/sheet.csv": b"id,name,grade\n1,Ada,\n",
+    }.items():  # fmt: skip
+        (folder / name).parent.mkdir(exist_ok=True, parents=True)
+        (folder / name).write_bytes(content)
+    with zipfile.ZipFile(folder / "class.zip", "w") as archive:
+        archive.writestr("s1.pdf", report)
+    return folder
+
+
+def hashed(folder: Path) -> dict[str, str]:
+    """Every regular file, without links, with its hash."""
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+    }
+
+
+@dataclass(frozen=True)
+class Aim:
+    """A command with one of its outputs at one of its inputs.
+
+    Attributes
+    ----------
+    option : str
+        With the ending that it requires.
+    name : str or None
+        Name in the folder of -o; None where the output is one file.
+    way : str
+        One of :data:`PATHS`.
+    """
+
+    command: str
+    read: str
+    option: str
+    name: str | None
+    way: str
+
+    def arguments(self, desk: Path, place: Path) -> list[str] | None:
+        """Make links below ``place``; None if the option or the file system has no such way."""
+        typed = self.command.format(desk=desk, place=place).split()
+        option, dot, end = self.option.partition(".")
+        if self.name:
+            found = _linked_into(desk / self.read, self.way, place, self.name)
+        elif self.name is not None:
+            found = _another_path(Path(self.read).parent, self.way, desk, place)
+        elif self.way == "beside":  # the results beside a report
+            (place / "r.json").symlink_to(desk / self.read)
+            has_results = end == "pdf" and not self.command.startswith("verify")
+            found = str(place / "r.pdf") if has_results else None
+        else:
+            found = _another_path(Path(self.read), self.way, desk, place, dot + end)
+        return None if found is None else [*typed, option, found]
+
+
+def _another_path(read: Path, way: str, desk: Path, place: Path, end: str = "") -> str | None:
+    """Another path of an input, or of its folder."""
+    target, link = desk / read, place / f"link{end}"
+    if way in ("link", "link to link"):
+        (place / "first").symlink_to(os.path.relpath(target, place))
+        link.symlink_to("first" if way == "link to link" else target)
+        return str(link)
+    if way == "hard link" and target.is_file():
+        link.hardlink_to(target)
+        return str(link)
+    if end and target.suffix != end:
+        return None
+    if way == "folder" and target != desk:
+        (place / "folder").symlink_to(target.parent)
+        return str(place / "folder" / target.name)
+    if way == "letters" and target != desk:
+        other = target.with_name(target.name.swapcase())
+        return str(other) if other.exists() else None
+    paths = {"typed": str(read), "relative": f"subs{os.sep}..{os.sep}{read}"}
+    return (paths | {"absolute": str(target)}).get(way)
+
+
+def _linked_into(target: Path, way: str, place: Path, name: str) -> str | None:
+    """A folder with a link at the place of an output; its subfolder with one, or a link itself."""
+    out, subfolder = place / "out", name.endswith("/")
+    out.mkdir()
+    if way == "folder" and subfolder:
+        (out / name[:-1]).symlink_to(target.parent)
+        return str(out)
+    link = out / name / f"any{target.suffix}" if subfolder else out / name
+    link.parent.mkdir(exist_ok=True)
+    if way == "link":
+        link.symlink_to(target)
+    elif way == "hard link":
+        link.hardlink_to(target)
+    else:
+        return None
+    return str(out)
+
+
+def aims() -> list[Aim]:
+    """Every command, input, output and way."""
+    found = []
+    for command, reads, options, names in RUNS:
+        outputs = [(option, None) for option in options.split()]
+        outputs += [("-o", name) for name in names or ()]
+        for read, (option, name), way in itertools.product(
+            reads.split(), outputs, (*PATHS, "beside")
+        ):
+            found.append(Aim(command, read, option, name, way))
+    return found
+
+
+def drawn(count: int, seed: int) -> list[Aim]:
+    """So many, drawn with replacement."""
+    return random.Random(seed).choices(aims(), k=count)
+
+
+def cleared(place: Path) -> Path:
+    """An empty folder for links and outputs."""
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    return place

@@ -1,0 +1,200 @@
+"""Damaged ULogs: a flight and a statement of the missing part, or one line of explanation."""
+
+import random
+import re
+import struct
+
+import pandas as pd
+import pytest
+from cli_tools import run_main
+from patience import patience
+from ulog_tools import make_log
+
+from px4fuse.analysis import run_comparison
+from px4fuse.errors import LogError
+from px4fuse.findings import find
+from px4fuse.flight import Ekf2, Flight
+from px4fuse.readers import read_log
+from px4fuse.readers.ulog import read_ulog
+from px4fuse.request import ComparisonRequest
+
+KINDS = ("truncated", "zeroed", "random", "deleted", "inserted", "flipped")
+PLACES = 12
+SIZES = (1, 2, 5, 20, 100, 1000)  # bytes, or bits of kind "flipped"
+# A damaged size can point beyond the end of the file: then pyulog ends
+MAX_MESSAGE_BYTES = 65_538
+# A smaller loss can be invisible: a ULog has no checksums (fraction of samples)
+MAX_SILENT_LOSS = 0.005
+IMU_HZ, DURATION_S = 250.0, 40.0
+HEAD = b"ULog\x01\x12\x35\x01" + bytes(8)
+
+
+@pytest.fixture(scope="module")
+def content() -> bytes:
+    """A ULog of 0.5 MB without damage."""
+    return make_log("v1.16", DURATION_S, IMU_HZ).encode()
+
+
+@pytest.fixture(scope="module")
+def whole(content: bytes) -> int:
+    """Number of samples in the ULog without damage."""
+    flight = read_ulog("whole.ulg", content)
+    assert flight.log.damage == ()
+    assert flight.log.bytes_read == len(content)
+    return count_samples(flight)
+
+
+def count_samples(flight: Flight) -> int:
+    state = flight.ekf2.state if isinstance(flight.ekf2, Ekf2) else None
+    frames = (flight.imu, flight.attitude, state, *(one.samples for one in flight.positions))
+    return sum(len(frame) for frame in frames if isinstance(frame, pd.DataFrame))
+
+
+def damage(content: bytes, kind: str, place: int) -> tuple[bytes, int, int]:
+    """Damage a file at one of 12 places; return its content, the place and the size."""
+    dice, size, data = (
+        random.Random(f"{kind} {place}"),
+        SIZES[place % len(SIZES)],
+        bytearray(content),
+    )
+    first, last = (len(content) * edge // PLACES for edge in (place, place + 1))
+    at = dice.randrange(max(first, len(HEAD)), last)
+    end = min(at + size, last)
+    match kind:
+        case "truncated":
+            del data[at:]
+        case "zeroed":
+            data[at:end] = bytes(end - at)
+        case "random":
+            data[at:end] = dice.randbytes(end - at)
+        case "deleted":
+            del data[at:end]
+        case "inserted":
+            data[at:at] = dice.randbytes(size)
+        case "flipped":
+            for _ in range(size):
+                data[dice.randrange(len(HEAD), len(data))] ^= 1 << dice.randrange(8)
+    return bytes(data), at, size
+
+
+@pytest.mark.parametrize("place", range(PLACES))
+@pytest.mark.parametrize("kind", KINDS)
+def test_read_ulog_damaged_states_the_loss(content, whole, capsys, kind: str, place: int) -> None:
+    data, at, size = damage(content, kind, place)
+    flight, refusal = None, ""
+    with patience():
+        try:
+            flight = read_ulog("damaged.ulg", data)
+        except LogError as error:
+            refusal = str(error)
+    assert "".join(capsys.readouterr()) == ""
+    if flight is None:
+        assert re.fullmatch(r"damaged\.ulg: .+", refusal)
+        return
+    log, kept = flight.log, count_samples(flight) / whole
+    if kind == "flipped":
+        assert kept > {100: 0.8, 1000: 0.05}.get(size, 0.995)
+    else:
+        kept_before = at / len(content) - 0.01
+        assert kept > (kept_before if at > len(data) - MAX_MESSAGE_BYTES else 0.85)
+    said = " ".join(log.damage)
+    stated = re.search(r"([\d.]+) s of the IMU are missing before the end at ([\d.]+) s", said)
+    if kept < 1.0 - MAX_SILENT_LOSS:
+        assert stated or "ends in mid-message after" in said or log.ends_in_flight
+    if stated and kind != "flipped":
+        missing_s, end_s = map(float, stated.groups())
+        assert missing_s == pytest.approx(end_s - len(flight.imu) / IMU_HZ, abs=0.3)
+
+
+@pytest.mark.parametrize("rubbish", [bytes(200_000), b"\xff" * 200_000], ids=["zeros", "ones"])
+def test_read_ulog_rubbish_inside_keeps_the_flight(content, whole, rubbish: bytes) -> None:
+    at = content.index(b"D\0\0", len(content) // 2) - 2  # a message of the first topic
+    flight = read_ulog("long.ulg", content[:at] + rubbish + content[at:])
+    assert count_samples(flight) > 0.999 * whole
+    assert flight.log.bytes - flight.log.bytes_read == pytest.approx(len(rubbish), abs=2000)
+    assert "0.0 s of the IMU are missing" in flight.log.damage[0]
+
+
+def test_read_ulog_damaged_definition_ends(content) -> None:
+    """pyulog alone repeats the rest of the file where a definition is longer than it."""
+    cut = content[: content.index(b"vehicle_attitude:")]
+    with patience(), pytest.raises(LogError, match="without any data"):
+        read_ulog("cut.ulg", cut[:-3] + struct.pack("<HB", 60_000, 0) + bytes(100))
+
+
+def message(kind: str, content: bytes) -> bytes:
+    return struct.pack("<HB", len(content), ord(kind)) + content
+
+
+@pytest.mark.parametrize(
+    "definitions",
+    [
+        [message("F", b"a:b[65535] b;"), message("F", b"b:uint8_t[65535] c;")],
+        [message("F", b"a:" + b"uint8_t[65535] c;" * 3800)],
+        [message("F", b"a:uint8_t[60000] c;")] * 50,
+    ],
+    ids=["nested", "long", "many"],
+)
+def test_read_ulog_huge_formats_are_rejected(definitions: list[bytes]) -> None:
+    """Without a limit they need up to 1,000 GB of memory."""
+    subscriptions = [
+        message("A", struct.pack("<BH", 0, number) + b"a") for number in range(len(definitions))
+    ]
+    with patience(), pytest.raises(LogError, match=r"its topics have more than 200,000 fields"):
+        read_ulog("huge.ulg", HEAD + b"".join(definitions + subscriptions))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.5, 0.9])
+def test_read_log_cut_off_states_the_end(tmp_path, sample_log, share: float) -> None:
+    path = tmp_path / "cut.ulg"
+    content = sample_log.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    flight = read_log(path)
+    assert flight.log.ends_in_flight
+    assert flight.log.bytes_read == pytest.approx(share * len(content), abs=1000)
+    (said,) = flight.log.damage
+    assert f"ends in mid-message after {flight.log.duration_s:.1f} s, in flight" in said
+    if share > 0.1:
+        return
+    found = find(run_comparison(ComparisonRequest(log=str(path))))
+    (named,) = [one for one in found if one.id == "log_damaged"]
+    assert named.message.startswith("The file ends in mid-message")
+
+
+def test_cli_damaged_log_prints_the_loss(tmp_path, sample_log, monkeypatch, capsys) -> None:
+    """A fifth of the sample flight with a hole of 20 kB."""
+    content = bytearray(sample_log.read_bytes()[:700_000])
+    content[400_000:420_000] = bytes(20_000)
+    path = tmp_path / "hole.ulg"
+    path.write_bytes(content)
+    for arguments in (["info", path], ["compare", path, "--json", "-"]):
+        code, out, err = run_main(monkeypatch, capsys, *arguments)
+        assert (code, "Traceback" in err) == (0, False)
+        said = " ".join(out.split())  # lines are wrapped
+        assert "the file ends in mid-message after 24.0 s, in flight" in said
+        assert "0.8 s of the IMU are missing before the end at 24.0 s" in said
+
+
+def test_info_unreadable_log_exits_with_one_line(tmp_path, monkeypatch, capsys) -> None:
+    path = tmp_path / "head.ulg"
+    path.write_bytes(HEAD + b"\xff" * 5000)
+    for command in ("info", "compare"):
+        code, out, err = run_main(monkeypatch, capsys, command, path)
+        assert (code, out, len(err.splitlines())) == (2, "", 1)
+        assert "without any data" in err
+
+
+# IMU samples that a reader with its own resynchronisation finds, which pyulog does not
+DAMAGED = {
+    "Auterion_px4-ulog-rs_hist_15eddfaf_corrupt_format_not_utf8": (13_951, 0.0006),
+    "Auterion_px4-ulog-rs_hist_2f3b79f6_corrupt_unregistered_msg_id": (19_191, 0.0046),
+}
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", DAMAGED)
+def test_read_log_real_damage_loses_little(shared_logs, name: str) -> None:
+    count, lost = DAMAGED[name]
+    flight = read_log(shared_logs / "real" / f"{name}.ulg")
+    assert count * (1.0 - lost) < len(flight.imu) < count
+    assert "s of the IMU are missing before the end at" in flight.log.damage[0]

@@ -1,0 +1,105 @@
+"""Environments that no command can change: a result, or one line with the cause."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cli_tools import contents, run_main
+from conftest import LOG
+
+posix = pytest.mark.skipif(os.name == "nt", reason="folders in use and limits are those of POSIX")
+linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the limit")
+
+
+def started(
+    arguments: str, *, before: str = "", folder: Path, **environment: str
+) -> tuple[int, str, str]:
+    """A command in a shell of its own, after another one: exit code, output, errors."""
+    ended = subprocess.run(
+        ["sh", "-c", f'{before} exec "$0" -m px4fuse {arguments}', sys.executable],
+        cwd=folder, env=os.environ | environment, capture_output=True, check=False,
+    )  # fmt: skip
+    return ended.returncode, ended.stdout.decode(), ended.stderr.decode()
+
+
+@posix
+def test_report_ignores_backend_of_notebooks(tmp_path) -> None:
+    backend = "module://matplotlib_inline.backend_inline"
+    code, _, err = started(
+        f"loop {LOG.with_name('loop_slam.tum')} -o r.pdf", folder=tmp_path, MPLBACKEND=backend
+    )
+    assert (code, err) == (0, "")
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF-")
+
+
+@posix
+def test_info_ignores_date_that_is_not_a_number(tmp_path) -> None:
+    code, out, err = started(f"info {LOG}", folder=tmp_path, SOURCE_DATE_EPOCH="abc")
+    assert (code, err) == (0, "")
+    assert out.startswith(LOG.name)
+
+
+@pytest.mark.parametrize("columns", ["0", "00", "abc", ""])
+def test_output_ignores_width_that_is_not_positive(monkeypatch, capsys, columns) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    usual = run_main(monkeypatch, capsys, "info", LOG)
+    monkeypatch.setenv("COLUMNS", columns)
+    assert run_main(monkeypatch, capsys, "info", LOG) == usual
+    assert usual[1].startswith(LOG.name)
+
+
+def test_terminal_ignores_width_of_zero(monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "0")
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    code, out, _ = run_main(monkeypatch, capsys, "info", LOG)
+    assert code == 0
+    assert LOG.name in out
+
+
+@posix
+@pytest.mark.parametrize("command", ["compare {log} -o r.pdf", "info {log} --json i.json"])
+def test_deleted_current_folder_is_named(tmp_path, command) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    code, out, err = started(command.format(log=LOG), before='rmdir "$PWD";', folder=gone)
+    said = "px4fuse: the current folder no longer exists, nothing was written. "
+    assert (code, out, err) == (2, "", f"{said}Change to another folder.\n")
+
+
+@linux
+def test_small_memory_limit_is_named(tmp_path) -> None:
+    for command in (f"compare {LOG} -o r.pdf", f"explore {LOG} -o r.html", f"info {LOG}"):
+        code, out, err = started(command, before="ulimit -v 400000;", folder=tmp_path)
+        assert (code, out) == (2, "")
+        assert err.startswith("px4fuse: the memory limit is 410 MB, at least 800 MB")
+        assert len(err.splitlines()) == 1
+    assert started("--help", before="ulimit -v 400000;", folder=tmp_path)[0] == 0
+    assert contents(tmp_path) == {}
+
+
+def test_exhausted_memory_is_one_line(monkeypatch, capsys, tmp_path) -> None:
+    from px4fuse import analysis
+
+    def exhausted(*_: object) -> None:
+        raise MemoryError("Unable to allocate 7.46 MiB")
+
+    monkeypatch.setattr(analysis, "read_flight", exhausted)
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run_main(monkeypatch, capsys, "info", LOG, "--json", "i.json")
+    assert (code, out) == (2, "")
+    assert err.startswith("px4fuse: not enough memory, nothing was written. Close other programs")
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["tune {log} --start 126", "sync {log} --end 3"])
+def test_failed_estimate_writes_no_file(monkeypatch, capsys, tmp_path, command) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = command.format(log=LOG).split()
+    code, out, err = run_main(monkeypatch, capsys, *words, "--json", "j.json")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert "could be determined: " in err
+    assert contents(tmp_path) == {}

@@ -1,0 +1,167 @@
+"""Inputs are never replaced: no output of any command goes to a file that the command reads."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from aimed import RUNS, Aim, aims, cleared, hashed, made_desk
+from class_tools import in_this_process, report_of
+from cli_tools import done, refused, run
+from conftest import REPORT, SAMPLES
+
+from px4fuse.errors import OutputError
+
+pytestmark = [
+    pytest.mark.usefixtures("analysed_once", "no_drawing"),
+    pytest.mark.skipif(os.name == "nt", reason="links need rights there"),
+]
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_desk(tmp_path_factory.mktemp("desk") / "desk")
+
+
+def group(aim: Aim) -> tuple[str, str, str | None]:
+    return aim.command, aim.option, aim.name
+
+
+@pytest.mark.parametrize("command", [command for command, *_ in RUNS])
+def test_output_at_input_is_refused_by_every_path(desk, tmp_path, monkeypatch, command) -> None:
+    monkeypatch.chdir(desk)
+    before, tried = hashed(desk), 0
+    for aim in (aim for aim in aims() if aim.command == command):
+        arguments = aim.arguments(desk, cleared(tmp_path / "place"))
+        if arguments is None:
+            continue
+        result = run(*arguments)
+        assert isinstance(result.exception, OutputError), (aim, result.output)
+        assert result.stdout == ""
+        assert hashed(desk) == before, aim
+        tried += 1
+    assert tried >= 4
+
+
+# --- the faults that were found ---
+
+
+@pytest.fixture
+def class_desk(tmp_path, monkeypatch) -> Path:
+    """Reports that were handed in, in a folder whose name is that of grade's own."""
+    folder = tmp_path / "h" / "reports"
+    folder.mkdir(parents=True)
+    (folder / "1001.pdf").write_bytes(report_of("Ada", "1001"))
+    (tmp_path / "gg").mkdir()
+    (tmp_path / "gg" / "class.csv").write_text("id,name\n1001,Ada\n")
+    (tmp_path / "g3" / "grades").mkdir(parents=True)
+    (tmp_path / "g3" / "grades" / "ws.csv").write_text("id,name,grade\n1001,Ada,\n")
+    in_this_process(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["grade h/reports -o h", "grade h/reports --roster gg/class.csv -o gg",
+     "grade h/reports --worksheet g3/grades/ws.csv -o g3"],
+)  # fmt: skip
+def test_grade_into_folder_of_inputs_is_refused(class_desk, command) -> None:
+    before = hashed(class_desk)
+    assert "contains an input of this command" in refused(*command.split())
+    assert hashed(class_desk) == before
+
+
+def test_grade_keeps_pdf_behind_linked_reports_folder(class_desk) -> None:
+    (class_desk / "out").mkdir()
+    (class_desk / "out" / "reports").symlink_to(class_desk / "h" / "reports")
+    before = hashed(class_desk)
+    assert "contains an input" in refused("grade", "h/reports", "-o", "out")
+    assert hashed(class_desk) == before
+
+
+def test_grade_twice_into_one_folder_keeps_names(class_desk) -> None:
+    command = ["grade", "h/reports", "--roster", "gg/class.csv", "--anonymous", "-o", "out"]
+    done(*command)
+    (class_desk / "out" / "overrides.csv").write_text("id,item,points,comment\n1001,,,Good\n")
+    before = (class_desk / "out" / "names.csv").read_bytes()
+    done(*command)
+    assert (class_desk / "out" / "names.csv").read_bytes() == before
+
+
+def test_compare_keeps_its_answer_form(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(SAMPLES / "aisle_uwb.ulg", "l.ulg")
+    done("answers", "l.ulg", "-o", "form.toml")
+    before = hashed(tmp_path)
+    command = "compare l.ulg --answers form.toml --json form.toml"
+    assert refused(*command.split()).startswith("form.toml: is an input of this command")
+    assert hashed(tmp_path) == before
+
+
+def test_verify_keeps_a_log_of_a_folder(tmp_path, monkeypatch) -> None:
+    in_this_process(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "d").mkdir()
+    shutil.copy(SAMPLES / "aisle_uwb.ulg", "d/aisle.ulg")
+    shutil.copy(REPORT, "a.pdf")
+    before = hashed(tmp_path)
+    said = refused("verify", "a.pdf", "d", "--json", "d/aisle.ulg")
+    assert said.startswith("d/aisle.ulg: is an input of this command")
+    assert hashed(tmp_path) == before
+
+
+def test_batch_into_folder_of_logs_is_refused(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "d" / "in").mkdir(parents=True)
+    shutil.copy(SAMPLES / "aisle_uwb.ulg", "d/in/fleet.ulg")
+    for logs in ("d", "d/in/fleet.ulg", "d/*/*.ulg"):
+        assert "-o d: contains an input" in refused("batch", logs, "-o", "d")
+
+
+# --- the register ---
+
+
+def test_write_to_registered_file_is_refused(tmp_path) -> None:
+    from px4fuse.input_files import inputs_protected
+    from px4fuse.reading import read_text
+    from px4fuse.writing import write_all
+
+    path, other = tmp_path / "a", tmp_path / "b"
+    path.write_text("mine")
+    with inputs_protected():
+        read_text(path, OutputError, 100)
+        with pytest.raises(OutputError, match="a: is an input"):
+            write_all({other: b"x", path: b"x"})
+        assert not other.exists()
+    write_all({path: b"x"})
+    assert path.read_bytes() == b"x"
+
+
+def test_file_system_without_inodes_compares_paths(tmp_path, monkeypatch) -> None:
+    """As one that ignores upper and lower case, and gives every file the inode 0."""
+    from px4fuse.input_files import add_input, check_output_folder, check_outputs, inputs_protected
+
+    real, real_names = Path.stat, Path.iterdir
+
+    def lower(path: Path) -> Path:
+        return Path(str(path).replace("NOTES", "notes").replace("DIR", "dir"))
+
+    def stat(self: Path, **how: bool) -> os.stat_result:
+        found = real(lower(self), **how)
+        return os.stat_result((found.st_mode, 0, *found[2:]))
+
+    notes = tmp_path / "dir" / "notes.md"
+    notes.parent.mkdir()
+    notes.write_text("mine")
+    monkeypatch.setattr(Path, "stat", stat)
+    monkeypatch.setattr(Path, "iterdir", lambda self: real_names(lower(self)))
+    with inputs_protected():
+        add_input(notes)
+        check_outputs([notes.with_name("other.md")])
+        with pytest.raises(OutputError):
+            check_outputs([notes.with_name("NOTES.md")])
+        with pytest.raises(OutputError):
+            check_output_folder(tmp_path / "DIR")
