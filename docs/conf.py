@@ -1,7 +1,7 @@
-"""How the documentation is built: ``python -m sphinx -W docs docs/_build``, without a network.
+"""Sphinx configuration: ``python -m sphinx -W docs docs/_build`` builds without a network.
 
-What can be read out of the program is made at build: the findings' pages, the commands' help, the
-picture of the rooms.
+Three parts are generated from the program: pages of the findings, help of the commands, and the
+figure of the package layers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
 ROOT = Path(__file__).resolve().parents[1]
-MADE = Path(__file__).parent / "made"
+GENERATED = Path(__file__).parent / "made"
 sys.path.insert(0, str(Path(__file__).parent))
 
 import findings_pages  # noqa: E402
@@ -24,25 +24,25 @@ import findings_pages  # noqa: E402
 from px4fuse.cli import COMMANDS, cli  # noqa: E402
 
 project = "px4fuse"
-author = copyright = "The px4fuse authors"  # noqa: A001 - as Sphinx calls it
+author = copyright = "The px4fuse authors"  # noqa: A001 - name required by Sphinx
 release = metadata.version("px4fuse")
 extensions = [
     "myst_parser",  # Markdown
     "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",  # numpydoc's sections
+    "sphinx.ext.napoleon",  # numpydoc sections of docstrings
 ]
 exclude_patterns = ["_build"]
 html_theme = "furo"
-smartquotes = False  # two dashes begin an option
+smartquotes = False  # keeps the two dashes of options
 html_title = f"px4fuse {release}"
 myst_heading_anchors = 3
-autodoc_typehints = "none"  # the docstrings say them, with units
+autodoc_typehints = "none"  # docstrings contain the types, with units
 autodoc_member_order = "bysource"
 napoleon_use_rtype = False
 
 
-def rooms() -> Figure:
-    """The package's rooms from its layers in ``pyproject.toml``, what is imported below."""
+def draw_layers() -> Figure:
+    """Draw the package layers of ``pyproject.toml``; each layer imports those below it."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     figure = Figure(figsize=(7.0, 0.34 * len(layers)))
@@ -51,8 +51,8 @@ def rooms() -> Figure:
     axes.axis("off")
     for row, layer in enumerate(layers):
         names = layer.split(" | ")
-        for place, name in enumerate(names):
-            left, width = 0.08 + 0.9 * place / len(names), 0.9 / len(names) - 0.01
+        for column, name in enumerate(names):
+            left, width = 0.08 + 0.9 * column / len(names), 0.9 / len(names) - 0.01
             axes.add_patch(_box(left, row + 0.08, width, 0.84))
             axes.text(left + width / 2.0, row + 0.5, name, ha="center", va="center", size=9)
     axes.annotate("", (0.03, len(layers) - 0.3), (0.03, 0.3), arrowprops={"arrowstyle": "->"})
@@ -67,19 +67,20 @@ def _box(left: float, top: float, width: float, height: float) -> FancyBboxPatch
     )  # fmt: skip
 
 
-def commands() -> str:
-    """What each command says of itself with ``--help``."""
-    parts = ["# Every option\n"]
+def format_options() -> str:
+    """Format the ``--help`` text of each command as one Markdown page."""
+    sections = ["# All options\n"]
     for name in COMMANDS:
-        context = click.Context(cli, info_name="px4fuse")
-        command = cli.get_command(context, name)
+        parent = click.Context(cli, info_name="px4fuse")
+        command = cli.get_command(parent, name)
         assert command is not None
-        with click.Context(command, parent=context, info_name=name, max_content_width=88) as here:
-            parts.append(f"## {name}\n\n```text\n{command.get_help(here)}\n```\n")
-    return "\n".join(parts)
+        with click.Context(command, parent=parent, info_name=name, max_content_width=88) as context:
+            help_text = command.get_help(context)
+        sections.append(f"## {name}\n\n```text\n{help_text}\n```\n")
+    return "\n".join(sections)
 
 
-MADE.mkdir(exist_ok=True)
-rooms().savefig(MADE / "rooms.svg")
-(MADE / "options.md").write_text(commands(), encoding="utf-8")
-findings_pages.write(MADE / "findings")
+GENERATED.mkdir(exist_ok=True)
+draw_layers().savefig(GENERATED / "layers.svg")
+(GENERATED / "options.md").write_text(format_options(), encoding="utf-8")
+findings_pages.write(GENERATED / "findings")

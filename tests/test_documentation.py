@@ -1,4 +1,4 @@
-"""What README and documentation tell a newcomer to type works word for word."""
+"""Commands, code, links and figures of README and documentation, executed and checked."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def blocks(page: str, kind: str) -> list[str]:
 
 
 def commands(page: str) -> list[str]:
-    """Lines of a page to type, without the readers of pipes."""
+    """Return the px4fuse commands of a page, each up to its first pipe."""
     lines = [line for text in blocks(page, "sh") for line in text.splitlines()]
     return [line.split(" | ")[0] for line in lines if line.startswith("px4fuse ")]
 
 
 @pytest.fixture
 def at_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder that looks like a fresh clone, so that outputs do not land in this one."""
+    """Change to a temporary folder with the sample logs, so that outputs are not in the clone."""
     samples = ROOT / "sample_logs"
     shutil.copytree(samples, tmp_path / "sample_logs")
     shutil.copytree(samples, tmp_path / "installed" / "px4fuse_samples")
@@ -48,42 +48,42 @@ def at_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def typed(line: str) -> str:
+def run_command(line: str) -> str:
     return done(*shlex.split(line, comments=True)[1:]).output
 
 
-@pytest.mark.usefixtures("no_drawing", "at_root")  # tests of their own draw each kind of report
+@pytest.mark.usefixtures("no_drawing", "at_root")  # other tests draw each kind of report
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)])
-def test_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> None:
-    """What README has too is typed there."""
+def test_page_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> None:
+    """Commands that README contains too run only for README."""
     if page == "docs/instructors.md":
-        pytest.skip("a test of its own makes what its commands need")
+        pytest.skip("test_instructors_commands_run_in_order makes the inputs")
     monkeypatch.setattr(run, "run_bounded", in_turn)
-    typed_there = commands("README.md") if page != "README.md" else []
-    for number, line in enumerate(line for line in commands(page) if line not in typed_there):
+    readme_commands = commands("README.md") if page != "README.md" else []
+    for number, line in enumerate(line for line in commands(page) if line not in readme_commands):
         if line == "px4fuse practice":
-            typed(f"{line} --flights 1")
-        elif line.startswith("px4fuse batch"):  # the sample logs themselves are in the other lines
+            run_command(f"{line} --flights 1")
+        elif line.startswith("px4fuse batch"):  # a small log: other commands use the sample logs
             folder = tmp_path / f"batch_{number}"
             folder.mkdir()
             tiny_logs(folder / "sample_logs", 1)
             monkeypatch.chdir(folder)
-            typed(line)
+            run_command(line)
             monkeypatch.chdir(tmp_path)
         else:
-            typed(line)
+            run_command(line)
 
 
 @pytest.mark.usefixtures("drawn_once", "at_root")
-def test_the_instructors_four_commands_run_in_order(monkeypatch) -> None:
+def test_instructors_commands_run_in_order(monkeypatch) -> None:
     in_this_process(monkeypatch)
     Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")
-    Path("notes.md").write_text("# What I found\n\nThe stamps are late.\n")
+    Path("notes.md").write_text("# What I found\n\nThe timestamps are late.\n")
     lines = commands("docs/instructors.md")
     assert len(lines) == 4
-    said = [typed(line) for line in lines]
+    outputs = [run_command(line) for line in lines]
     assert {path.name for path in Path("flights").glob("*.ulg")} == {"1001.ulg", "1002.ulg"}
-    assert "verified" in said[-1]
+    assert "verified" in outputs[-1]
     table = Path("class/class.csv").read_text(encoding="utf-8-sig")
     assert "Ada Lovelace,1001,verified" in table
 
@@ -91,33 +91,35 @@ def test_the_instructors_four_commands_run_in_order(monkeypatch) -> None:
 @pytest.mark.usefixtures("at_root")
 @pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
 def test_python_examples_run(page: str, capsys) -> None:
-    """In the page's order, on the tables that its own command extracts."""
+    """The tables of `px4fuse extract` are written first; the code blocks run in order."""
     mpl.use("Agg")
     for line in commands(page):
         if line.startswith("px4fuse extract"):
-            typed(line)
+            run_command(line)
             capsys.readouterr()
     for block in blocks(page, "python"):
         exec(compile(block, page, "exec"), {})
-        said = capsys.readouterr().out
-        numbers = re.findall(r"-?\d+\.\d+", said)
+        output = capsys.readouterr().out
+        numbers = re.findall(r"-?\d+\.\d+", output)
         assert numbers
         assert all(abs(float(number)) < 1e3 for number in numbers)
-        assert len(said.splitlines()) < 150 or "gain" in said  # no table is printed whole
+        assert len(output.splitlines()) < 150 or "gain" in output  # no whole table is printed
     pyplot.close("all")
 
 
-@pytest.mark.parametrize(("page", "most"), [("README.md", 3), ("docs/lab.md", 2)])
-def test_the_lab_has_a_command_for_each_step(page: str, most: int) -> None:
+@pytest.mark.parametrize(
+    ("page", "max_commands"), [("README.md", 3), ("docs/lab.md", 2)], ids=["readme", "lab"]
+)
+def test_lab_each_step_has_commands(page: str, max_commands: int) -> None:
     steps = re.split(r"\n\*\*\d\. ", PAGES[page].split("The lab in five steps\n")[-1])[1:]
     assert len(steps) == 5
     for number, step in enumerate(steps, 1):
-        step = step.split("\n## ")[0]  # noqa: PLW2901 - what follows the lab
-        assert 1 <= len(re.findall(r"^px4fuse ", step, re.MULTILINE)) <= most
+        step = step.split("\n## ")[0]  # noqa: PLW2901 - without the next section
+        assert 1 <= len(re.findall(r"^px4fuse ", step, re.MULTILINE)) <= max_commands
         assert page == "README.md" or f"reports/example/lab_{number}.png)" in step
 
 
-def test_pictures_are_small_and_made_by_the_script() -> None:
+def test_pictures_are_small_and_made_by_script() -> None:
     script = (ROOT / "tests" / "benchmarks" / "readme_pictures.py").read_text(encoding="utf-8")
     pictures = re.findall(r"!\[[^]]+\]\((\S+\.png)\)", README + PAGES["docs/lab.md"])
     assert len({Path(picture).name for picture in pictures}) == 7
@@ -128,14 +130,14 @@ def test_pictures_are_small_and_made_by_the_script() -> None:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shells_complete_as_said(shell, monkeypatch, capsys) -> None:
-    said = PAGES["docs/commands.md"]
-    assert all(f"`px4fuse {command}" in said for command in COMMANDS)
-    assert f"_PX4FUSE_COMPLETE={shell}_source px4fuse" in said or f"`{shell}_source`" in said
+def test_commands_page_completion_lines_work(shell, monkeypatch, capsys) -> None:
+    page = PAGES["docs/commands.md"]
+    assert all(f"`px4fuse {command}" in page for command in COMMANDS)
+    assert f"_PX4FUSE_COMPLETE={shell}_source px4fuse" in page
     monkeypatch.setenv("_PX4FUSE_COMPLETE", f"{shell}_source")
-    with pytest.raises(SystemExit) as done:
+    with pytest.raises(SystemExit) as exit_info:
         cli.main(prog_name="px4fuse")
-    assert done.value.code == 0
+    assert exit_info.value.code == 0
     assert "px4fuse" in capsys.readouterr().out
     monkeypatch.setenv("_PX4FUSE_COMPLETE", f"{shell}_complete")
     monkeypatch.setenv("COMP_WORDS", "px4fuse comp")
@@ -151,21 +153,21 @@ def test_linked_files_and_headings_exist(page: str) -> None:
     targets = re.findall(r"\]\(([^)]+)\)", PAGES[page])
     targets += re.findall(r"(?<=\{image\} )\S+|(?<=\}`)[^`]+", PAGES[page])
     for target in targets:
-        target = target.partition("<")[2].removesuffix(">") or target  # noqa: PLW2901 - a download
+        target = target.partition("<")[2].removesuffix(">") or target  # noqa: PLW2901 - target of a download
         name, _, heading = target.partition("#")
-        if "//" in target or name.startswith("made/"):  # the build makes and checks these
+        if "//" in target or name.startswith("made/"):  # generated and checked by the build
             continue
         path = folder / name if name else ROOT / page
         assert path.exists(), target
         headings = (
             re.findall(r"^#+ (.*)", path.read_text(encoding="utf-8"), re.M) if heading else []
         )
-        anchors = [re.sub(r"[^\w -]", "", each).lower().replace(" ", "-") for each in headings]
+        anchors = [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in headings]
         assert not heading or heading in anchors, target
 
 
-def test_the_index_shows_the_readme_with_absolute_links() -> None:
-    """By the rules that the build gives its plugin."""
+def test_readme_on_pypi_has_absolute_links() -> None:
+    """The substitutions are those that pyproject.toml gives the build plugin."""
     import tomllib
 
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -178,7 +180,7 @@ def test_the_index_shows_the_readme_with_absolute_links() -> None:
     assert all(link.startswith("https://") for link in links)
 
 
-def test_source_distribution_includes_every_top_level_document() -> None:
+def test_sdist_includes_each_top_level_document() -> None:
     import tomllib
 
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -111,8 +111,9 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
 def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
     """Agreement on every flight as the documentation has it."""
     lines = [
-        "| flight | innovations | correlation n/e | S replayed / logged, 5 to 95 % | rejected | "
-        "published, m rms n/e | left | height: correlation GNSS / barometer, published, m rms |",
+        "| flight | innovations | correlation (north / east) | S replayed / logged, 5 to 95 % | "
+        "rejected (replayed / logged) | published position, RMS difference (m, north / east) | "
+        "unexplained | height: correlation GNSS / barometer, RMS difference (m) |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, model in models.items():
@@ -132,7 +133,7 @@ def height_cell(agreement: Agreement) -> str:
     """Of a flight whose heights are replayed."""
     heights = [*agreement.gnss_hgt.values(), *agreement.baro_hgt.values()]
     if not heights or agreement.doubtful:
-        return "EKF2's own"
+        return "from the log"
     both = " / ".join(f"{axis.innovation_correlation:.4f}" for axis in heights)
     return f"{both}, {heights[0].position_rms_difference_m:.3f}"
 
