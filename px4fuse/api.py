@@ -294,7 +294,7 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
 
     target = _ending(path, ".html")
     _request(analysis)
-    write_all({target: html_text([analysis]).encode()})
+    write_all({target: html_text(analysis).encode()})
     return target
 
 

@@ -179,7 +179,7 @@ def practice_text(
         scripts.append(script)
     return page_text(
         "\n".join(scripts),
-        [data],
+        data,
         command="practice",
         heading="What is wrong with this flight?",
         title=f"seed {seed}, level {level}",
@@ -211,7 +211,7 @@ def _flown(one: Round, number: int) -> tuple[dict[str, Any], str]:
     }
     data |= {"story": [], "findings": []}
     packed = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
-    scripts = data_scripts([data], [analysis], packer, f"-{number}")
+    scripts = data_scripts(data, analysis, packer, f"-{number}")
     return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{packed}</script>'
 
 

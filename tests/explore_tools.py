@@ -25,7 +25,7 @@ def explored(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     request = ComparisonRequest(log=str(sample_log))
     analysis = px4fuse.analysis.run(request)  # as it is then
     file = tmp_path_factory.mktemp("explore") / "sample.html"
-    file.write_bytes(html_text([analysis]).encode())
+    file.write_bytes(html_text(analysis).encode())
     return file, analysis
 
 
@@ -40,7 +40,7 @@ def show(browser: Browser, file: Path, at: str = "", width: int = 1400) -> Brows
     browser.open(file, width=width)
     if at:
         browser.ask(f"location.hash = {json.dumps(at)}")
-    ready = "document.querySelector('#tables table') !== null"
+    ready = "document.querySelector('#table tbody tr') !== null"
     end = time.monotonic() + 30.0
     while not browser.ask(ready):
         assert time.monotonic() < end, browser.complaints()

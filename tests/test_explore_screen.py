@@ -60,7 +60,7 @@ def key(page: Browser, name: str) -> None:
 
 
 def test_knobs_innovations_sigmas_and_needle_are_in_view_at_once(page: Browser) -> None:
-    wanted = [*KNOBS, "#innovation-0", "#sigma_p-0", "#sigma_v-0", "#needle-0", "#live"]
+    wanted = [*KNOBS, "#innovation", "#sigma_p", "#sigma_v", "#needle", "#live"]
     assert page.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
 
 
@@ -75,14 +75,14 @@ def test_on_a_phone_knobs_and_a_plot_stay(
     assert height <= 3 * 844
     browser.ask(f"scrollTo(0, {share * height})")
     settle(browser)
-    wanted = [*KNOBS, "#innovation-0"]
+    wanted = [*KNOBS, "#innovation"]
     assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
     # the tabs choose which one
     browser.ask("document.getElementById('tab-sigma_v').click()")
     settle(browser)
-    wanted = [*KNOBS, "#sigma_v-0"]
+    wanted = [*KNOBS, "#sigma_v"]
     assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
-    assert not browser.ask("document.querySelector('#innovation-0').checkVisibility()")
+    assert not browser.ask("document.querySelector('#innovation').checkVisibility()")
     assert browser.complaints() == []
 
 
@@ -90,11 +90,11 @@ def test_what_leaves_an_axis_is_marked_at_its_edge(page: Browser) -> None:
     put(page, sigmaA=0.002)
 
     def drawn(name: str, *columns: str) -> list[Any]:
-        data = f"e.model('innovation:{name}-source-0').data"
+        data = f"e.model('innovation:{name}-source').data"
         lists = ", ".join(f"Array.from({data}.{column})" for column in columns)
         return [np.array(each) for each in ask(page, f"Explore.then((e) => [{lists}])")]
 
-    ends = "(({start, end}) => [start, end])(e.model('innovation-0').y_range)"
+    ends = "(({start, end}) => [start, end])(e.model('innovation').y_range)"
     low, high = ask(page, f"Explore.then((e) => {ends})")
     t, nu = drawn("updates", "t", "nu")
     out = (nu < low) | (nu > high)
@@ -130,8 +130,8 @@ def test_the_words_follow_the_knobs_and_their_cure_was_replayed(
     assert cure[2] == number_words(nis, 2)
     cured = nis_with(analysis, Settings(sigma_a_m_s2=float(cure[1]), sigma_z_m=0.05))
     assert cure[3] == number_words(cured, 2)
-    assert f"ours {number_words(nis, 2)} (understated" in text(page, "read-0")
-    hand = page.ask("document.querySelector('#needle-0 .hand.ours').style.left")
+    assert f"ours {number_words(nis, 2)} (understated" in text(page, "read")
+    hand = page.ask("document.querySelector('#needle .hand.ours').style.left")
     assert hand == "100%"
 
 
@@ -152,7 +152,7 @@ def test_findings_of_the_settings_follow_and_the_others_stay(
     analysis = run(ComparisonRequest(log=str(sample_log), sigma_z_m=1.0))
     assert any(one.id == "sigma_z_large" for one in find(analysis))
     file = tmp_path / "large.html"
-    file.write_bytes(html_text([analysis]).encode())
+    file.write_bytes(html_text(analysis).encode())
     show(browser, file)
     open_view(browser, "recorded")
     said = "[...document.querySelectorAll('.now-said')].map((one) => one.textContent)"
@@ -179,13 +179,13 @@ def test_ekf2_curves_equal_the_log(page: Browser, explored: tuple[Path, Analysis
         ("filter", "sigma_v:variance", "sv", variance["velocity_variance_m2_s2"].pow(0.5)),
     ):
         open_view(page, view)
-        data = f"e.model('{name}-source-0').data"
+        data = f"e.model('{name}-source').data"
         lists = f"[Array.from({data}.t), Array.from({data}.{column})]"
         drawn = ask(page, f"Explore.then((e) => {lists})")
         assert len(drawn[0]) > 100
         expected = np.interp(drawn[0], logged.index, logged)
         np.testing.assert_allclose(drawn[1], expected, rtol=0.0, atol=2e-6)
-    rejected = "e.model('strip-source-0').data.row.filter((row) => row === 'EKF2 rejected').length"
+    rejected = "e.model('strip-source').data.row.filter((row) => row === 'EKF2 rejected').length"
     count = ask(page, f"Explore.then((e) => {rejected})")
     assert count == (result.ekf2_innovations["rejected"] > 0).sum()
 
@@ -205,7 +205,7 @@ def test_the_address_restores_every_knob(page: Browser, explored: tuple[Path, An
     assert {*wanted[1:].split("&")} == {*address[1:].split("&")}
     assert page.ask("document.getElementById('sigma-z-value').value") == "0.07"
     assert page.ask("document.querySelector('[name=input][value=zero]').checked")
-    assert text(page, "now-0").startswith("Measurement 17 of")
+    assert text(page, "now").startswith("Measurement 17 of")
 
 
 # ------------------------------------------------------------------ the step
@@ -217,7 +217,7 @@ def test_the_ellipse_is_the_replays_p_at_every_step(
     open_view(page, "step")
     shown = ask(
         page,
-        "Explore.then((e) => { const run = e.runs[0].run;"
+        "Explore.then((e) => { const run = e.result.run;"
         "return Step.moments(run).map((one) => { const s = Step.state(run, one);"
         "const {p, v} = Step.ellipse(s); return [one.i, one.u, one.updated, s.slice(0, 2),"
         "Array.from(p), Array.from(v)]; }); })",
@@ -246,11 +246,11 @@ def test_space_plays_and_pauses(page: Browser) -> None:
     steps = "Explore.then((e) => e.stepper.at())"
     page.call("Input.dispatchKeyEvent", type="keyDown", key=" ", text=" ")
     settle(page)
-    assert text(page, "play-0") == "Pause"
+    assert text(page, "play") == "Pause"
     ask(page, "new Promise((r) => setTimeout(r, 1300))")
     page.call("Input.dispatchKeyEvent", type="keyDown", key=" ", text=" ")
     settle(page)
-    assert text(page, "play-0") == "Play"
+    assert text(page, "play") == "Play"
     at = ask(page, steps)
     assert at >= 2
     ask(page, "new Promise((r) => setTimeout(r, 700))")
@@ -272,7 +272,7 @@ def test_the_tour_from_end_to_end(page: Browser, explored: tuple[Path, Analysis]
     for _ in STATIONS:
         settle(page)
         a, z, offset = ask(page, knobs)
-        assert page.ask(f"({IN_VIEW})('#sigma-a', '#needle-0').length") == 2
+        assert page.ask(f"({IN_VIEW})('#sigma-a', '#needle').length") == 2
         seen.append((text(page, "tour-title"), text(page, "tour-sentence"), a, z, offset))
         assert text(page, "tour-task").startswith("Do: ")
         assert text(page, "tour-see").startswith("See: ")
@@ -311,8 +311,8 @@ def test_by_keyboard_alone(page: Browser) -> None:
     key(page, "ArrowRight")
     settle(page)
     assert page.ask("document.activeElement.id") == "tab-track"
-    assert page.ask("document.querySelector('#position-0').checkVisibility()")
-    assert not page.ask("document.querySelector('#innovation-0').checkVisibility()")
+    assert page.ask("document.querySelector('#position').checkVisibility()")
+    assert not page.ask("document.querySelector('#innovation').checkVisibility()")
     key(page, "End")
     settle(page)
     assert page.ask("document.querySelector('#view-recorded').checkVisibility()")

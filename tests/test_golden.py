@@ -216,7 +216,7 @@ def test_the_page_of_a_fleet_holds_what_it_held() -> None:
 def test_the_plots_to_explore_are_what_they_were(sample_log: Path) -> None:
     analysis = px4fuse.compare(str(sample_log))
     data = flight_data(analysis, Packer())
-    document, _ = document_json([data], [analysis.tuning])
+    document, _ = document_json(data, analysis.tuning)
     ids: dict[str, str] = {}
 
     def named(found: re.Match[str]) -> str:

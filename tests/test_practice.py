@@ -188,7 +188,7 @@ def test_nobody_reads_the_answers_by_chance(quiz: Path) -> None:
     told = keys(quiz)
     assert [one["right"] for one in told] == [one.right for one in draw(SEED, 1, COUNT)]
     for content in re.findall(r'id="content-\d+">([^<]+)<', source):
-        flight = json.loads(content)["flights"][0]
+        flight = json.loads(content)["flight"]
         assert flight["findings"] == flight["story"] == []
         assert "mistake" not in content
         assert "px4fuse compare 'flight" in flight["command"]["bare"]
@@ -213,7 +213,7 @@ def renewed(page: Browser, button: str) -> None:
     while time.monotonic() < end:
         with contextlib.suppress(AssertionError):  # in between there is no page
             if page.ask(
-                "window.before === undefined && document.querySelector('#tables table') !== null"
+                "window.before === undefined && document.querySelector('#table tbody tr') !== null"
                 " && document.getElementById('quiz-title').textContent !== ''"
             ):
                 break

@@ -7,38 +7,32 @@ import click
 
 from px4fuse.cli import inputs, outputs
 from px4fuse.cli.sample import sample_log
-from px4fuse.errors import SettingsError
 from px4fuse.request import settings_name
 
 
 @click.command()
-@click.argument("logs", nargs=-1, type=inputs.InputPath())
+@click.argument("log", required=False, type=inputs.InputPath())
 @inputs.analysis_options
 @inputs.options("explore")
 @inputs.open_option
-def explore(logs: tuple[Path, ...], output: Path | None, **given: Any) -> None:
+def explore(log: Path | None, output: Path | None, **given: Any) -> None:
     """Write a web page with sliders for SIGMA_A, SIGMA_Z, DT and the clock offset.
 
-    LOG is a PX4 ULog or a MAVLink recording; with two of them, both stand side by side; without one
-    it is the sample flight. The page is one file that needs no network: it replays the filter in
-    the browser at every move and shows what that does to innovations, variances and errors, one
-    step at a time if you like, and takes you on a tour of the flight.
+    LOG is a PX4 ULog or a MAVLink recording; without one it is the sample flight. The page is one
+    file that needs no network: it replays the filter in the browser at every move and shows what
+    that does to innovations, variances and errors, one step at a time if you like, and takes you on
+    a tour of the flight.
     """
     from px4fuse.analysis import run
 
-    if len(logs) > 2:
-        raise SettingsError(f"{len(logs)} logs: give one, or two to see them side by side.")
-    if len(logs) == 2 and (given["mavlink"] is not None or given["position"] is not None):
-        raise SettingsError("--mavlink and --position belong to one log: give only one LOG.")
-    logs = logs or (sample_log(),)
-    requests = [inputs.comparison_request(log, dict(given)) for log in logs]
-    stems = "_".join(log.stem for log in logs)
-    target = outputs.web_page(output, Path("reports", f"{stems}{settings_name(requests[0])}.html"))
+    log = log or sample_log()
+    request = inputs.comparison_request(log, given)
+    target = outputs.web_page(output, Path("reports", f"{log.stem}{settings_name(request)}.html"))
     with outputs.progress(target) as step:
-        found = [run(request, step) for request in requests]
+        analysis = run(request, step)
         step("writing the page")
         # Bokeh takes long to import, and bad input needs none of it
         from px4fuse.explore.page import html_text
 
-        content = html_text(found).encode()
+        content = html_text(analysis).encode()
     outputs.finish({target: content})

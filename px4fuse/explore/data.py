@@ -38,7 +38,7 @@ MAX_PLAN_POINTS = 2000
 OF_KNOBS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
 
-def flight_data(analysis: Analysis, packer: Packer, *, beside: bool = False) -> dict[str, Any]:
+def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
     """Everything about one flight, as JSON can hold it; arrays are places in the packer.
 
     Parameters
@@ -46,11 +46,8 @@ def flight_data(analysis: Analysis, packer: Packer, *, beside: bool = False) -> 
     analysis : Analysis
         Made from a request.
     packer : Packer
-    beside : bool
-        Whether it stands beside another flight: then times are from the start of its segment.
     """
     signals = signals_of(analysis, packer)
-    settings, segment = analysis.settings, analysis.segment
     events, findings, request = analysis.events, find(analysis), analysis.request
     assert request is not None
     return {
@@ -58,9 +55,8 @@ def flight_data(analysis: Analysis, packer: Packer, *, beside: bool = False) -> 
         "source": analysis.source.name,
         # what innovations ask for then is no noise
         "drifts": analysis.source.origin.may_drift,
-        "shift": segment.start_s if beside else 0.0,
         "story": list(story(analysis, findings)),
-        "settings": _settings(settings),
+        "settings": _settings(analysis.settings),
         "main": analysis.main.axis.name,
         **signals,
         "axes": [

@@ -83,38 +83,33 @@ class Figures(Record, frozen=True):
 FIGURES = table(__file__, "figures.toml", Figures)
 
 
-def document_json(
-    flights: list[dict[str, Any]], tunings: list[Tuning]
-) -> tuple[Any, dict[str, str]]:
+def document_json(data: dict[str, Any], tuning: Tuning) -> tuple[Any, dict[str, str]]:
     """Bokeh's document, and of each root the id of the element that it goes into.
 
     Parameters
     ----------
-    flights : list of dict
+    data : dict
         From :func:`px4fuse.explore.data.flight_data`.
-    tunings : list of mapping
-        Of each flight, for its likelihood maps.
+    tuning : mapping
+        For the likelihood maps.
     """
     document = Document()
     time_range = _range("time")
-    places: dict[str, str] = {}
-    for number, (data, tuning) in enumerate(zip(flights, tunings, strict=True)):
-        plots = _plots(number, data, time_range)
-        plots |= {
-            "strip": _strip(number, data, time_range),
-            "map": _map(number, tuning),
-            "plan": _plan(number),
-            "step": _step(number),
-        }
-        places |= {plot.id: f"{name}-{number}" for name, plot in plots.items()}
-        with document.models.freeze():  # what belongs to the roots is looked for once
-            for plot in plots.values():
-                document.add_root(plot)
-    return document.to_json(deferred=False), places
+    plots = _plots(data, time_range)
+    plots |= {
+        "strip": _strip(data, time_range),
+        "map": _map(tuning),
+        "plan": _plan(),
+        "step": _step(),
+    }
+    with document.models.freeze():  # what belongs to the roots is looked for once
+        for plot in plots.values():
+            document.add_root(plot)
+    return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
 
 
-def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
-    """Every plot against time of one flight, by its name."""
+def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
+    """Every plot against time, by its name."""
     lacking = {
         kind
         for kind in ("ekf2", "truth")
@@ -124,9 +119,9 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
     for name, plot in FIGURES.plots.items():
         if name == "error" and "truth" in lacking:
             continue
-        sources = _Sources(name, number)
+        sources = _Sources(name)
         made = plots[name] = figure(
-            name=f"{name}-{number}",
+            name=name,
             height=TALL if plot.tall else HEIGHT,
             sizing_mode="stretch_width",
             x_range=time_range,
@@ -154,22 +149,19 @@ def _plots(number: int, data: dict[str, Any], time_range: Range1d) -> dict[str, 
             if who:
                 _hover(made, drawn, (who, f"@{column}{{0.000}} {plot.unit}"))
         made.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
-        shift = data["shift"]
         for low, high, style in _bands(data):
-            made.add_layout(
-                BoxAnnotation(left=low - shift, right=high - shift, level="underlay", **style)
-            )
+            made.add_layout(BoxAnnotation(left=low, right=high, level="underlay", **style))
     return plots
 
 
 class _Sources(dict[str, ColumnDataSource]):
     """The sources of one plot, each made when it is first asked for."""
 
-    def __init__(self, plot: str, number: int) -> None:
-        self.plot, self.number = plot, number
+    def __init__(self, plot: str) -> None:
+        self.plot = plot
 
     def __missing__(self, name: str) -> ColumnDataSource:
-        self[name] = _source(f"{self.plot}:{name}", self.number, FIGURES.sources[name])
+        self[name] = _source(f"{self.plot}:{name}", FIGURES.sources[name])
         return self[name]
 
 
@@ -219,10 +211,10 @@ def _range(name: str | None = None) -> Range1d:
     return Range1d(start=0.1, end=1.0, name=name)
 
 
-def _source(name: str, number: int, columns: str) -> ColumnDataSource:
+def _source(name: str, columns: str) -> ColumnDataSource:
     """Empty, for the page to fill."""
     empty: dict[str, Any] = {column: [] for column in columns.split()}
-    return ColumnDataSource(empty, name=f"{name}-source-{number}")
+    return ColumnDataSource(empty, name=f"{name}-source")
 
 
 def _bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
@@ -244,13 +236,13 @@ def _bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
     ]
 
 
-def _strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
+def _strip(data: dict[str, Any], time_range: Range1d) -> Any:
     """What happened when, a row for each kind, so that no colour is needed to tell them apart."""
-    source = _source("strip", number, "row left right text")
+    source = _source("strip", "row left right text")
     has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
     rows = FIGURES.strip if has_ekf2 else FIGURES.strip[2:]
     made = figure(
-        name=f"strip-{number}",
+        name="strip",
         height=28 * len(rows) + 24,
         sizing_mode="stretch_width",
         x_range=time_range,
@@ -285,10 +277,10 @@ def _strip(number: int, data: dict[str, Any], time_range: Range1d) -> Any:
     return made
 
 
-def _map(number: int, tuning: Tuning) -> Any:
+def _map(tuning: Tuning) -> Any:
     """How likely the innovations are over both noises, and where the sliders stand."""
     made = figure(
-        name=f"map-{number}",
+        name="map",
         height=250,
         sizing_mode="stretch_width",
         x_axis_type="log",
@@ -309,9 +301,9 @@ def _map(number: int, tuning: Tuning) -> Any:
             image = np.sqrt(2.0 * np.maximum(tuned.map.drop.T, 0.0)).astype(np.float32)
             draw: Any = made.image  # its colours stand in no signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
-    trail = _source("trail", number, "x y")
-    best = _source("best", number, "x y")
-    point = _source("point", number, "x y")
+    trail = _source("trail", "x y")
+    best = _source("best", "x y")
+    point = _source("point", "x y")
     white: dict[str, Any] = {"line_color": "white"}
     made.line("x", "y", source=trail, line_color=EKF2, line_width=1.2, name="ekf2")
     _dots(made, trail, EKF2, 3, name="ekf2")
@@ -333,10 +325,10 @@ def _outer(values: Array) -> tuple[float, float]:
     return float(values[0]) / half, float(values[-1]) * half - float(values[0]) / half
 
 
-def _plan(number: int) -> Any:
+def _plan() -> Any:
     """The track seen from above; what is chosen on it is the time that all plots show."""
     made = figure(
-        name=f"plan-{number}",
+        name="plan",
         height=250,
         sizing_mode="stretch_width",
         match_aspect=True,
@@ -346,9 +338,9 @@ def _plan(number: int) -> Any:
         x_axis_label="east (m)",
         y_axis_label="north (m)",
     )
-    track = _source("plan", number, "t east north")
-    shown = _source("shown", number, "east north")
-    here = _source("here", number, "east north")
+    track = _source("plan", "t east north")
+    shown = _source("shown", "east north")
+    here = _source("here", "east north")
     made.line("east", "north", source=track, line_color=MEASUREMENT, line_width=1.0)
     _dots(made, track, MEASUREMENT, 3, nonselection_fill_alpha=0.6)
     _dots(made, shown, OURS, 4, name="ours")
@@ -356,10 +348,10 @@ def _plan(number: int) -> Any:
     return made
 
 
-def _step(number: int) -> Any:
+def _step() -> Any:
     """The phase plane: position and velocity with their ellipse of 2σ, and what was measured."""
     made = figure(
-        name=f"step-{number}",
+        name="step",
         height=330,
         sizing_mode="stretch_width",
         x_range=_range(),
@@ -376,9 +368,9 @@ def _step(number: int) -> Any:
     made.add_layout(
         Span(dimension="height", location=0.0, visible=False, name="measurement", line_dash=[2, 2])
     )
-    trail = _source("trail-means", number, "p v")
-    before, now = _source("before", number, "p v"), _source("now", number, "p v")
-    mean = _source("mean", number, "p v")
+    trail = _source("trail-means", "p v")
+    before, now = _source("before", "p v"), _source("now", "p v")
+    mean = _source("mean", "p v")
     made.line("p", "v", source=trail, line_color=MEASUREMENT, line_width=1.0, name="measured")
     made.line("p", "v", source=before, **OURS_LINE | {"line_dash": [6, 3]})
     made.patch("p", "v", source=now, fill_color=OURS, fill_alpha=0.25, **OURS_LINE)

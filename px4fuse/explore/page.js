@@ -11,15 +11,15 @@ const Explore = (async () => {
     return null;
   }
 
-  // ------------------------------------------------------------------ the flights' data
+  // ------------------------------------------------------------------ the flight's data
   const arrays = await Engine.unpack($(`arrays${Practice.suffix}`).textContent, content.packed);
   const take = (places) => places.map((place) => arrays[place]);
-  const flights = content.flights.map((flight, number) => ({
-    ...flight, number,
-    imu: typeof flight.imu === "string" ? flight.imu
-      : { ...flight.imu, time: arrays[flight.imu.time] },
-    plan: typeof flight.plan === "string" ? flight.plan : take(flight.plan),
-    axes: flight.axes.map((axis) => ({
+  const { imu, plan, axes } = content.flight;
+  const flight = {
+    ...content.flight,
+    imu: typeof imu === "string" ? imu : { ...imu, time: arrays[imu.time] },
+    plan: typeof plan === "string" ? plan : take(plan),
+    axes: axes.map((axis) => ({
       ...axis, time: arrays[axis.time], z: arrays[axis.z], bands: take(axis.bands),
       integral: axis.integral === undefined ? null : arrays[axis.integral],
       ekf2: typeof axis.ekf2 === "string" ? axis.ekf2 : {
@@ -30,11 +30,10 @@ const Explore = (async () => {
         p: take(axis.truth.p), v: axis.truth.v === null ? null : take(axis.truth.v),
       },
     })),
-  }));
-  const lone = flights[0];
+  };
   // the truth is for afterwards
   if (Practice.hidden) {
-    for (const axis of lone.axes) {
+    for (const axis of flight.axes) {
       axis.truth = "shown after your answer";
       for (const name of ["truthP", "truthV", "claimed"]) delete axis.ekf2.summary?.[name];
     }
@@ -51,11 +50,11 @@ const Explore = (async () => {
       hint: "added to the stamps" },
   ];
   const TICKS = 600;
-  const settings = { ...lone.settings, axis: lone.main };
+  const settings = { ...flight.settings, axis: flight.main };
   const chosen = { step: null }; // the measurement that is looked at, from 0
   const round = (value, digits) => Number(value.toPrecision(digits));
-  const why = lone.offset.why;
-  const reach = why ? [settings.offset, settings.offset] : [lone.offset.from, lone.offset.to];
+  const why = flight.offset.why;
+  const reach = why ? [settings.offset, settings.offset] : [flight.offset.from, flight.offset.to];
   const limits = (knob) => knob.key === "offset" ? reach : ranges[knob.id];
   const fromSlider = (knob, tick) => {
     if (!knob.log) return Math.round((reach[0] + (reach[1] - reach[0]) * tick / TICKS) * 1e4) / 1e4;
@@ -91,25 +90,24 @@ const Explore = (async () => {
     }
     $("knobs").append(box);
   }
-  const names = lone.axes.map((axis) => axis.name)
-    .filter((name) => flights.every((flight) => flight.axes.some((axis) => axis.name === name)));
+  const names = axes.map((axis) => axis.name);
   for (const name of names) {
     const label = make("label");
     label.append(make("input", undefined, { type: "radio", name: "axis", value: name }), ` ${name}`);
     $("axes").append(label);
   }
   $("axes").addEventListener("change", (event) => set({ axis: event.target.value }));
-  const hasImu = flights.every((flight) => typeof flight.imu !== "string");
+  const hasImu = typeof imu !== "string";
   for (const radio of document.querySelectorAll("[name=input]")) {
     radio.addEventListener("change", () => set({ input: radio.value }));
     if (radio.value === "imu" && !hasImu) {
       radio.disabled = true;
-      $("input-note").textContent = flights.map((f) => f.imu).find((imu) => typeof imu === "string");
+      $("input-note").textContent = imu;
     }
   }
-  const axisOf = (flight) => flight.axes.find((axis) => axis.name === settings.axis);
+  const axisNow = () => flight.axes.find((axis) => axis.name === settings.axis);
   const say = (text) => { $("said").textContent = text; };
-  const mapOf = (flight) => flight.maps[axisOf(flight).map] ?? "not made";
+  const mapNow = () => flight.maps[axisNow().map] ?? "not made";
 
   $("lesson").addEventListener("click", () => {
     const { sigmaA, sigmaZ, dt } = ranges.lesson;
@@ -117,12 +115,12 @@ const Explore = (async () => {
     say("The values of the lesson.");
   });
   $("likely").addEventListener("click", () => {
-    const [sigmaA, sigmaZ] = mapOf(lone).likely;
-    set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: lone.settings.dt });
+    const [sigmaA, sigmaZ] = mapNow().likely;
+    set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: flight.settings.dt });
     say("What makes the innovations of this flight most likely.");
   });
   $("ekf2-r").addEventListener("click", () => {
-    set({ sigmaZ: round(axisOf(lone).ekf2.r, 3) });
+    set({ sigmaZ: round(axisNow().ekf2.r, 3) });
     say("SIGMA_Z is the standard deviation that EKF2 gave the measurements (median).");
   });
 
@@ -243,33 +241,25 @@ const Explore = (async () => {
 
   // ------------------------------------------------------------------ Bokeh
   Bokeh.logger.set_level("off");
-  await Bokeh.embed.embed_items({ page: readDocument() }, [
+  await Bokeh.embed.embed_items({ page: read(`document${Practice.suffix}`) }, [
     { docid: "page", roots: content.places, root_ids: Object.keys(content.places) }]);
   const page = Bokeh.documents[0];
-  function readDocument() {
-    // the places of map, plan and step are made here, since they stand beside words
-    for (const flight of flights) {
-      $("maps").append(make("div", undefined, { id: `map-${flight.number}` }));
-      $("view-step").append(Step.places(flight), Times.places(flight));
-    }
-    return read(`document${Practice.suffix}`);
-  }
   const known = new Map();
   const model = (name) => {
     if (!known.has(name)) known.set(name, page.get_model_by_name(name));
     return known.get(name);
   };
-  const put = (name, flight, columns) => { model(`${name}-source-${flight.number}`).data = columns; };
+  const put = (name, columns) => { model(`${name}-source`).data = columns; };
   /* Into every plot in view that has such a source */
-  const give = (name, flight, columns) => {
+  const give = (name, columns) => {
     for (const plot of seenPlots()) {
-      const source = model(`${plot}:${name}-source-${flight.number}`);
+      const source = model(`${plot}:${name}-source`);
       if (source !== null) source.data = columns;
     }
   };
   const timeRange = model("time");
-  const figures = (flight) => ["position", "velocity", "error", "innovation", "sigma_p", "sigma_v",
-    "nis", "gain", "strip"].map((name) => model(`${name}-${flight.number}`)).filter(Boolean);
+  const figures = ["position", "velocity", "error", "innovation", "sigma_p", "sigma_v",
+    "nis", "gain", "strip"].map(model).filter(Boolean);
 
   /* Rows of columns between two times, the extremes of every column kept where there are many */
   let most = MOST_POINTS;
@@ -301,42 +291,27 @@ const Explore = (async () => {
   const EMPTY = new Float64Array(0);
   const table = (names, columns) => Object.fromEntries(
     names.map((name, i) => [name, columns.length ? columns[i] : EMPTY]));
-  const later = (t, by) => by ? t.map((x) => x - by) : t;
+  const shifted = (t, by) => by ? t.map((x) => x + by) : t;
 
-  /* Heights of the plots; two flights have the same, so that they can be compared */
-  const heights = new Map();
+  /* Set the vertical range of a plot in view */
   function frame(name, ends, log = false) {
-    if (!isSeen(name)) return;
-    const [low, high] = ends();
-    const known = heights.get(name) ?? [Infinity, -Infinity, log];
-    heights.set(name, [Math.min(known[0], low), Math.max(known[1], high), log]);
-  }
-  function setHeights() {
-    for (const [name, [least, most, log]] of heights) {
-      let [low, high] = [least, most];
-      if (!(high > low)) [low, high] = Number.isFinite(low) ? [0.9 * low - 0.1, 1.1 * low + 0.1] : [0.1, 1];
-      const edge = log ? 1.15 : 0.06 * (high - low);
-      for (const { number } of flights) {
-        const range = model(`${name}-${number}`)?.y_range;
-        if (range) [range.start, range.end] = log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
-      }
-    }
-    heights.clear();
-    for (const flight of flights) marks(flight);
+    const range = isSeen(name) ? model(name)?.y_range : undefined;
+    if (!range) return;
+    let [low, high] = ends();
+    if (!(high > low)) [low, high] = Number.isFinite(low) ? [0.9 * low - 0.1, 1.1 * low + 0.1] : [0.1, 1];
+    const edge = log ? 1.15 : 0.06 * (high - low);
+    [range.start, range.end] = log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
   }
   /* Arrow heads at the edge where something lies beyond it */
-  const latest = [];
-  function marks(flight) {
-    const drawn = latest[flight.number];
-    if (drawn === undefined) return;
+  function marks(drawn) {
     const rows = (...parts) => parts.flatMap(([part, column]) => part === undefined ? []
       : Array.from(part.t, (t, i) => [t, part[column][i]]));
     for (const [plot, name, points] of [["position", "beyond", rows([drawn.measured, "z"])],
       ["innovation", "beyond", rows([drawn.updates, "nu"])],
       ["innovation", "beyond_ekf2", rows([drawn.fused, "nu"], [drawn.rejected, "nu"])]]) {
-      const source = isSeen(plot) ? model(`${plot}:${name}-source-${flight.number}`) : null;
+      const source = isSeen(plot) ? model(`${plot}:${name}-source`) : null;
       if (source === null) continue;
-      const { start: low, end: high } = model(`${plot}-${flight.number}`).y_range, inside = 0.035 * (high - low);
+      const { start: low, end: high } = model(plot).y_range, inside = 0.035 * (high - low);
       const out = points.filter(([, y]) => y < low || y > high);
       source.data = { t: out.map(([t]) => t), y: out.map(([, y]) => y > high ? high - inside : low + inside),
         turn: out.map(([, y]) => y > high ? 0 : Math.PI) };
@@ -356,11 +331,11 @@ const Explore = (async () => {
   };
 
   // ------------------------------------------------------------------ a replay and its numbers
-  const runs = [];
-  function replayed(flight, quick) {
-    const axis = axisOf(flight), run = Engine.replay(flight, axis, settings);
-    if (run === null) return { run, axis, numbers: null };
-    return { run, axis, numbers: numbers(axis, run, quick) };
+  // of the settings now; run and numbers are null with too few measurements
+  const result = { run: null, axis: null, numbers: null };
+  function replay(quick) {
+    const axis = axisNow(), run = Engine.replay(flight, axis, settings);
+    Object.assign(result, { run, axis, numbers: run && numbers(axis, run, quick) });
   }
   /* What the filter's innovations say of it; unless quick, how far off it is too */
   function numbers(axis, run, quick = false) {
@@ -396,19 +371,14 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ the needle and the words
   const DECADES = [-1.3, 1.3]; // of the mean NIS that the scale shows
   const place = (nis) => Math.min(Math.max((Math.log10(nis) - DECADES[0]) / (DECADES[1] - DECADES[0]), 0), 1);
-  for (const flight of flights) {
-    const scale = make("div", undefined, { className: "needle", id: `needle-${flight.number}` });
-    scale.setAttribute("role", "img");
-    for (const name of ["band", "hand ekf2", "hand ours"]) scale.append(make("span", undefined, { className: name }));
-    for (const nis of [0.1, 0.3, 1, 3, 10]) {
-      const tick = make("small", String(nis));
-      tick.style.left = `${100 * place(nis)}%`;
-      scale.append(tick);
-    }
-    $("needles").append(scale);
+  for (const name of ["band", "hand ekf2", "hand ours"]) $("needle").append(make("span", undefined, { className: name }));
+  for (const nis of [0.1, 0.3, 1, 3, 10]) {
+    const tick = make("small", String(nis));
+    tick.style.left = `${100 * place(nis)}%`;
+    $("needle").append(tick);
   }
-  function drawNeedle(flight, axis, ours) {
-    const [band, theirs, own] = $(`needle-${flight.number}`).children, ekf2 = ekf2Of(axis);
+  function drawNeedle({ axis, numbers: ours }) {
+    const [band, theirs, own] = $("needle").children, ekf2 = ekf2Of(axis);
     for (const [hand, one] of [[own, ours], [theirs, ekf2]]) {
       hand.hidden = one?.nis === undefined;
       if (!hand.hidden) hand.style.left = `${100 * place(one.nis)}%`;
@@ -421,34 +391,27 @@ const Explore = (async () => {
     const said = [["ours", ours], ["EKF2", ekf2]].filter(([, one]) => one?.nis !== undefined)
       .map(([who, one]) => `${who} ${Story.numberWords(one.nis, 2)} (${Story.verdict(one)})`);
     const words = `mean NIS: ${said.join(", ") || "not known"}`;
-    $(`needle-${flight.number}`).ariaLabel = words;
-    const shown = flights.length > 1 ? `${flight.log}: ${words}` : words;
-    const line = $(`read-${flight.number}`) ?? make("p", "", { id: `read-${flight.number}`, className: "nis" });
-    line.textContent = shown;
-    if (!line.isConnected) $("needles").append(line);
+    $("needle").ariaLabel = $("read").textContent = words;
   }
-  const tried = (flight, axis) => (changes) => {
+  const tried = (axis) => (changes) => {
     const run = Engine.replay(flight, axis, { ...settings, ...changes });
     return run && numbers(axis, run, true);
   };
-  function tell() {
-    const sentences = flights.map((flight) => {
-      const { axis, numbers: ours } = runs[flight.number], found = mapOf(flight), { likely } = flight.offset;
-      const [sigmaA, sigmaZ] = typeof found === "string" ? [null, null] : found.likely;
-      const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["a clock offset of", "offset", likely]]
-        .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
-        .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
-      const words = Story.sentence(axis, ours, ekf2Of(axis))
-        + (Practice.hidden || flight.drifts ? "" : Story.cure(ours, candidates, tried(flight, axis)));
-      for (const line of document.querySelectorAll(`#now-said-${flight.number}`)) {
-        line.textContent = moved(flight) ? `The knobs stand elsewhere now: ${words}` : "";
-        line.parentElement.classList.toggle("stale", moved(flight));
-      }
-      return flights.length > 1 ? `${flight.log}: ${words}` : words;
-    });
-    if ($("live").textContent !== sentences.join(" ")) $("live").textContent = sentences.join(" ");
+  function tell({ axis, numbers: ours }) {
+    const found = mapNow(), { likely } = flight.offset;
+    const [sigmaA, sigmaZ] = typeof found === "string" ? [null, null] : found.likely;
+    const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["a clock offset of", "offset", likely]]
+      .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
+      .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
+    const words = Story.sentence(axis, ours, ekf2Of(axis))
+      + (Practice.hidden || flight.drifts ? "" : Story.cure(ours, candidates, tried(axis)));
+    for (const line of document.querySelectorAll(".now-said")) {
+      line.textContent = moved() ? `The knobs stand elsewhere now: ${words}` : "";
+      line.parentElement.classList.toggle("stale", moved());
+    }
+    if ($("live").textContent !== words) $("live").textContent = words;
   }
-  const moved = (flight) => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
+  const moved = () => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
   const ROWS = [
     ["Mean NIS (1 is consistent)", (x) => x.nis?.toFixed(2)],
     ["95 % band of it", (x) => x.band && `${x.band[0].toFixed(2)}–${x.band[1].toFixed(2)}`],
@@ -462,24 +425,15 @@ const Explore = (async () => {
     ["Position: RMS to truth", (x) => x.truthP?.toFixed(3).concat(" m")],
     ["Velocity: RMS to truth", (x) => x.truthV?.toFixed(3).concat(" m/s")],
   ];
-  function drawTable(flight, axis, ours) {
+  const body = $("table").tBodies[0];
+  for (const [title] of ROWS) {
+    body.insertRow().append(make("th", title, { scope: "row" }), make("td", "", { className: "ours" }),
+      make("td", "", { className: "ekf2" }));
+  }
+  function drawTable({ axis, numbers: ours }) {
     const ekf2 = ekf2Of(axis);
-    let own = $(`table-${flight.number}`);
-    if (own === null) {
-      own = make("table", undefined, { id: `table-${flight.number}` });
-      if (flights.length > 1) own.append(make("caption", flight.log));
-      const head = own.createTHead().insertRow();
-      for (const name of ["number", "ours", "EKF2"]) head.append(make("th", name, { scope: "col" }));
-      const body = own.createTBody();
-      for (const [title] of ROWS) {
-        const row = body.insertRow();
-        row.append(make("th", title, { scope: "row" }), make("td", "", { className: "ours" }),
-          make("td", "", { className: "ekf2" }));
-      }
-      $("tables").append(own, make("p", "", { className: "note", id: `why-${flight.number}` }));
-    }
     ROWS.forEach(([, words], i) => {
-      const row = own.tBodies[0].rows[i], left = ours && words(ours), right = words(ekf2);
+      const row = body.rows[i], left = ours && words(ours), right = words(ekf2);
       row.cells[1].textContent = left ?? "–";
       row.cells[2].textContent = right ?? "–";
       row.hidden = (left ?? right) === undefined && i > 5;
@@ -488,36 +442,36 @@ const Explore = (async () => {
     if (ours === null) missing.push("Ours: too few measurements are left in the analysed part.");
     if (ekf2.why) missing.push(`EKF2: ${ekf2.why}.`);
     if (typeof axis.truth === "string") missing.push(`Truth: ${axis.truth}.`);
-    $(`why-${flight.number}`).textContent = missing.join(" ");
+    $("why").textContent = missing.join(" ");
   }
 
   // ------------------------------------------------------------------ plots against time
-  function drawOurs(flight, { run, axis }) {
-    const shift = flight.shift, { steps, updates } = run;
+  function drawOurs({ run, axis }) {
+    const { steps, updates } = run;
     const n = steps.time.length, m = updates.nu.length, size = n + m;
     const saw = table(["t", "p", "v", "sp", "sv"], Array.from({ length: 5 }, () => new Float64Array(size)));
     for (let i = 0, k = 0, u = 0; i < n; i++) {
       if (u < m && updates.step[u] === i) { // just before the update, then just after it
-        saw.t[k] = steps.time[i] - shift; saw.p[k] = updates.p[u]; saw.v[k] = updates.v[u];
+        saw.t[k] = steps.time[i]; saw.p[k] = updates.p[u]; saw.v[k] = updates.v[u];
         saw.sp[k] = Math.sqrt(updates.p00[u]); saw.sv[k++] = Math.sqrt(updates.p11[u++]);
       }
-      saw.t[k] = steps.time[i] - shift; saw.p[k] = steps.p[i]; saw.v[k] = steps.v[i];
+      saw.t[k] = steps.time[i]; saw.p[k] = steps.p[i]; saw.v[k] = steps.v[i];
       saw.sp[k] = Math.sqrt(steps.p00[i]); saw.sv[k++] = Math.sqrt(steps.p11[i]);
     }
-    const rows = { t: updates.time.map((t) => t - shift), nu: updates.nu,
+    const rows = { t: updates.time, nu: updates.nu,
       plus: updates.s.map((s) => 2 * Math.sqrt(s)), minus: updates.s.map((s) => -2 * Math.sqrt(s)),
       k0: updates.k0, k1: updates.k1, running: running(updates.nu, updates.s) };
     const seen = { steps: thin(saw, ["p", "sp"]), updates: thin(rows, ["nu", "plus"]) };
-    give("steps", flight, seen.steps);
-    give("updates", flight, seen.updates);
+    give("steps", seen.steps);
+    give("updates", seen.updates);
     if (isSeen("position")) {
-      seen.measured = thin({ t: later(axis.time, shift - settings.offset), z: axis.z }, ["z"]);
-      give("measured", flight, seen.measured);
+      seen.measured = thin({ t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
+      give("measured", seen.measured);
     }
     if (isSeen("error") && typeof axis.truth !== "string") {
       const known = Engine.interp(steps.time, ...axis.truth.p, NaN);
-      seen.error = thin({ t: later(steps.time, shift), e: steps.p.map((p, i) => p - known[i]) }, ["e"]);
-      give("error", flight, seen.error);
+      seen.error = thin({ t: steps.time, e: steps.p.map((p, i) => p - known[i]) }, ["e"]);
+      give("error", seen.error);
     }
     return seen;
   }
@@ -531,16 +485,14 @@ const Explore = (async () => {
     return out;
   }
   /* EKF2, truth: only an axis or a zoom changes them */
-  function drawOthers(flight, axis) {
-    const shift = flight.shift, seen = {};
-    const take = (name, columns, keys) => { seen[name] = thin(columns, keys); give(name, flight, seen[name]); };
+  function drawOthers(axis) {
+    const seen = {};
+    const take = (name, columns, keys) => { seen[name] = thin(columns, keys); give(name, seen[name]); };
     if (typeof axis.ekf2 !== "string") {
       const { state, variance, innovations } = axis.ekf2;
-      const own = table(["t", "p", "v"], state);
-      take("state", { t: later(own.t, shift), p: own.p, v: own.v }, ["p", "v"]);
-      const sigma = table(["t", "sp", "sv"], variance);
-      take("variance", { t: later(sigma.t, shift), sp: sigma.sp, sv: sigma.sv }, ["sp", "sv"]);
-      const rows = table(["t", "nu", "sigma", "rejected"], innovations), t = later(rows.t, shift);
+      take("state", table(["t", "p", "v"], state), ["p", "v"]);
+      take("variance", table(["t", "sp", "sv"], variance), ["sp", "sv"]);
+      const rows = table(["t", "nu", "sigma", "rejected"], innovations), { t } = rows;
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
         const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
         take(name, { t: Float64Array.from(which, (i) => t[i]),
@@ -551,20 +503,19 @@ const Explore = (async () => {
     }
     if (typeof axis.truth !== "string") {
       const { p, v } = axis.truth;
-      take("truth_p", { t: later(p[0], shift), p: p[1] }, ["p"]);
-      if (v !== null) take("truth_v", { t: later(v[0], shift), v: v[1] }, ["v"]);
+      take("truth_p", { t: p[0], p: p[1] }, ["p"]);
+      if (v !== null) take("truth_v", { t: v[0], v: v[1] }, ["v"]);
       if (typeof axis.ekf2 !== "string") {
         const [time, own] = axis.ekf2.state;
         const known = Engine.interp(time, ...p, NaN);
-        take("error_ekf2", { t: later(time, shift), e: own.map((x, i) => x - known[i]) }, ["e"]);
+        take("error_ekf2", { t: time, e: own.map((x, i) => x - known[i]) }, ["e"]);
       }
     }
     return seen;
   }
-  function frames(flight, ours, others) {
+  function frames(ours, others) {
     const of = (part, column) => part?.[column] ?? EMPTY;
     const { steps, updates } = ours;
-    latest[flight.number] = { ...others, ...ours };
     frame("position", () => extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
     frame("velocity", () => extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
     frame("error", () => extent(of(ours.error, "e"), of(others.error_ekf2, "e")));
@@ -580,40 +531,41 @@ const Explore = (async () => {
     frame("sigma_v", () => extent(steps.sv, of(others.variance, "sv")), true);
     frame("nis", () => extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
     frame("gain", () => extent(updates.k0, updates.k1, [0]));
+    marks({ ...others, ...ours });
   }
 
   // ------------------------------------------------------------------ the map of both noises
-  const trails = flights.map(() => ({ x: [], y: [] }));
-  const mapShown = flights.map(() => null);
-  function drawMap(flight) {
-    const found = mapOf(flight), number = flight.number, plot = model(`map-${number}`);
+  const trail = { x: [], y: [] };
+  let mapShown = null;
+  function drawMap() {
+    const found = mapNow(), plot = model("map");
     const known = typeof found !== "string";
-    $(`map-${number}`).hidden = !known;
+    $("map").hidden = !known;
     if (!known) return;
-    const trail = trails[number], last = trail.x.length - 1;
+    const last = trail.x.length - 1;
     if (trail.x[last] !== settings.sigmaA || trail.y[last] !== settings.sigmaZ) {
       trail.x.push(settings.sigmaA);
       trail.y.push(settings.sigmaZ);
       if (trail.x.length > 200) { trail.x.shift(); trail.y.shift(); }
     }
-    const [[a0, a1], [z0, z1]] = [found.sigmaA, found.sigmaZ], name = axisOf(flight).map;
-    if (mapShown[number] !== name) {
-      mapShown[number] = name;
+    const [[a0, a1], [z0, z1]] = [found.sigmaA, found.sigmaZ], name = axisNow().map;
+    if (mapShown !== name) {
+      mapShown = name;
       for (const one of plot.renderers) {
         if (one.name?.startsWith("map:")) one.visible = one.name === `map:${name}`;
       }
       const likely = found.likely.every((x) => x !== null);
-      put("best", flight, likely ? { x: [found.likely[0]], y: [found.likely[1]] } : { x: [], y: [] });
+      put("best", likely ? { x: [found.likely[0]], y: [found.likely[1]] } : { x: [], y: [] });
     }
-    put("trail", flight, { x: [...trail.x], y: [...trail.y] });
-    put("point", flight, { x: [settings.sigmaA], y: [settings.sigmaZ] });
+    put("trail", { x: [...trail.x], y: [...trail.y] });
+    put("point", { x: [settings.sigmaA], y: [settings.sigmaZ] });
     [plot.x_range.start, plot.x_range.end] = [Math.min(a0, settings.sigmaA / 1.3), Math.max(a1, settings.sigmaA * 1.3)];
     [plot.y_range.start, plot.y_range.end] = [Math.min(z0, settings.sigmaZ / 1.3), Math.max(z1, settings.sigmaZ * 1.3)];
   }
   function mapWords() {
-    const found = mapOf(lone), made = lone.settings;
+    const found = mapNow(), made = flight.settings;
     if (typeof found === "string") return `Not known: ${found}.`;
-    const axis = axisOf(lone).map === "horizontal" ? "north and east together" : `axis ${axisOf(lone).map}`;
+    const axis = axisNow().map === "horizontal" ? "north and east together" : `axis ${axisNow().map}`;
     const other = made.dt !== settings.dt || made.offset !== settings.offset || made.input !== settings.input;
     return `Of ${axis}, from ${found.count} measurements, at DT ${made.dt} s, input ${made.input}, clock `
       + `offset ${round(made.offset, 4)} s. Dark is likely, the cross is the best, each shade half a standard `
@@ -622,30 +574,20 @@ const Explore = (async () => {
 
   // ------------------------------------------------------------------ the command
   const quoted = (x) => String(round(x, 12));
-  function command(flight) {
+  function command() {
     const { bare, held, input, found } = flight.command, lesson = ranges.lesson;
-    const moved = settings.offset !== flight.settings.offset;
-    const words = [moved ? held : bare];
+    const words = [settings.offset !== flight.settings.offset ? held : bare];
     for (const knob of KNOBS) {
       const usual = knob.key === "offset" ? 0 : lesson[knob.key];
-      if (knob.key === "offset" && flight.offset.why) continue;
+      if (knob.key === "offset" && why) continue;
       if (settings[knob.key] !== usual) words.push(`--${knob.id} ${quoted(settings[knob.key])}`);
     }
     if (settings.input !== found || input !== null) words.push(`--input ${settings.input}`);
     return words.join(" ");
   }
-  for (const flight of flights) {
-    const code = make("code", "", { className: "command", id: `command-${flight.number}` });
-    const button = make("button", "Copy", { type: "button", id: `copy-${flight.number}` });
-    const done = make("span", "", { className: "note" });
-    done.setAttribute("role", "status");
-    button.addEventListener("click", async () => {
-      done.textContent = await copied(code) ? " copied" : " marked: press Ctrl+C";
-    });
-    const line = make("p", undefined, { className: "buttons" });
-    line.append(button, done);
-    $("commands").append(code, line);
-  }
+  $("copy").addEventListener("click", async () => {
+    $("copy-note").textContent = await copied($("command")) ? " copied" : " marked: press Ctrl+C";
+  });
   async function copied(node) {
     try {
       await navigator.clipboard.writeText(node.textContent);
@@ -658,7 +600,7 @@ const Explore = (async () => {
 
   // ------------------------------------------------------------------ all of it
   let axisShown = null;
-  const others = [];
+  let others = null;
   /* Replay and draw what is in view; quick leaves out what is only read, until a drag has ended */
   function show(quick = false) {
     most = quick ? FEW_POINTS : MOST_POINTS;
@@ -669,60 +611,49 @@ const Explore = (async () => {
     }
     const another = axisShown !== settings.axis;
     axisShown = settings.axis;
-    for (const flight of flights) {
-      const done = runs[flight.number] = replayed(flight, quick);
-      if (another) others[flight.number] = drawOthers(flight, done.axis);
-      if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
-      drawNeedle(flight, done.axis, done.numbers);
-      if (isSeen("map")) drawMap(flight);
-    }
-    setHeights();
+    replay(quick);
+    if (another) others = drawOthers(result.axis);
+    if (result.run) frames(drawOurs(result), others);
+    drawNeedle(result);
+    if (isSeen("map")) drawMap();
     if (quick) return;
     clearTimeout(rest);
     for (const name of ["axis", "input"]) {
       for (const radio of document.querySelectorAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
     }
-    const axis = axisOf(lone), found = mapOf(lone);
+    const { axis } = result, found = mapNow();
     $("axis-note").textContent = [axis.heading === null ? "" : `heading ${axis.heading.toFixed(1)}°`, axis.note]
       .filter(Boolean).join(", ");
     $("likely").disabled = typeof found === "string" || found.likely.includes(null);
     $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
     $("map-note").textContent = mapWords();
-    for (const flight of flights) {
-      const done = runs[flight.number];
-      drawTable(flight, done.axis, done.numbers);
-      $(`command-${flight.number}`).textContent = command(flight);
-      if (another) times.strip(flight, done.axis);
-      times.plan(flight);
-    }
+    drawTable(result);
+    $("command").textContent = command();
+    if (another) times.strip(axis);
+    times.plan();
     stepper.draw();
-    tell();
+    tell(result);
     toAddress();
   }
   /* After a zoom: the same replay, other rows of it */
   function look() {
-    for (const flight of flights) {
-      const done = runs[flight.number];
-      if (!done) continue;
-      others[flight.number] = drawOthers(flight, done.axis);
-      if (done.run) frames(flight, drawOurs(flight, done), others[flight.number]);
-      times.plan(flight);
-    }
-    setHeights();
+    others = drawOthers(result.axis);
+    if (result.run) frames(drawOurs(result), others);
+    times.plan();
   }
 
-  const stepper = Step.start({ flights, settings, chosen, runs, model, put, figures, isSeen,
+  const stepper = Step.start({ settings, chosen, result, model, put, figures, isSeen,
     moved: (time) => { times.show(time); toAddress(); } });
   const keys = { n: () => stepper.go((chosen.step ?? -1) + 1), p: () => stepper.go((chosen.step ?? 1) - 1),
     " ": () => { open("step"); stepper.play(); }, s: () => stepper.faster(-1), f: () => stepper.faster(1) };
-  const times = Times.start({ flights, settings, model, put, timeRange, figures, look, later, isSeen, keys, open });
+  const times = Times.start({ flight, settings, model, put, timeRange, figures, look, shifted, isSeen, keys, open });
   tabs();
   addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
   open(view, false);
   fromAddress();
   show();
-  const shared = { recorded: times.recorded, look: times.view, settings, set, show, open, runs, flights, model,
-    numbers, timeRange, chosen, stepper, axisOf, mapOf, ekf2Of, view: () => view };
+  const shared = { recorded: times.recorded, look: times.view, settings, set, show, open, result, flight, model,
+    numbers, timeRange, chosen, stepper, axisNow, mapNow, ekf2Of, view: () => view };
   Tour.start(shared);
   Practice.start(shared);
   return shared;

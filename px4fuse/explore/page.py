@@ -1,6 +1,6 @@
-"""The page as one file: Bokeh, the flights' data, the engine and what moves them."""
+"""The page as one file: Bokeh, the flight's data, the engine and what moves them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -18,13 +18,13 @@ SCRIPTS = ("dom", "story", "step", "times", "tour")
 HERE = "px4fuse.explore"
 
 
-def html_text(analyses: Sequence[Analysis]) -> str:
+def html_text(analysis: Analysis) -> str:
     """Lay out the page.
 
     Parameters
     ----------
-    analyses : sequence of Analysis
-        One, or two to be shown side by side; each made from a request.
+    analysis : Analysis
+        Made from a request.
 
     Returns
     -------
@@ -32,33 +32,31 @@ def html_text(analyses: Sequence[Analysis]) -> str:
         Write it as UTF-8.
     """
     packer = Packer()
-    data = [flight_data(one, packer, beside=len(analyses) > 1) for one in analyses]
+    data = flight_data(analysis, packer)
     return page_text(
-        data_scripts(data, analyses, packer),
+        data_scripts(data, analysis, packer),
         data,
         command="explore",
         heading="Turn the knobs and watch",
-        title=" and ".join(one["log"] for one in data),
+        title=data["log"],
     )
 
 
-def data_scripts(
-    data: list[dict[str, Any]], analyses: Sequence[Analysis], packer: Packer, suffix: str = ""
-) -> str:
-    """What the page reads of some flights, as elements that run nothing.
+def data_scripts(data: dict[str, Any], analysis: Analysis, packer: Packer, suffix: str = "") -> str:
+    """Return the elements with the data of one flight; none of them is run.
 
     Parameters
     ----------
-    data : list of dict
+    data : dict
         From :func:`px4fuse.explore.data.flight_data`.
-    analyses : sequence of Analysis
+    analysis : Analysis
     packer : Packer
         That the data were made with.
     suffix : str
         Of the elements' ids, where a page has several such sets.
     """
-    document, places = document_json(data, [analysis.tuning for analysis in analyses])
-    content = {"flights": data, "ranges": ranges(), "packed": packer.specs, "places": places}
+    document, places = document_json(data, analysis.tuning)
+    content = {"flight": data, "ranges": ranges(), "packed": packer.specs, "places": places}
     return "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
@@ -71,7 +69,7 @@ def data_scripts(
 
 def page_text(
     scripts: str,
-    data: list[dict[str, Any]],
+    data: dict[str, Any],
     *,
     command: str,
     heading: str,
@@ -84,8 +82,8 @@ def page_text(
     Parameters
     ----------
     scripts : str
-    data : list of dict
-        The flights that stand side by side.
+    data : dict
+        A flight of the page; all have ground truth, or none has.
     command, heading, title : str
     rounds : int
         How many flights are asked about.
@@ -112,8 +110,5 @@ def page_text(
         rounds=rounds,
         choices=choices,
         panels=FIGURES.panels.items(),
-        flights=[
-            (one["log"], any(isinstance(axis["truth"], dict) for axis in one["axes"]))
-            for one in data
-        ],
+        has_truth=any(isinstance(axis["truth"], dict) for axis in data["axes"]),
     )

@@ -5,33 +5,6 @@ const Step = (() => {
   const TRAIL = 60; // means that the trail keeps
   const PACES_MS = [1600, 800, 400, 200, 100, 50];
 
-  /* Where the phase plane and its words stand */
-  function places(flight) {
-    const n = flight.number, box = make("section", undefined, { className: "card step" });
-    box.append(make("h2", "Step by step"));
-    if (flight.number > 0) box.append(make("p", flight.log, { className: "note", dir: "auto" }));
-    const buttons = make("div", undefined, { className: "buttons" });
-    for (const [id, text, title] of [["first", "first", "First measurement"],
-      ["previous", "◀", "Previous measurement"], ["play", "Play", ""], ["next", "▶", "Next measurement"],
-      ["last", "last", "Last measurement"], ["slower", "slower", ""], ["faster", "faster", ""]]) {
-      const button = make("button", text, { type: "button", id: `${id}-${n}` });
-      if (title) button.ariaLabel = button.title = title;
-      buttons.append(button);
-    }
-    const slider = make("input", undefined, { type: "range", id: `cursor-${n}`, min: 0, value: 0,
-      ariaLabel: "Measurement" });
-    const words = make("div", undefined, { className: "equations" });
-    words.append(make("p", "", { id: `now-${n}`, role: "status" }), make("div", undefined, { id: `numbers-${n}` }));
-    const picture = make("div");
-    picture.append(make("div", undefined, { id: `step-${n}` }),
-      make("p", "Filled: the ellipse of 2σ now. Dashed: before this step. Grey band: z ± 2 SIGMA_Z.",
-        { className: "note" }));
-    const both = make("div", undefined, { className: "two" });
-    both.append(picture, words);
-    box.append(buttons, slider, both);
-    return box;
-  }
-
   /* Points of the ellipse of 2σ, by the Cholesky factor of P */
   function ellipse([p, v, p00, p01, p11]) {
     const a = Math.sqrt(p00), b = p01 / a, c = Math.sqrt(Math.max(p11 - b * b, 0));
@@ -98,112 +71,97 @@ const Step = (() => {
   }
 
   function start(page) {
-    const { flights, settings, chosen, runs, model, put, figures, isSeen, moved } = page;
-    const lists = flights.map(() => ({ run: null, list: [] }));
-    const listOf = (number) => {
-      const run = runs[number]?.run ?? null;
-      if (lists[number].run !== run) lists[number] = { run, list: run === null ? [] : moments(run) };
-      return lists[number].list;
+    const { settings, chosen, result, model, put, figures, isSeen, moved } = page;
+    let cached = { run: null, list: [] };
+    const listNow = () => {
+      const { run } = result;
+      if (cached.run !== run) cached = { run, list: run === null ? [] : moments(run) };
+      return cached.list;
     };
-    let moment = null, playing = null, pace = 2; // place in the first flight's list
+    let moment = null, playing = null, pace = 2; // place in the list
 
     /* To a measurement, counted from 0: just after its update */
     function go(measurement) {
-      const list = listOf(0);
+      const list = listNow();
       if (!list.length) return;
-      const last = runs[0].run.updates.nu.length - 1;
+      const last = result.run.updates.nu.length - 1;
       chosen.step = Math.min(Math.max(measurement, 0), last);
       moment = list.findIndex((one) => one.u === chosen.step && one.updated);
       draw();
-      moved(runs[0].run.updates.time[chosen.step]);
+      moved(result.run.updates.time[chosen.step]);
     }
     function advance() {
-      const list = listOf(0);
+      const list = listNow();
       moment = Math.min((moment ?? 0) + 1, list.length - 1);
       for (let at = moment; at >= 0; at--) if (list[at].u >= 0) { chosen.step = list[at].u; break; }
       draw();
-      moved(runs[0].run.steps.time[list[moment].i]);
+      moved(result.run.steps.time[list[moment].i]);
       if (moment === list.length - 1) pause();
     }
     function pause() {
       clearInterval(playing);
       playing = null;
-      for (const { number } of flights) {
-        $(`play-${number}`).textContent = "Play";
-        $(`now-${number}`).ariaLive = "polite";
-      }
+      $("play").textContent = "Play";
+      $("now").ariaLive = "polite";
     }
     function play() {
       if (playing !== null) return pause();
-      const list = listOf(0);
+      const list = listNow();
       if (!list.length) return;
       if (moment === null || moment >= list.length - 1) moment = 0;
       playing = setInterval(advance, PACES_MS[pace]);
-      for (const { number } of flights) {
-        $(`play-${number}`).textContent = "Pause";
-        $(`now-${number}`).ariaLive = "off"; // nobody can listen that fast
-      }
+      $("play").textContent = "Pause";
+      $("now").ariaLive = "off"; // nobody can listen that fast
     }
     function faster(by) {
       pace = Math.min(Math.max(pace + by, 0), PACES_MS.length - 1);
       if (playing !== null) { clearInterval(playing); playing = setInterval(advance, PACES_MS[pace]); }
-      for (const { number: n } of flights) {
-        $(`slower-${n}`).disabled = pace === 0;
-        $(`faster-${n}`).disabled = pace === PACES_MS.length - 1;
-      }
+      $("slower").disabled = pace === 0;
+      $("faster").disabled = pace === PACES_MS.length - 1;
     }
 
-    /* The moment of another flight that is nearest in measurements */
-    function momentOf(number) {
-      const list = listOf(number);
-      if (number === 0) return list[Math.min(moment, list.length - 1)];
-      return list.findLast((one) => one.updated && one.u <= chosen.step) ?? list[list.length - 1];
-    }
     function draw() {
+      const { run } = result;
       if (moment === null && chosen.step !== null) {
-        const wanted = Math.min(chosen.step, (runs[0]?.run?.updates.nu.length ?? 1) - 1);
-        moment = listOf(0).findIndex((one) => one.u === wanted && one.updated);
+        const wanted = Math.min(chosen.step, (run?.updates.nu.length ?? 1) - 1);
+        moment = listNow().findIndex((one) => one.u === wanted && one.updated);
         if (moment < 0) moment = null;
       }
-      for (const flight of flights) drawOne(flight);
-    }
-    function drawOne(flight) {
-      const n = flight.number, run = runs[n]?.run ?? null, known = run !== null && moment !== null;
-      const lines = figures(flight).flatMap((plot) => plot.center).filter((one) => one.name === "cursor");
+      const known = run !== null && moment !== null;
+      const lines = figures.flatMap((plot) => plot.center).filter((one) => one.name === "cursor");
       for (const line of lines) line.visible = known;
-      for (const id of ["first", "previous", "next", "last", "play"]) $(`${id}-${n}`).disabled = run === null;
-      if (run !== null) $(`cursor-${n}`).max = run.updates.nu.length - 1;
+      for (const id of ["first", "previous", "next", "last", "play"]) $(id).disabled = run === null;
+      if (run !== null) $("cursor").max = run.updates.nu.length - 1;
       if (!known) {
-        $(`now-${n}`).textContent = "Choose a measurement: press n, or the buttons.";
+        $("now").textContent = "Choose a measurement: press n, or the buttons.";
         return;
       }
-      const one = momentOf(n), t = run.steps.time[one.i] - flight.shift;
+      const list = listNow(), one = list[Math.min(moment, list.length - 1)], t = run.steps.time[one.i];
       for (const line of lines) line.location = t;
-      const count = run.updates.nu.length, slider = $(`cursor-${n}`);
+      const count = run.updates.nu.length, slider = $("cursor");
       slider.value = chosen.step;
       slider.ariaValueText = `Measurement ${chosen.step + 1} of ${count}`;
-      $(`now-${n}`).textContent = one.u >= 0 ? `Measurement ${one.u + 1} of ${count}, at ${t.toFixed(3)} s`
+      $("now").textContent = one.u >= 0 ? `Measurement ${one.u + 1} of ${count}, at ${t.toFixed(3)} s`
         + (one.updated ? "" : ": predicted, not yet updated") : `Predicted to ${t.toFixed(3)} s`;
       if (!isSeen("step")) return;
-      drawPlane(flight, run, one);
-      if (one.i === 0) return $(`numbers-${n}`).replaceChildren(make("p", "The filter begins here."));
+      drawPlane(run, one);
+      if (one.i === 0) return $("numbers").replaceChildren(make("p", "The filter begins here."));
       const table = make("table");
       for (const [head, text, update] of equations(run, settings, one)) {
         const row = table.insertRow();
         row.append(make("th", head, { scope: "row" }), make("td", text));
         row.className = update === one.updated ? "now" : "";
       }
-      $(`numbers-${n}`).replaceChildren(table);
+      $("numbers").replaceChildren(table);
     }
-    function drawPlane(flight, run, one) {
-      const n = flight.number, plot = model(`step-${n}`), now = state(run, one);
+    function drawPlane(run, one) {
+      const plot = model("step"), now = state(run, one);
       const previous = one.updated ? state(run, { ...one, updated: false }) : after(run, Math.max(one.i - 1, 0));
-      const shapes = { now: ellipse(now), before: ellipse(previous) };
-      put("now", flight, shapes.now);
-      put("before", flight, shapes.before);
-      put("mean", flight, { p: [now[0]], v: [now[1]] });
+      put("now", ellipse(now));
+      put("before", ellipse(previous));
+      put("mean", { p: [now[0]], v: [now[1]] });
       const from = Math.max(one.i - TRAIL, 0);
-      put("trail-means", flight, { p: run.steps.p.subarray(from, one.i), v: run.steps.v.subarray(from, one.i) });
+      put("trail-means", { p: run.steps.p.subarray(from, one.i), v: run.steps.v.subarray(from, one.i) });
       const measured = one.u >= 0, z = measured ? run.updates.z[one.u] : 0;
       const band = plot.center.find((part) => part.name === "band");
       const line = plot.center.find((part) => part.name === "measurement");
@@ -213,35 +171,30 @@ const Step = (() => {
         line.location = z;
       }
       // as large at every moment, so that what grows is the ellipse: the widest prior of the run
-      const { reach } = reachOf(n, run);
+      const reach = reachOf(run);
       [plot.x_range.start, plot.x_range.end] = [now[0] - reach[0], now[0] + reach[0]];
       [plot.y_range.start, plot.y_range.end] = [now[1] - reach[1], now[1] + reach[1]];
     }
-    const reaches = flights.map(() => ({ run: null, reach: [1, 1] }));
-    function reachOf(n, run) {
-      if (reaches[n].run === run) return reaches[n];
+    let reached = { run: null, reach: [1, 1] };
+    function reachOf(run) {
+      if (reached.run === run) return reached.reach;
       const typical = (values) => Float64Array.from(values, Math.sqrt).sort()[Math.floor(0.9 * values.length)];
       const wide = Math.max(2.5 * typical(run.updates.p00), 2.5 * Math.min(settings.sigmaZ, 20 * typical(run.updates.p00)));
-      reaches[n] = { run, reach: [wide, 2.8 * typical(run.updates.p11)] };
-      return reaches[n];
+      reached = { run, reach: [wide, 2.8 * typical(run.updates.p11)] };
+      return reached.reach;
     }
 
-    for (const { number: n } of flights) {
-      $(`first-${n}`).addEventListener("click", () => go(0));
-      $(`previous-${n}`).addEventListener("click", () => go((chosen.step ?? 1) - 1));
-      $(`next-${n}`).addEventListener("click", () => go((chosen.step ?? -1) + 1));
-      $(`last-${n}`).addEventListener("click", () => go(Infinity));
-      $(`play-${n}`).addEventListener("click", play);
-      $(`slower-${n}`).addEventListener("click", () => faster(-1));
-      $(`faster-${n}`).addEventListener("click", () => faster(1));
-      $(`cursor-${n}`).addEventListener("input", (event) => go(Number(event.target.value)));
-    }
+    const clicks = { first: () => go(0), previous: () => go((chosen.step ?? 1) - 1),
+      next: () => go((chosen.step ?? -1) + 1), last: () => go(Infinity), play,
+      slower: () => faster(-1), faster: () => faster(1) };
+    for (const [id, act] of Object.entries(clicks)) $(id).addEventListener("click", act);
+    $("cursor").addEventListener("input", (event) => go(Number(event.target.value)));
     const another = () => { // a new run has other moments: stay at the measurement
       moment = null;
       draw();
     };
-    return { go, draw: another, play, pause, faster, at: () => moment, listOf };
+    return { go, draw: another, play, pause, faster, at: () => moment, listNow };
   }
 
-  return { places, start, ellipse, moments, state };
+  return { start, ellipse, moments, state };
 })();

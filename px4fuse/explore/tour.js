@@ -85,18 +85,18 @@ const Tour = (() => {
   const tidy = (x) => Number(x.toPrecision(2));
 
   function start(page) {
-    const { settings, set, open, runs, flights, numbers, chosen, stepper, axisOf, mapOf } = page;
-    const box = $("tour"), lone = flights[0];
+    const { settings, set, open, result, flight, numbers, chosen, stepper, axisNow, mapNow } = page;
+    const box = $("tour");
     let at = null, before = null;
 
     /* What the stations start from: the most likely noises where they are known, else the report's */
     function facts() {
-      const axis = axisOf(lone), found = mapOf(lone), likely = typeof found === "string" ? [null, null] : found.likely;
-      const own = lone.settings, base = { sigmaA: tidy(likely[0] ?? own.sigmaA), sigmaZ: tidy(likely[1] ?? own.sigmaZ),
-        dt: own.dt, input: own.input, offset: Number((lone.offset.likely ?? own.offset).toFixed(3)) };
-      if (lone.offset.why) base.offset = own.offset;
+      const axis = axisNow(), found = mapNow(), likely = typeof found === "string" ? [null, null] : found.likely;
+      const own = flight.settings, base = { sigmaA: tidy(likely[0] ?? own.sigmaA), sigmaZ: tidy(likely[1] ?? own.sigmaZ),
+        dt: own.dt, input: own.input, offset: Number((flight.offset.likely ?? own.offset).toFixed(3)) };
+      if (flight.offset.why) base.offset = own.offset;
       const tried = (changes) => {
-        const run = Engine.replay(lone, axis, { ...settings, ...changes }), p = run.updates.p00;
+        const run = Engine.replay(flight, axis, { ...settings, ...changes }), p = run.updates.p00;
         return { ...numbers(axis, run), run, sigma: Math.sqrt(p.toSorted()[p.length >> 1]),
           from: (other) => {
             const { time } = run.steps, from = time.length >> 3; // settled
@@ -107,7 +107,7 @@ const Tour = (() => {
       let step = 0;
       updates.nu.forEach((nu, i) => { if (nu * nu / updates.s[i] > updates.nu[step] ** 2 / updates.s[step]) step = i; });
       const worst = { step, sigmas: Math.abs(updates.nu[step]) / Math.sqrt(updates.s[step]), at: updates.time[step] };
-      return { base, tried, axis, worst, why: lone.offset.why, offsets: [lone.offset.from, lone.offset.to],
+      return { base, tried, axis, worst, why: flight.offset.why, offsets: [flight.offset.from, flight.offset.to],
         ekf2: page.ekf2Of(axis) };
     }
     function go(to) {
@@ -135,7 +135,7 @@ const Tour = (() => {
       before = null;
       $("tour-start").focus();
     }
-    $("tour-start").hidden = flights.length > 1 || runs[0]?.run === null;
+    $("tour-start").hidden = result.run === null;
     $("tour-start").addEventListener("click", () => go(0));
     $("tour-back").addEventListener("click", () => go(at - 1));
     $("tour-next").addEventListener("click", () => at === STATIONS.length - 1 ? end() : go(at + 1));

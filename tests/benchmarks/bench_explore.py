@@ -1,8 +1,8 @@
 """How soon the page of explore is redrawn after a slider moves, in Chromium without a GPU.
 
 Of the sample flight, two minutes long, in a window of 1400 by 900: from the slider's event until
-the frame is over in which the plots were painted, at every knob; the same with two logs side by
-side; the replay alone; and the page's size. Nothing here can fail: run it, read it.
+the frame is over in which the plots were painted, at every knob; the replay alone; and the page's
+size. Nothing here can fail: run it, read it.
 
     python tests/benchmarks/bench_explore.py
 """
@@ -29,7 +29,7 @@ SCRIPT = """(async () => {
     await frame();
     whole.push(performance.now() - start);
     start = performance.now();
-    Engine.replay(page.flights[0], page.flights[0].axes[3], page.settings);
+    Engine.replay(page.flight, page.flight.axes[3], page.settings);
     alone.push(performance.now() - start);
   }
   const at = (values, share) => values.sort((a, b) => a - b)[Math.floor(share * 59)];
@@ -52,17 +52,16 @@ def main() -> None:
         browser = Browser(program, Path(folder, "profile"))
         try:
             analysis = run(ComparisonRequest(log=str(LOG)))
-            for name, logs in (("one log", 1), ("two logs", 2)):
-                file = Path(folder, f"page{logs}.html")
-                file.write_bytes(html_text([analysis] * logs).encode())
-                show(browser, file)
-                print(f"{name}: {file.stat().st_size / 1e6:.2f} MB")
-                for knob in ("sigma-a", "sigma-z", "dt", "clock-offset"):
-                    median, most, alone = ask(browser, SCRIPT % knob)
-                    print(
-                        f"  {knob}: {median:.0f} ms until redrawn (median), {most:.0f} ms (19 of "
-                        f"20); the replay alone {alone:.1f} ms"
-                    )
+            file = Path(folder, "page.html")
+            file.write_bytes(html_text(analysis).encode())
+            show(browser, file)
+            print(f"page: {file.stat().st_size / 1e6:.2f} MB")
+            for knob in ("sigma-a", "sigma-z", "dt", "clock-offset"):
+                median, most, alone = ask(browser, SCRIPT % knob)
+                print(
+                    f"  {knob}: {median:.0f} ms until redrawn (median), {most:.0f} ms (19 of "
+                    f"20); the replay alone {alone:.1f} ms"
+                )
         finally:
             browser.close()
 
