@@ -89,7 +89,9 @@ def test_a_sweep_has_2_to_200_values():
 @pytest.fixture
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What is prepared of a flight of which only the parameters matter."""
-    monkeypatch.setattr(inputs_module, "read_vision", lambda *_: made(Received, stamp_s=np.zeros(1)))
+    monkeypatch.setattr(
+        inputs_module, "read_vision", lambda *_: made(Received, stamp_s=np.zeros(1))
+    )
     stretch = made(Stretch, field=None)
     monkeypatch.setattr(inputs_module, "find_stretches", lambda *_, **_more: (stretch,))
 
