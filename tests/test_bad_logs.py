@@ -16,7 +16,7 @@ import pytest
 from patience import patience
 from ulog_tools import Log, make_log, position, seconds_of, selector, stamps, take, topic
 
-from px4fuse.analysis import run_or_judge_aids
+from px4fuse.analysis import run_or_evaluate_aids
 from px4fuse.cli import main
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.errors import LogError, Px4FuseError
@@ -412,7 +412,7 @@ def test_compare_of_damaged_part_writes_finite_results(tmp_path, damage):
     log = make_log("v1.16", 20.0)
     damage(log)
     request = ComparisonRequest(log=str(log.write(tmp_path / "made.ulg")))
-    results = outcome_results(request, run_or_judge_aids(request))
+    results = outcome_results(request, run_or_evaluate_aids(request))
     assert not re.search(r"\b(nan|inf)\b|e\+[23]\d", to_json(results))
     if damage is truth_impossible:
         reason = "vehicle_local_position_groundtruth has no sample"

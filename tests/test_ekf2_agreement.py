@@ -19,7 +19,7 @@ from px4fuse.ekf2.replay import (
     Ekf2Replay,
     _agreement_verdict,
     _axis_agreement,
-    _heading_off_deg,
+    _heading_error_deg,
     _velocity,
     agreement_with_log,
     inside_spans,
@@ -153,7 +153,7 @@ def test_heading_without_a_logged_state_in_judged_time_is_absent():
     delayed = pd.DataFrame(index=pd.Index([1.0]))
     ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
     replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, judged_s=((5.0, 9.0),))
-    assert _heading_off_deg(ekf2, replay) is None
+    assert _heading_error_deg(ekf2, replay) is None
 
 
 def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:

@@ -188,8 +188,8 @@ def test_graph_without_convergence_says_so(tmp_path, monkeypatch, capsys):
     far = "".join(f"VERTEX_SE2 {number} {number} 3 0\n" for number in range(5))
     path.write_text(far + SQUARE.format(*[UNIT_2] * 4) + f"EDGE_SE2 0 4 0.1 0.1 6.2 {UNIT_2}\n")
     assert "Solver" not in run_main(monkeypatch, capsys, "loop", path)[1]
-    monkeypatch.setattr(solver, "_MOST_DAMPING", 0.0)
-    monkeypatch.setattr(solver, "_LEAST_FIDELITY", 1e9)
+    monkeypatch.setattr(solver, "_MAX_DAMPING", 0.0)
+    monkeypatch.setattr(solver, "_MIN_FIDELITY", 1e9)
     code, out, _ = run_main(monkeypatch, capsys, "loop", path, "--json", tmp_path / "g.json")
     assert code == 0
     assert "not converged: pose graph, all closures" in out
