@@ -20,7 +20,7 @@ from px4fuse.ekf2.replay import (
     _agreement_verdict,
     _axis_agreement,
     _heading_error_deg,
-    _velocity,
+    _velocity_agreement,
     agreement_with_log,
     inside_spans,
     logged_innovations,
@@ -146,7 +146,7 @@ def test_constant_velocity_innovations_have_no_correlation():
     samples = pd.DataFrame(0.1, index=index, columns=[*columns, "innovation_down", "variance_down"])
     ekf2 = made(Ekf2, aids={"gnss_vel": made(AidLog, samples=samples)})
     replay = SimpleNamespace(updates=updates, judged_s=((0.0, 99.0),), other_aid_updates={})
-    assert _velocity(ekf2, replay, own=True) == ({}, True)
+    assert _velocity_agreement(ekf2, replay, own=True) == ({}, True)
 
 
 def test_heading_without_a_logged_state_in_judged_time_is_absent():
