@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 import pandas as pd
 from msgspec import Meta
@@ -38,7 +40,36 @@ class CatalogueEntry(Record, frozen=True):
 CATALOGUE: Mapping[str, CatalogueEntry] = table(
     __file__, "catalogue.toml", dict[str, CatalogueEntry]
 )
+GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 NAMES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
+
+
+class Example(Record, frozen=True):
+    """Example of a finding, with its rates on simulated flights (tests/studies/rates.csv).
+
+    Attributes
+    ----------
+    message, remedy : str
+        Of one flight.
+    clean_flights, false_alarms : int
+        Flights without a mistake, and on how many of them the finding appears.
+    detection : dict
+        Share of the flights with a mistake on which it appears, by option of px4fuse simulate or
+        setting.
+    """
+
+    message: str
+    remedy: str
+    clean_flights: int
+    false_alarms: int
+    detection: Mapping[str, float]
+
+
+def load_examples() -> Mapping[str, Example]:
+    """Load the examples by id, made by docs/findings_pages.py."""
+    return msgspec.json.decode(
+        Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, Example]
+    )
 
 
 class Finding(Record, frozen=True, omit_defaults=False):
@@ -144,7 +175,7 @@ def format_percent(share: float, digits: int = 0) -> str:
 
 
 def spans_at(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ...]:
-    """Parts of a segment in which a step function has a value; the first value extends backwards."""
+    """Parts of a segment in which a step function has a value; its first value extends back."""
     edges = np.clip(np.append(steps.index.to_numpy(), np.inf), segment.start_s, segment.end_s)
     edges[0] = segment.start_s
     there = (steps.to_numpy() == value) & (np.diff(edges) > 0.0)

@@ -313,7 +313,7 @@ def _noise_above_reported(analysis: Analysis) -> str:
     stated_m = float(np.sqrt(stated.median()))
     if not parameter_m > NOISE_RATIO_TOLERANCE * stated_m:  # false for NaN too
         return ""
-    prefix = f"{name} {parameter_m:g} m exceeds the accuracy that the receiver reports ({stated_m:.2g} m)"
+    prefix = f"{name} {parameter_m:g} m exceeds the accuracy reported by GNSS ({stated_m:.2g} m)"
     return remedy.format_ekf2_remedy(
         analysis.ekf2_model,
         {name: float(f"{stated_m:.2g}")},

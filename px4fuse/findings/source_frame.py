@@ -125,9 +125,10 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_wrong",
         f"EKF2's heading drifts relative to {analysis.source.name}: "
-        f"{first.heading_error_deg:+.0f}° from {first.start_s:.0f} to {first.end_s:.0f} s, {last.heading_error_deg:+.0f}° from "
-        f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, by {basis}). A constant "
-        f"rotation of the positions cannot correct this. Possible cause: {possible_cause}.",
+        f"{first.heading_error_deg:+.0f}° from {first.start_s:.0f} to {first.end_s:.0f} s, "
+        f"{last.heading_error_deg:+.0f}° from {last.start_s:.0f} to {last.end_s:.0f} s (clockwise "
+        f"from above, by {basis}). A constant rotation of the positions cannot correct this. "
+        f"Possible cause: {possible_cause}.",
         action,
         {
             "from_deg": first.heading_error_deg,

@@ -120,7 +120,7 @@ def unequal_noise(analysis: Analysis) -> Found:
     yield warning(
         "source_axes_unequal",
         f"The noise of {analysis.source.name} is {large:.2g} m along {more} and {small:.2g} m "
-        f"along {less}. One SIGMA_Z, or one EKF2 measurement noise, is wrong for at least one axis.",
+        f"along {less}. One SIGMA_Z, or one EKF2 measurement noise, does not fit both axes.",
         f"Analyse each axis separately (--axis {more} --sigma-z {large:.2g}). For EKF2 use the "
         "larger value. Place the anchors on all sides of the flight area.",
         {f"{less}_sigma_z_m": small, f"{more}_sigma_z_m": large},
