@@ -253,7 +253,7 @@ def test_time_correlation_fit_tries_zero_and_estimated_offset(
     assert tried[::2] == tried[1::2] == [[0.0], [0.0, 0.3], [-0.2, 0.0]]
 
 
-def test_find_correlated_noise_with_jump_or_outliers_reports_both() -> None:
+def test_find_correlated_noise_with_outliers_reports_both() -> None:
     """Jumps and outliers are removed before the correlation is estimated."""
     assert {"source_jumps", "source_coloured"} <= set(
         root_findings(analysed(partial(both, jump_m=2.0)))
