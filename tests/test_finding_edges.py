@@ -327,7 +327,7 @@ def test_source_as_sent_logger_limit_is_reported(
 ) -> None:
     lacks = (
         Unavailable("another", "no", "Do."),
-        Unavailable("it", "it was off", "Do.", source="vehicle_visual_odometry"),
+        Unavailable("it", "it was disabled", "Do.", source="vehicle_visual_odometry"),
     )
     profile = log(parameters={"SDLOG_PROFILE": 2.0})
     for origin in (ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS):
@@ -336,7 +336,7 @@ def test_source_as_sent_logger_limit_is_reported(
         assert [one.id for one in found] == ["source_not_logged", "source_decimated"][
             : 1 + decimated
         ]
-        assert "lacks vehicle_visual_odometry (it was off)" in found[0].message
+        assert "lacks vehicle_visual_odometry (it was disabled)" in found[0].message
         assert all("SDLOG_PROFILE to 130 " in each.remedy for each in found)
         for each in found[1:]:
             assert rate_hz == pytest.approx(each.evidence["logger_limit_hz"], rel=0.35)
@@ -575,7 +575,7 @@ def no_truth(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 BIAS, JUMPS, SCALE = imu.bias, source_positions.jumps, source_positions.scale
-ARRIVALS, THINNED, CLOCK = (
+ARRIVALS, DOWNSAMPLED, CLOCK = (
     source_stamps.arrivals,
     source_intervals.downsampling,
     source_clock.detect,
@@ -594,8 +594,8 @@ SOURCE_EDGES = [
           (0.2, 0.01, "warning"), (0.199, 0.01, None), (0.3, 0.01, "error"),
           (0.299, 0.01, "warning"), (0.25, 0.0625, "warning"), (0.25, 0.0626, None))),
     # EKF2's bias if the positions give none; horizontally that of the positions is better
-    *((BIAS, analysis(bias_scale_jump_fit=ours, ekf2=bias_of_ekf2(*bias)), expected)
-      for bias, ours, expected in (
+    *((BIAS, analysis(bias_scale_jump_fit=fit, ekf2=bias_of_ekf2(*bias)), expected)
+      for bias, fit, expected in (
           ((0.2, 0.0, 0.0), NONE, "warning"), ((0.199, 0.0, 0.0), NONE, None),
           ((0.0, 0.0, 0.2), with_bias(0.0), "warning"), ((0.5, 0.5, 0.1), with_bias(0.0), None))),
     *((ARRIVALS, analysis(ekf2=ekf2), expected) for ekf2, expected in (
@@ -608,16 +608,16 @@ SOURCE_EDGES = [
         (ages(20, 20, 0.1), "error"), (ages(20, 20, 0.0999), "warning"),
         (ages(0, 30, 0.00099), "warning"), (ages(0, 30, 0.001), None))),
     (ARRIVALS, analysis(ekf2=ages(20, 20), **REBUILT), None),
-    *((THINNED, at_multiples(multiples), expected) for multiples, expected in (
+    *((DOWNSAMPLED, at_multiples(multiples), expected) for multiples, expected in (
         ([1, 1, 2] * 20, "warning"), ([1, 1, 2] * 19 + [1, 1, 1], None),  # 25 % missing
         ([1, 2] * 25, "warning"), ([1, 2] * 24 + [1], None),  # at least 50 intervals
         ([2, 3] * 30, "error"),  # intervals of 0.31 s: EKF2 does not start
         ([2] * 54 + [3] * 6, "error"), ([2] * 55 + [3] * 5, None),  # at least 10 % of each multiple
         ([1] * 50 + [2] * 35 + [4] * 15, "error"), ([1] * 50 + [2] * 34 + [4] * 16, None))),
     # mapped timestamps and topics rebuilt by EKF2 show nothing
-    (THINNED, at_multiples([1, 2] * 30, clock_map=clock_map()), None),
-    (THINNED, at_multiples([1, 2] * 30, origin=ALIGNED), None),
-    (THINNED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE), "warning"),
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, clock_map=clock_map()), None),
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=ALIGNED), None),
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE), "warning"),
     # two samples lost in one interval
     *((source_intervals.losses, at_multiples([1] * singles + [3], 0.25, **parts), expected)
       for singles, parts, expected in (

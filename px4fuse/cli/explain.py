@@ -70,8 +70,10 @@ def _rates(clean_flights: int, false_alarms: int, detection: Mapping[str, float]
     """Format the false alarm rate and the detection rates on simulated flights."""
     if not clean_flights:
         return ["Not measured: this finding states a fact of the log or of a setting."]
-    detected = "; ".join(f"{mistake}: {share:.0%}" for mistake, share in detection.items())
+    detected = "; ".join(
+        f"{mistake}: {100.0 * share:.0f} %" for mistake, share in detection.items()
+    )
     return [
         f"False alarms on {false_alarms} of {clean_flights} simulated flights without a mistake.",
-        f"Found on simulated flights with {detected}.".replace("%", " %"),
+        f"Found on simulated flights with {detected}.",
     ]

@@ -90,7 +90,7 @@ def find_aids(results: Mapping[str, AidResult]) -> tuple[Finding, ...]:
 
 
 def finding_title(finding: str) -> str:
-    """Title of a finding; for an unknown id its words.
+    """Title of a finding; an unknown id is returned with blanks.
 
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')

@@ -94,8 +94,9 @@ def error_exceeds_sigma(
                 f"{owner}_sigma_p_m": one.reported_sigma_m,
             }
             causes[owner] = cause = cause_of(analysis.causes, owner, axis, "nees")
+            along = analysis.axes[axis].axis.called
             sentences.append(
-                f"{name} along {axis}: position RMSE {one.rmse_m:.2f} m, reported σ "
+                f"{name} along {along}: position RMSE {one.rmse_m:.2f} m, reported σ "
                 f"{one.reported_sigma_m:.2g} m (mean NEES {format_factor(one.nees)}, mean NIS "
                 f"{format_number(one.nis_mean, 2)}; expected 1)."
             )

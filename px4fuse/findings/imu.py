@@ -16,7 +16,7 @@ MIN_IMU_GAP_S = 0.2  # s in total; two prediction steps
 MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, and a margin against aliasing
 MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; PX4 logs 20 Hz by default, 0.1 s of a tilt can be interpolated
 MAX_CLIPPED_S = 0.1  # s; one prediction step, a touch-down clips one or two samples
-MIN_CLIPPING_PAUSE_S = 2.0  # s; clipped samples further apart are separate spans
+MIN_CLIPPING_PAUSE_S = 2.0  # s; a longer pause separates two spans
 RATE_MARGIN = 0.98  # measured stream rates are slightly below the requested rate
 
 

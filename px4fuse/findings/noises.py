@@ -1,6 +1,6 @@
 """SIGMA_Z or SIGMA_A that contradicts the innovations, and KF or EKF2 that is not consistent.
 
-The mean NIS alone cannot separate SIGMA_A from SIGMA_Z, since both increase S. The likelihood can:
+The mean NIS alone cannot separate SIGMA_A from SIGMA_Z: both increase S. The likelihood can:
 SIGMA_A correlates the innovations that follow each other, SIGMA_Z does not. Both are estimated
 together and proposed together, the larger deviation first. A deviation of a default setting is one
 severity level lower than that of a chosen one.
@@ -225,7 +225,7 @@ def process_noise_near_zero(analysis: Analysis) -> Found:
             "process_noise_forgotten",
             f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero. The position variance grows by only "
             f"{format_percent(growth, 1)} between updates, and the gain falls to {gain:.3f}. KF "
-            f"needs {response_s:.0f} s to follow a change (along {name}).",
+            f"needs {response_s:.0f} s to follow a change (along {result.axis.called}).",
             f"Increase SIGMA_A.{remedy_text}",
             {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
         )
@@ -296,7 +296,7 @@ def _variance_finding(
     return finding(
         severity,
         f"{owner}_variance_{stated}",
-        f"{name} is {'under' if over else 'over'}confident along {result.axis.name}: σ is "
+        f"{name} is {'under' if over else 'over'}confident along {result.axis.called}: σ is "
         f"{format_factor(factor)} times too {'large' if over else 'small'}. The mean NIS is "
         f"{format_number(statement.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} axes)."
         f"{gate_effect}",

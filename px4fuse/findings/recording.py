@@ -60,7 +60,7 @@ def loss(flight: Flight) -> Found:
         )
     for topic, count in list(log.dropped.items())[:1]:
         others = len(log.dropped) - 1
-        also = f"; samples of {others} more topics too" if others else ""
+        also = f" (also in {others} other topic{'s' if others > 1 else ''})" if others else ""
         yield info(
             "samples_dropped",
             f"{count} samples of {topic} were dropped: their timestamps are zero or go back{also}.",

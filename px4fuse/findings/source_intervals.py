@@ -44,9 +44,10 @@ def gaps(analysis: Analysis) -> Found:
             check = "the antenna's view of the sky, its cable and radio interference"
         limit_s, count = longest_s(1.0 / rate_hz), len(found)
         number = "one gap" if count == 1 else f"{count} gaps"
+        longest = "" if count == 1 else "the longest "
         yield warning(
             "source_gap",
-            f"The position source has {number} of more than {limit_s:.1f} s, the longest "
+            f"The position source has {number} of more than {limit_s:.1f} s: {longest}"
             f"{until - at:.1f} s from {at:.1f} s. In a gap KF uses the IMU only, and its error "
             "grows.",
             f"Check {check}. Analyse one side of the gap (--start, --end).",
