@@ -613,7 +613,7 @@ def test_summary_noise_shape_finding_replaces_setting_as_cause() -> None:
         ("kf", {"sigma_a_m_s2": 0.3, "sigma_z_m": 0.2},
          "SIGMA_A 0.3 m/s² instead of 1 m/s² and SIGMA_Z 0.2 m instead of 1 m"),
         ("ekf2", {"EKF2_EV_DELAY": 90.0, "EKF2_DELAY_MAX": 250.0},
-         "EKF2_EV_DELAY 90 ms instead of 7"),
+         "EKF2_EV_DELAY 90 ms instead of 7 ms"),
     ],
 )  # fmt: skip
 def test_format_change_names_old_and_new_value(

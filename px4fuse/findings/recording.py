@@ -50,7 +50,7 @@ def loss(flight: Flight) -> Found:
         if not log.damage:
             action = "Log until after the landing. If the file was cut off, copy it again."
         elif log.format.startswith("MAVLink"):
-            action = "Record by cable or on the companion computer."
+            action = "Record on a link that loses no bytes: by cable, or on the companion computer."
         yield finding(
             "warning" if log.damage else "info",
             "log_damaged",

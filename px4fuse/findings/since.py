@@ -145,4 +145,4 @@ def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> st
     assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
     flown, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit
     unit = unit.replace("^2", "²").replace("^3", "³")
-    return f"{name} {value:.3g} {unit} instead of {flown:.4g}".replace("  ", " ")
+    return f"{name} {value:.3g} {unit} instead of {flown:.4g} {unit}".replace("  ", " ").rstrip()
