@@ -63,7 +63,7 @@ LABEL_WIDTH = 26  # characters per line of an axis label
 # Mistakes of `px4fuse simulate`, and settings of the comparison, that show a finding
 SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
-    "ekf2_ev_delay_wrong": (("ekf2-delay",), {}),
+    "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
     "ekf2_gate_small": (("ekf2-gate",), {}),
     "source_clock_offset": (("clock-offset",), {}),
     "source_clock_changes": (("clock-drift=8000ppm",), {}),

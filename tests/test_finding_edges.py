@@ -133,7 +133,7 @@ def test_ekf2_resets_and_dropouts_outside_segment_are_ignored(
         (60.0, {"ekf2_fusion_interrupted": "warning"}), (59.9, {"ekf2_not_fusing": "error"}),
     ],
 )  # fmt: skip
-def test_ekf2_not_fusing_limits_of_the_share(until_s: float, expected: dict[str, str]) -> None:
+def test_ekf2_not_fusing_severity_follows_share(until_s: float, expected: dict[str, str]) -> None:
     one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
     assert named(ekf2_not_fusing.detect, one) == expected
     for finding in ekf2_not_fusing.detect(one):
@@ -210,7 +210,7 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     ("count", "of", "expected"),
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
-def test_ekf2_rejecting_limits_of_the_share(count: int, of: int, expected: str | None) -> None:
+def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: str | None) -> None:
     """EKF2 rejects the horizontal vector, so the first axis is used."""
     axes = axis("north", ekf2_innovations=rejected(count, of)), axis("east")
     axes[1].ekf2_innovations = rejected(9, 9)
@@ -288,7 +288,7 @@ def test_hidden_errors_report_rmse_after_alignment(left: float, frame: bool, dri
         ((10.0, 109.9), (10.0, 110.0), [(39.99, 42.0), (109.9, 110.0)]),
     ],
 )  # fmt: skip
-def test_imu_gap_spans_inside_and_at_ends_of_segment(ends: Any, segment: Any, spans: Any) -> None:
+def test_imu_gap_spans_are_found_inside_the_segment(ends: Any, segment: Any, spans: Any) -> None:
     """Gaps at an end count if longer than 0.05 s; gaps outside the segment do not."""
     time = np.concatenate([np.arange(ends[0], 40.0, 0.01), np.arange(42.0, ends[1], 0.01)])
     found = imu._gap_spans(pd.DataFrame(index=time), Segment(*segment, ""))

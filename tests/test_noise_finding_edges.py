@@ -85,7 +85,9 @@ def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
         (0.101, Noise(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
-def test_setting_deviation_at_limits(chosen: float, estimate: Noise, expected: Any) -> None:
+def test_setting_deviation_severity_at_limits(
+    chosen: float, estimate: Noise, expected: Any
+) -> None:
     off = noises.setting_deviation("sigma_z_m", chosen, estimate)
     if off is None or expected is None:
         assert off is expected
@@ -132,7 +134,7 @@ def test_deviating_settings_bound_is_typed_as_at_least_5_mm() -> None:
         ({"source": HOVERING}, ["sigma_z_small"]),  # SIGMA_A is not estimated without motion
         ({"source": ODOMETRY}, ["sigma_z_small"]),  # a source that may drift
         ({"source": MOVING, "axes": (hiding(),)}, ["sigma_z_small"]),
-        ({"source": ODOMETRY, "settings": Settings(1.0, 0.1)}, []),  # no info there
+        ({"source": ODOMETRY, "settings": Settings(1.0, 0.1)}, []),  # drift: no finding of info
         ({"source": MOVING, "axes": (hiding(),), "settings": Settings(1.0, 0.1)},
          ["sigma_z_small"]),
         ({"source": MOVING, "axes": (axis(ekf2=statement(), ekf2_truth=against_truth(9.0)),)},
@@ -171,7 +173,9 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
-def test_near_zero_process_noise_at_limits(one: Any, expected: str | None) -> None:
+def test_near_zero_process_noise_needs_slow_correlated_filter(
+    one: Any, expected: str | None
+) -> None:
     assert severity(noises.process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
@@ -409,7 +413,9 @@ def loop(*closures: Closure, **parts: Any) -> Loop:
         ((closure(0.0, accepted=False),), ["loop_drift_understated", "false_loop_closure"]),
     ],
 )  # fmt: skip
-def test_loop_closures_at_limits(closures: tuple[Closure, ...], expected: list[str]) -> None:
+def test_loop_closures_gnc_weight_determines_findings(
+    closures: tuple[Closure, ...], expected: list[str]
+) -> None:
     found = list(loops.closures(loop(*closures, is_end_assumed=False)))
     assert [finding.id for finding in found] == expected
     if expected == ["loop_drift_understated"]:

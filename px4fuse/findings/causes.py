@@ -24,7 +24,7 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
 )
 # Key in the evidence of time-correlated noise: its white part over the σ that a filter assumes. It
 # is set if the ratio is large: the assumed noise is then wrong in addition
-WHITE_BEYOND = "white_over_assumed"
+WHITE_RATIO = "white_over_assumed"
 # Kinds of cause of an aid's finding: the sensor of the position source, or a shift in flight
 SENSOR, CHANGE = "the source's sensor", "change"
 
@@ -61,7 +61,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     groups = sorted(by_root(findings), key=lambda group: places.index(group[0].id))
     for cause, listed in CONSEQUENCES.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
-        if cause_group is None or WHITE_BEYOND in cause_group[0].evidence:
+        if cause_group is None or WHITE_RATIO in cause_group[0].evidence:
             continue
         effect_groups = [
             group for group in groups if group is not cause_group and _is_effect(group[0], listed)

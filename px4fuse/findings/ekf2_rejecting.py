@@ -11,7 +11,7 @@ from px4fuse.findings.since import format_remedy_of_ekf2
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # of the innovations; a gate of 5 √S rejects 6e-7 if consistent
-REJECTED_SHARE_ERROR = 0.20  # of the innovations; R or the time offset is then wrong
+REJECTED_SHARE_ERROR = 0.20  # of the innovations; usually R or the time offset is wrong
 
 
 def default_remedy(aid: Aid) -> str:

@@ -30,8 +30,8 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 MIN_NEES_ERROR = 16.0  # mean NEES; errors of 4 σ
 MAX_SMALL_NIS = 0.5  # mean NIS; innovations are 30 % smaller than expected
-MAX_KF_ERROR_RATIO = 0.7  # KF over EKF2 RMSE; half of EKF2's mean square error is then its own
-MAX_ALIGNED_SHARE = 0.5  # RMSE after over before the alignment; below, most of it is misalignment
+MAX_KF_ERROR_RATIO = 0.7  # RMSE of KF over EKF2; below, half of EKF2's mean square error is its own
+MAX_ALIGNED_SHARE = 0.5  # RMSE after over RMSE before alignment; below, misalignment dominates
 FILTERS: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
 DRIFT_REMEDY = (
     "Do not take SIGMA_Z or EKF2_EVP_NOISE from these innovations. Correct the drift with a loop "

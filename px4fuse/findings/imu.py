@@ -10,7 +10,7 @@ from px4fuse.findings.model import MAX_MOMENT_S, Found, error, finding, warning
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 
-BIAS_ERROR_M_S2 = 0.3  # m/s²; three times SIGMA_A, a position error of 0.15 m after 1 s
+BIAS_ERROR_M_S2 = 0.3  # m/s²; a position error of 0.15 m after 1 s
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))  # tilt with the effect of a bias of 1 m/s²
 MIN_IMU_GAP_S = 0.2  # s in total; two prediction steps
 MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, and a margin against aliasing

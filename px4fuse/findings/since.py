@@ -84,7 +84,7 @@ def format_remedy(analysis: Analysis, cause: Intervention) -> str:
     if turn_deg := change.pop(changed.TURN, None):
         # GNSS positions refer to true north, so EKF2's heading is wrong
         actions.append(
-            f"Calibrate the magnetometer away from metal and motors ({turn_deg:+.0f}°)."
+            f"Calibrate the magnetometer (heading error {turn_deg:+.0f}°), away from metal."
             if is_gnss
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )

@@ -125,15 +125,14 @@ def _intervals(analysis: Analysis) -> tuple[Array, float]:
 
 def _base_interval(intervals: Array) -> tuple[float, Array] | None:
     """Longest interval (s) of which all are whole multiples, and these; None if there is none."""
-    typical = float(
-        np.sort(intervals)[len(intervals) // 2]
-    )  # an actual interval, not a mean of two
+    # an actual interval, not the mean of two
+    typical = float(np.sort(intervals)[len(intervals) // 2])
     for divisor in range(1, MAX_DIVISOR + 1):
         multiples = np.rint(intervals * divisor / typical)
         if np.any(multiples < 1.0):
             continue
         base = float(np.sum(intervals) / np.sum(multiples))
-        # the first that fits is the longest
+        # divisors increase, so the first match is the longest interval
         if float(np.sqrt(np.mean((intervals / base - multiples) ** 2))) <= MAX_MULTIPLE_RMS:
             return base, multiples
     return None

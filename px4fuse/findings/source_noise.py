@@ -14,7 +14,7 @@ from px4fuse.filter.coloured import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
-from px4fuse.findings.causes import WHITE_BEYOND
+from px4fuse.findings.causes import WHITE_RATIO
 from px4fuse.findings.model import Found, error, format_percent, info, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
@@ -26,7 +26,7 @@ MIN_REPEAT_SHARE = 0.05  # of the positions
 MIN_REPEAT_SHARE_ERROR = 0.3  # of the positions; the actual rate is then clearly lower
 MIN_REPEATS = 10
 MIN_AXIS_RATIO = 1.5  # ratio of σ between the axes
-MIN_AXIS_NIS_RATIO = 1.7  # ratio of the mean NIS above which each axis is tuned
+MIN_AXIS_NIS_RATIO = 1.7  # ratio of the mean NIS; below, the axes are not tuned separately
 MIN_PART_RATIO = 2.0  # ratio of σ between the noisier part and the rest
 MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5  # the same ratio, outliers not fused
 MIN_PART_RATIO_ERROR = 4.0  # ratio of σ
@@ -55,8 +55,8 @@ def time_correlated_noise(analysis: Analysis) -> Found:
     is_gnss = analysis.source.origin.is_gnss
     evidence = {name: value for name, value in asdict(found).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
-    if (beyond := found.white_m / float(np.nanmin(assumed_m))) > NOISE_RATIO_TOLERANCE:
-        evidence[WHITE_BEYOND] = beyond
+    if (ratio := found.white_m / float(np.nanmin(assumed_m))) > NOISE_RATIO_TOLERANCE:
+        evidence[WHITE_RATIO] = ratio
     hint = "Set R to cover both parts; GNSS errors are usually time-correlated."
     if not is_gnss:
         hint = (

@@ -35,7 +35,7 @@ MIN_MOTION_RANGE_M = 0.5  # m, 5 to 95 %; a hovering vehicle with UWB noise of 0
 NOISE_RANGE_FACTOR = 1.25 * 3.29  # 5 to 95 % range of white noise in σ, with a margin of 25 %
 SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826  # median |second difference| over σ of white noise
 MIN_LOW_PASS_GAIN_NATS = 6.0  # likelihood ratio 400; clean flights have 0 to 2
-MIN_LAG_NATS = 1.0  # low pass over time-correlated noise, which has one parameter more
+MIN_LAG_NATS = 1.0  # log-likelihood of a low pass minus that of time-correlated noise
 MIN_LAG_S = 0.05  # s; at 1 m/s half of the noise of good UWB (0.1 m)
 MIN_LAG_ERROR_S = 0.10  # s; at 1 m/s the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2  # m; twice the noise of good UWB (0.1 m)
@@ -47,9 +47,7 @@ MIN_SCALE_SIGMAS = 3.0  # standard deviations; 0.3 % of clean flights exceed it
 MIN_OUTLIER_SHARE = 0.005  # of the measurements; normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_SHARE_ERROR = 0.02  # of the measurements; one each 10 s at 5 Hz
 MIN_OUTLIERS = 3
-MIN_VARIANCE_RATIO = (
-    2.0  # reported over actual variance, or its inverse; changes EKF2's NIS as much
-)
+MIN_VARIANCE_RATIO = 2.0  # reported over actual variance, or its inverse
 MIN_VARIANCE_RATIO_ERROR = 3.0  # the same ratio
 
 

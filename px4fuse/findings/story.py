@@ -25,9 +25,9 @@ from px4fuse.loop.model import Loop
 from px4fuse.plain import capitalise_first, format_factor
 from px4fuse.readers.px4_ekf2 import OTHER_AIDING
 
-MAX_SENTENCES = 3  # paragraphs of the summary
+MAX_PARAGRAPHS = 3  # paragraphs of the summary
 # Findings whose content is in the first paragraph
-IN_FIRST_SENTENCE = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
+IN_FIRST_PARAGRAPH = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
 # Faults of the source that no noise setting and no outlier removal corrects
 NOISE_SHAPE_FINDINGS = frozenset(
     (
@@ -79,7 +79,7 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
         kind = kind_of(analysis, cause)
         if (shapes and kind not in allowed_kinds) or (is_misaligned and kind == PROCESS):
             cause_by_filter[owner] = None
-    known = IN_FIRST_SENTENCE
+    known = IN_FIRST_PARAGRAPH
     for cause in filter(None, cause_by_filter.values()):
         known |= FINDINGS_OF_CAUSE.get(kind_of(analysis, cause), frozenset())
     if cause_by_filter["kf"] is not None and not interventions.SETTING_CHANGES.isdisjoint(
@@ -96,12 +96,12 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     )
     sentences = [
         _verdict_paragraph(analysis, cause_by_filter, has_explanation),
-        *(reduction_sentences := tuple(_difference_after_change(analysis, cause_by_filter))),
+        *(reduction_texts := tuple(_difference_after_change(analysis, cause_by_filter))),
         *(_finding_sentence(analysis, one) for one in causes if one.id not in EFFECT_FINDINGS),
-        *_differences(analysis, has_difference_sentence=bool(reduction_sentences)),
+        *_differences(analysis, has_difference_text=bool(reduction_texts)),
         *(_finding_sentence(analysis, one) for one in causes if one.id in EFFECT_FINDINGS),
     ]
-    return tuple(sentences[:MAX_SENTENCES])
+    return tuple(sentences[:MAX_PARAGRAPHS])
 
 
 def _failed_statistic(analysis: Analysis, owner: FilterName) -> Of:
@@ -264,7 +264,7 @@ def _difference_after_change(
         )
 
 
-def _differences(analysis: Analysis, *, has_difference_sentence: bool) -> Iterator[str]:
+def _differences(analysis: Analysis, *, has_difference_text: bool) -> Iterator[str]:
     """Loop closure error, and the explanation of the difference KF - EKF2."""
     loop, why = analysis.loop, analysis.why.get(analysis.main.axis.name)
     if isinstance(loop, Loop) and (gap := loop.closure_error_m) is not None:
@@ -273,5 +273,5 @@ def _differences(analysis: Analysis, *, has_difference_sentence: bool) -> Iterat
             f"The odometry has a loop closure error of {format_metres(gap)} after {length:.0f} m "
             f"({format_percent(gap / length, 1)})."
         )
-    if isinstance(why, Why) and not has_difference_sentence:
+    if isinstance(why, Why) and not has_difference_text:
         yield why.cause
