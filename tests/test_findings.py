@@ -381,6 +381,7 @@ def test_examples_contain_rates_of_the_study() -> None:
 
 @pytest.mark.parametrize("typed", ["source_scale_wrong", "Source-Scale-Wrong"])
 def test_explain_finding_prints_its_page(typed, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)
     assert (code, err) == (0, "")
     example = load_examples()["source_scale_wrong"]
@@ -403,6 +404,7 @@ def test_explain_unmeasured_finding_states_it(monkeypatch, capsys) -> None:
 
 
 def test_explain_without_argument_lists_all_by_group(monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, _ = run_main(monkeypatch, capsys, "explain")
     assert code == 0
     lines = out.splitlines()

@@ -244,7 +244,7 @@ def test_time_correlation_fit_tries_zero_and_estimated_offset(
         tried.append(offsets)
         return 0.0, noises[0]
 
-    monkeypatch.setattr(coloured, "_best_of", none_better)
+    monkeypatch.setattr(coloured, "_best_of_grid", none_better)
     for offset_s in (0.0, 0.3, -0.2):
         time_correlation_fit(
             analysis.flight, (analysis.axes["north"].axis,), RIGHT, Noises(0.3, 0.1),
