@@ -20,8 +20,7 @@ MIN_DOWNSAMPLED_SHARE = 0.25  # of the source's samples; more than a link loses
 # Downsampling to a rate alternates between two neighbouring multiples; bursts of a link do not
 MIN_PAIR_SHARE = 0.85  # of the intervals
 MIN_MULTIPLE_SHARE = 0.1  # of the intervals; lost samples alone stay below
-# RMS distance from whole multiples, in units of the shorter interval: random intervals have 0.29,
-# the jitter of a source 0.03
+# RMS distance from whole multiples, in intervals: random ones have 0.29, jitter of a source 0.03
 MAX_MULTIPLE_RMS = 0.06
 MAX_DIVISOR = 4
 
