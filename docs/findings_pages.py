@@ -1,15 +1,17 @@
-"""Pages of the findings, each from its detector's file and from a flight on which it is found.
+"""Pages of the findings, made from the catalogue, the detectors and example flights.
 
-``write(folder)`` makes ``index.md`` and ``<id>.md`` for every name in
-``px4fuse.findings.NAMES``. Words, thresholds and remedies are the detector's own; the
-flights are those of the tests, and simulated ones; the rates are ``tests/studies/rates.csv``.
+``write(folder)`` makes ``index.md`` and ``<id>.md`` for each finding. Thresholds come from the
+detectors, examples from flights of the tests and simulated flights, rates from
+``tests/studies/rates.csv``. Run after a change of messages or rates, for ``px4fuse explain``:
+
+    python docs/findings_pages.py --examples
 """
 
 from __future__ import annotations
 
 import ast
+import json
 import sys
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -40,6 +42,7 @@ from px4fuse.filter.heading import HeadingPart, combine_heading_parts  # noqa: E
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import NAMES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.causes import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
+from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
 from px4fuse.flight import Columns, Unavailable  # noqa: E402
 from px4fuse.report.panels import (  # noqa: E402
     ERROR,
@@ -54,13 +57,13 @@ from px4fuse.simulation.scenario import Scenario  # noqa: E402
 
 slow, louder = partial(coloured, tau_s=0.5, share=1.0), partial(two_levels, factor=3.0)
 UNEQUAL_M = (0.05, 0.2, 0.1)
-MEANINGS = tomllib.loads(Path(__file__).with_name("meanings.toml").read_text(encoding="utf-8"))
 FINDINGS = ROOT / "px4fuse" / "findings"
+EXAMPLES = FINDINGS / "examples.json"
 LABEL_WIDTH = 26  # characters per line of an axis label
-# What `px4fuse simulate` is told, with the settings of the comparison, to show a finding
+# Mistakes of `px4fuse simulate`, and settings of the comparison, that show a finding
 SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
-    "ekf2_ev_delay_wrong": (("ekf2-delay",), {}),
+    "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
     "ekf2_gate_small": (("ekf2-gate",), {}),
     "source_clock_offset": (("clock-offset",), {}),
     "source_clock_changes": (("clock-drift=8000ppm",), {}),
@@ -81,7 +84,7 @@ SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
 
 @dataclass(frozen=True)
 class Example:
-    """A finding as it was told, on which flight, and what can be drawn of that."""
+    """Finding of an example flight, a description of the flight, and its analysis for figures."""
 
     finding: Finding
     flight: str
@@ -89,7 +92,7 @@ class Example:
 
 
 def examples() -> dict[str, Example]:
-    """An example of every finding that one could be made of."""
+    """Example of each finding by id, from simulated flights and flights of the tests."""
     made: dict[str, Example] = {}
 
     def keep(found: Any, flight: str, analysis: Analysis | None = None) -> None:
@@ -99,11 +102,11 @@ def examples() -> dict[str, Example]:
     for name, (typed, settings) in SIMULATED.items():
         flight = simulate_flight(Scenario(passes=4, seed=2), parse(typed))
         analysis = explain(compare(flight, Settings(**settings)))
-        words = " ".join(["px4fuse simulate", *(f"--mistake {each}" for each in typed)])
+        command = " ".join(["px4fuse simulate", *(f"--mistake {each}" for each in typed)])
         options = [f"--{key[:7].replace('_', '-')} {value:g}" for key, value in settings.items()]
         compared = f", compared with `{' '.join(options)}`" if options else ""
         found = [one for one in find(analysis) if one.id == name]
-        keep(found, f"`{words}`{compared}", analysis)
+        keep(found, f"`{command}`{compared}", analysis)
     for model in (slow, partial(held, share=0.2), partial(white, sigma=UNEQUAL_M), louder):
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
         truth = flight.truth.samples[Columns.POSITION].dropna()
@@ -111,13 +114,13 @@ def examples() -> dict[str, Example]:
         analysis = explain(compare(laid_over(flight, known, model, 10.0, 2), Settings()))
         found = [one for one in find(analysis) if one.id.startswith("source_")]
         keep(found, "errors of `tests/studies/source_errors.py` on a simulated flight", analysis)
-    for options, words in (
+    for options, drift_option in (
         ({"source": "sample_logs/loop_vio.ulg", "position_drift_m": 0.3}, "--drift 0.3"),
         ({"source": "sample_logs/aisle_uwb.ulg:ekf2"}, ""),
         ({"source": "sample_logs/loop_slam.tum"}, ""),
     ):
         made_of = {**options, "source": f"{ROOT}/{options['source']}"}
-        typed = f"px4fuse loop {options['source']} {words}".strip()
+        typed = f"px4fuse loop {options['source']} {drift_option}".strip()
         keep(find_loop(px4fuse.close_loop(**made_of)), f"`{typed}`")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
@@ -131,16 +134,16 @@ def examples() -> dict[str, Example]:
     ]
     still = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
     drifts = replace(still, heading=combine_heading_parts(tuple(parts), 1e-9, "positions"))
-    keep(source_frame.detect(drifts), "an estimate that was made up")
+    keep(source_frame.detect(drifts), "an invented heading estimate")
     flight = aisle_flight(duration_s=60.0)
-    silent = aid_log(enabled=steps((0.0, 1.0)))
-    silent = replace(silent, samples=outage_free(silent, 20.0, 41.0))
+    not_fused = aid_log(enabled=steps((0.0, 1.0)))
+    not_fused = replace(not_fused, samples=outage_free(not_fused, 20.0, 41.0))
     changed = aid_log()
     changed.samples.loc[35.0:, "innovation_east"] -= 0.7
-    aids = {"gnss_pos": silent, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
+    aids = {"gnss_pos": not_fused, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
             "mag_heading": changed}  # fmt: skip
-    judged = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
-    keep(find_aids(judged), "innovations that were made up")
+    evaluated = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
+    keep(find_aids(evaluated), "invented innovations")
     for fault in FAULTS:
         if fault.id in made:
             continue
@@ -153,95 +156,117 @@ def examples() -> dict[str, Example]:
     return made
 
 
-def written_in() -> dict[str, tuple[str, str]]:
-    """Of each finding the file whose detector names it, and what that detector says of itself."""
-    found: dict[str, tuple[str, str]] = {}
+def detectors() -> dict[str, str]:
+    """File of the detector of each finding, without ``.py``."""
+    found: dict[str, str] = {}
     for path in sorted(FINDINGS.glob("*.py")):
-        if path.stem in ("causes", "story", "model", "__init__"):
+        if path.stem in ("causes", "since", "story", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        for function in [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]:
-            words = [n.value for n in ast.walk(function) if isinstance(n, ast.Constant)]
-            for name in [word for word in words if word in NAMES]:
-                said = ast.get_docstring(function) or ast.get_docstring(tree) or ""
-                found.setdefault(str(name), (path.stem, said))
-    # those whose names are put together there
-    said = ast.get_docstring(ast.parse((FINDINGS / "noises.py").read_text(encoding="utf-8")))
-    for name in NAMES:
-        if name.startswith(("sigma_", "kf_var", "ekf2_var")):
-            found.setdefault(name, ("noises", said or ""))
-    return found
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and node.value in NAMES:
+                found.setdefault(str(node.value), path.stem)
+    # noises.py composes these ids of filter or option and direction
+    composed = (name for name in NAMES if name.startswith(("sigma_", "kf_var", "ekf2_var")))
+    return found | dict.fromkeys(composed, "noises")
 
 
 def thresholds(stem: str) -> Iterator[str]:
-    """Rows of a table of a file's thresholds, with what stands beside them."""
+    """Table rows of the thresholds of a file, with their comments."""
     source = (FINDINGS / f"{stem}.py").read_text(encoding="utf-8")
     lines = source.splitlines()
     for node in ast.parse(source).body:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant | ast.UnaryOp):
             name, line = ast.unparse(node.targets[0]), lines[node.lineno - 1]
             before = lines[node.lineno - 2]
-            said = line.partition("  # ")[2] or (before[2:] if before.startswith("# ") else "")
-            if name.isupper():
-                said = said.replace("|", r"\|")
-                yield f"| `{name}` | {ast.unparse(node.value)} | {said} |"
+            comment = line.partition("  # ")[2] or (before[2:] if before.startswith("# ") else "")
+            if name.isupper() and not isinstance(ast.literal_eval(node.value), str):
+                comment = comment.replace("|", r"\|")
+                yield f"| `{name}` | {ast.unparse(node.value)} | {comment} |"
 
 
-def rates(name: str) -> Iterator[str]:
-    """Rows of the table of how often it is found."""
-    table = pd.read_csv(ROOT / "tests" / "studies" / "rates.csv")
+def measured_rates() -> pd.DataFrame:
+    """Rates of the findings on simulated flights, with and without their mistake."""
+    return pd.read_csv(ROOT / "tests" / "studies" / "rates.csv")
+
+
+def rate_rows(name: str) -> Iterator[str]:
+    """Table rows of the rates of one finding."""
+    table = measured_rates()
     for row in table[table["finding"] == name].itertuples():
         yield (
-            f"| {row.condition} | {row.scenario} | {row.flights} | {row.rate:.0%} | "
-            f"{row.low:.0%} to {row.high:.0%} |"
+            f"| {row.condition} | {row.scenario} | {row.flights} | {100.0 * row.rate:.0f} % | "
+            f"{100.0 * row.low:.0f} to {100.0 * row.high:.0f} % |"
         )
 
 
 def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
-    """One finding's page."""
-    stem, said = written_in()[name]
-    title = NAMES[name]
-    yield f"# {title[0].upper()}{title[1:]}\n\n`{name}`\n"
-    yield f"## What it means\n\n{MEANINGS[name]}\n"
-    yield f"In the detector's own words: {' '.join(said.split())}\n"
-    causes = [cause for cause, brought in CONSEQUENCES.items()
-              if any(each.partition(":")[0] == name for each in brought)]  # fmt: skip
-    follows = [each.partition(":")[0] for each in CONSEQUENCES.get(name, ())]
+    """Paragraphs of the page of one finding."""
+    entry = CATALOGUE[name]
+    yield f"# {entry.title}\n\n`{name}` ({entry.group})\n"
+    yield f"## What it means\n\n{entry.meaning}\n"
+    causes = [cause for cause, effects in CONSEQUENCES.items()
+              if any(each.partition(":")[0] == name for each in effects)]  # fmt: skip
+    effects = [each.partition(":")[0] for each in CONSEQUENCES.get(name, ())]
     if causes:
-        yield "It is told behind its cause where there is one of: " + links(causes) + ".\n"
-    if follows:
-        yield "It explains, and is told before: " + links(follows) + ".\n"
+        yield "It can be a consequence of: " + links(causes) + ".\n"
+    if effects:
+        yield "Possible consequences: " + links(effects) + ".\n"
     if name in RECORDING:
-        yield "It is about the recording, and is told before what is said about noises.\n"
+        yield "It concerns the recording, so it is listed before findings about noises.\n"
     if example is not None:
         finding = example.finding
-        kind = {"error": "an *error*", "warning": "a *warning*", "info": "a *remark*"}
-        yield f"## How it looks\n\nOn {example.flight}, as {kind[finding.severity]}:\n"
+        yield f"## How it looks\n\nSeverity *{finding.severity}*, on {example.flight}:\n"
         yield f"> {finding.message}\n"
         if example.analysis is not None:
             yield f"![Error, innovations and σ of that flight]({picture(name, example, folder)})\n"
         yield f"## What to do\n\n> {finding.remedy}\n"
-    found = list(rates(name))
+    found = list(rate_rows(name))
     if found:
-        yield "## How often\n"
-        yield "On simulated flights (`none`: without a mistake, so a false alarm):\n"
-        yield "| mistake | flights of | flights | found | 95 % |\n|---|---|---|---|---|"
+        yield "## False alarms and detection\n"
+        yield "Rates on simulated flights. Mistake `none`: a finding is a false alarm.\n"
+        yield "| mistake | flight | flights | found | 95 % interval |\n|---|---|---|---|---|"
         yield "\n".join(found) + "\n"
+    stem = detectors()[name]
     rows = list(thresholds(stem))
     if rows:
         yield "## Thresholds\n"
-        yield f"In `px4fuse/findings/{stem}.py`, in part shared with its other findings:\n"
-        yield "| name | value | |\n|---|---|---|"
+        yield f"In `px4fuse/findings/{stem}.py`, some of them for its other findings:\n"
+        yield "| name | value | meaning |\n|---|---|---|"
         yield "\n".join(rows) + "\n"
 
 
 def links(names: list[str]) -> str:
-    """Links to other findings."""
+    """Links to the pages of other findings."""
     return ", ".join(f"[{NAMES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
+def packaged_examples(made: Mapping[str, Example]) -> dict[str, Any]:
+    """Contents of examples.json for ``px4fuse explain``: message, action and rates by id."""
+    table, contents = measured_rates(), {}
+    for name in NAMES:
+        rows = table[table["finding"] == name]
+        clean = rows[rows["condition"] == "none"]
+        contents[name] = {
+            "message": made[name].finding.message,
+            "remedy": made[name].finding.remedy,
+            "clean_flights": int(clean["flights"].sum()),
+            "false_alarms": round(float((clean["flights"] * clean["rate"]).sum())),
+            "detection": {
+                row.condition: row.rate for row in rows[rows["condition"] != "none"].itertuples()
+            },
+        }
+    return contents
+
+
+def write_examples() -> None:
+    """Write examples.json of the package."""
+    text = json.dumps(packaged_examples(examples()), ensure_ascii=False, indent=1)
+    EXAMPLES.write_text(f"{text}\n", encoding="utf-8")
+
+
 def picture(name: str, example: Example, folder: Path) -> str:
-    """Draw the main axis of the example's flight."""
+    """Draw error, innovations and σ of the example's axis; return the file name."""
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     shown = example.analysis.axes.get(str(axis)) or example.analysis.main
@@ -256,8 +281,20 @@ def picture(name: str, example: Example, folder: Path) -> str:
     return f"{name}.png"
 
 
+def index() -> Iterator[str]:
+    """Paragraphs of the index, one table and one chapter of the sidebar per group."""
+    yield "# The findings\n\n`px4fuse explain ID` prints a page in the terminal.\n"
+    for group in GROUPS:
+        names = [name for name, entry in CATALOGUE.items() if entry.group == group]
+        caption = group[0].upper() + group[1:]
+        yield f"## {caption}\n\n| finding | id |\n|---|---|"
+        yield "\n".join(f"| [{NAMES[name]}]({name}.md) | `{name}` |" for name in names)
+        yield f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n"
+        yield "\n".join(names) + "\n```\n"
+
+
 def write(folder: Path) -> None:
-    """Write all pages anew."""
+    """Write all pages."""
     mpl.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
     made = examples()
@@ -266,17 +303,11 @@ def write(folder: Path) -> None:
         text = "\n".join(page(name, made.get(name), folder))
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
         pyplot.close("all")
-    (folder / "index.md").write_text(
-        "# The findings\n\nWhat px4fuse calls by its name, in the order in which it is told. "
-        "Each page is made from the detector's own file.\n\n"
-        "| finding | id |\n|---|---|\n"
-        + "\n".join(f"| [{title}]({name}.md) | `{name}` |" for name, title in NAMES.items())
-        + "\n\n```{toctree}\n:hidden:\n\n"
-        + "\n".join(NAMES)
-        + "\n```\n",
-        encoding="utf-8",
-    )
+    (folder / "index.md").write_text("\n".join(index()), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1]))
+    if sys.argv[1] == "--examples":
+        write_examples()
+    else:
+        write(Path(sys.argv[1]))

@@ -1,4 +1,4 @@
-"""Analyses that hold no more than a finding reads, so that the right answer is plain."""
+"""Minimal analyses for tests of detectors: they contain only the fields that a detector reads."""
 
 import inspect
 from collections.abc import Callable, Iterable
@@ -28,12 +28,12 @@ T = TypeVar("T")
 NONE = Unavailable("it", "no topic for it", "Log it.")
 SEGMENT = Segment(10.0, 110.0, "")
 DRIFTING = replace(RECEIVED, kind="vio")
-# A setting that nobody comes with
+# Settings that differ from the defaults
 CHOSEN = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0)
 
 
 def made(kind: type[T], **parts: Any) -> T:
-    """An instance that holds these parts alone: to read another one is an error."""
+    """Make an instance with these fields only; reading another field is an error."""
     if issubclass(kind, msgspec.Struct):
         return StandIn(kind, parts)  # type: ignore[return-value]
     one = object.__new__(kind)
@@ -43,7 +43,7 @@ def made(kind: type[T], **parts: Any) -> T:
 
 
 class StandIn:
-    """What passes for a record that has some of its fields, and what follows from them."""
+    """Stand-in for a record with some of its fields; properties of the record work."""
 
     def __init__(self, kind: type, parts: dict[str, Any]) -> None:
         self.__dict__.update(parts, _kind=kind)
@@ -90,7 +90,7 @@ def analysis(
     flight: dict[str, Any] | None = None, settings: Settings = CHOSEN, notes: tuple[str, ...] = (),
     missing: tuple[Any, ...] = (), **parts: Any,
 ) -> Analysis:  # fmt: skip
-    """What is not given is not there."""
+    """Make an analysis; fields that are not given are Unavailable."""
     if isinstance(ekf2, dict):
         ekf2 = made(Ekf2, **ekf2)
     usual_flight = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, "airborne": NONE}
@@ -108,7 +108,7 @@ def analysis(
 
 
 def axis(name: str = "north", **parts: Any) -> Any:
-    """One axis; a filter that is not given is not judged."""
+    """Make the result of one axis; filters that are not given have no consistency test."""
     usual = {"ekf2_innovations": NONE, "truth": NONE, "ekf2_state": NONE}
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
@@ -130,7 +130,7 @@ def tried(
     owner: Any, change: dict[str, float], axis: str = "north", of: Any = "nis",
     before: float = 9.0, explains: float = 1.0,
 ) -> Intervention:  # fmt: skip
-    """What a change explained."""
+    """Make the result of a re-run: the share of a statistic that a change explains."""
     after = before ** (1.0 - explains)
     return Intervention(
         of=of, filter=owner, axis=axis, change=change, before=before, after=after,
@@ -139,7 +139,7 @@ def tried(
 
 
 def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> Any:
-    """A filter with this mean NIS."""
+    """Make the consistency of a filter with this mean NIS."""
     usual = {"lag1_autocorrelation": 0.0, "outside_gate": 0.0, "innovation_std_m": 0.3,
              "innovation_mean_m": 0.4}  # fmt: skip
     return made(
@@ -157,7 +157,7 @@ def against_truth(nees: float, rmse_m: float = 0.4) -> AgainstTruth:
 
 
 def hiding(nis: float = 1.0, nees: float = 4.0, name: str = "north", **parts: Any) -> Any:
-    """Our filter, content with its innovations."""
+    """Make an axis on which KF has this mean NIS and mean NEES."""
     return axis(name, kf=statement(nis), kf_truth=against_truth(nees), **parts)
 
 
@@ -169,7 +169,7 @@ def named(detect: Detect, subject: Any) -> dict[str, str]:
 
 
 def severity(detect: Detect, subject: Any) -> str | None:
-    """Of the one finding; None where there is none."""
+    """Severity of the only finding; None without a finding."""
     found = named(detect, subject)
     assert len(found) <= 1
     return next(iter(found.values()), None)
@@ -181,7 +181,7 @@ def only(detect: Detect, subject: Any) -> Finding:
 
 
 def ages(arrival: int, later: int, latency_s: float = 0.05, wrong: int = 0) -> dict[str, Any]:
-    """Stamps of arrival, so many of them late, then true ones."""
+    """Ages of arrival times (`wrong` of them have the latency), then of measurement times."""
     age = [latency_s] * wrong + [0.0] * (arrival - wrong) + [latency_s] * later
     series = pd.Series(age, index=20.0 + np.arange(len(age)))
     return {"record": made(FusionRecord, vision_age_s=series)}

@@ -1,7 +1,5 @@
 """One finding per cause, advice for what nobody chose, and the order in which causes are told."""
 
-import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,7 +8,6 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.findings import NAMES, Finding, causes
 from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, group_by_cause
-from px4fuse.findings.model import WORDS
 from px4fuse.report.words import verdict_notes
 
 
@@ -24,14 +21,6 @@ def test_the_table_knows_only_findings_that_there_are() -> None:
     kinds = {name.partition(":")[2] for names in CONSEQUENCES.values() for name in names}
     assert kinds - {""} <= {value for name, value in vars(causes).items() if name.isupper()
                             and isinstance(value, str)}  # fmt: skip
-
-
-def test_detectors_give_every_fact_that_the_words_name() -> None:
-    files = Path(causes.__file__).parent.glob("*.py")
-    source = "".join(path.read_text(encoding="utf-8") for path in files)
-    for name, words in WORDS.items():
-        for fact in set(re.findall(r"{(\w+)", str(words))) - set(words):
-            assert re.search(rf'\b{fact}=|"{fact}"', source), (name, fact)
 
 
 def test_the_table_has_inner_causes_before_outer_ones() -> None:

@@ -1,4 +1,4 @@
-"""The shipped table of false-alarm rates and power, and that this code still makes it."""
+"""Measured false alarm and detection rates (studies/rates.csv), and samples of them re-measured."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from detector_rates import (
 )
 
 TABLE = rates()
-# Told behind what makes it
-BEHIND = ("ekf2_rejecting", "aid_starved", "aid_understated")
-# Sizes that a log cannot show, for the reason in the finding's file; measured all the same
-INVISIBLE = {
+# Findings listed behind their cause
+CONSEQUENCES = ("ekf2_rejecting", "aid_starved", "aid_understated")
+# Mistakes too small to be detected; the reason is in the file of the detector
+NOT_DETECTABLE = {
     ("source_scale_wrong", "--mistake scale=5%"),
     ("source_thinned", "--mistake decimate=2.5Hz"),
 }
 
 
-def test_no_detector_cries_wolf_on_more_than_two_clean_flights_in_a_hundred() -> None:
+def test_rates_clean_flights_have_at_most_2_percent_alarms() -> None:
     clean = TABLE[TABLE["condition"] == CLEAN]
     assert set(clean["scenario"]) == set(SCENARIOS)
     assert clean["flights"].min() >= 50
@@ -36,26 +36,26 @@ def test_no_detector_cries_wolf_on_more_than_two_clean_flights_in_a_hundred() ->
 
 
 @pytest.mark.parametrize("finding", sorted({condition.finding for condition in CONDITIONS}))
-def test_every_detector_names_its_mistake_first_at_the_size_stated(finding) -> None:
+def test_rates_each_mistake_is_listed_first_on_95_percent(finding) -> None:
     rows = TABLE[(TABLE["finding"] == finding) & (TABLE["condition"] != CLEAN)]
-    assert rows["rate" if finding in BEHIND else "first"].max() >= 0.95
+    assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
 
-def test_what_a_log_cannot_show_is_not_found_by_chance() -> None:
-    for finding, condition in INVISIBLE:
+def test_rates_undetectable_mistakes_are_rarely_found() -> None:
+    for finding, condition in NOT_DETECTABLE:
         (row,) = TABLE[
             (TABLE["finding"] == finding) & (TABLE["condition"] == condition)
         ].itertuples()
         assert row.rate <= 0.1
 
 
-def test_noises_whose_likelihood_is_lost_in_rounding_are_passed_over() -> None:
-    """A slow error of 10 m over a SIGMA_Z of 1 mm, two positions 0.5 ms apart."""
+def test_find_likelihood_lost_in_rounding_is_skipped() -> None:
+    """Time-correlated error of 10 m, SIGMA_Z 1 mm, an interval of 0.5 ms between two positions."""
     jump = Condition("source_clock_changes", "--mistake clock-jump=400ms")
     assert found(FAULTY_SEED + 2, jump)[0] == "source_clock_changes"
 
 
-def test_the_code_still_does_what_the_table_says() -> None:
+def test_find_mistakes_detected_always_are_still_found() -> None:
     certain = {(row.finding, row.condition) for row in TABLE.itertuples() if row.rate == 1.0}
     assert found(5) == ()
     for condition in (
@@ -68,7 +68,7 @@ def test_the_code_still_does_what_the_table_says() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_rows_count_what_was_named_and_what_came_first() -> None:
+def test_rows_count_found_and_listed_first() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_turned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(

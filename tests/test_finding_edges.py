@@ -1,6 +1,6 @@
-"""Each finding but those of noises at the edges of its thresholds.
+"""Detectors, except those of noises, at the limits of their thresholds.
 
-The limits are written out here, so that one that is changed must be changed here as well.
+The limits are repeated here, so a change of a threshold fails a test.
 """
 
 from functools import partial
@@ -65,32 +65,32 @@ from px4fuse.origin import ALIGNED, FROM_INNOVATIONS, GNSS, LOGGED_BY_EKF2, MOTI
 from px4fuse.recording import Dropout
 
 
-def steps(*pairs: tuple[float, float], column: str = "horizontal") -> dict[str, Any]:
-    """EKF2 whose fusion flag changes at these times."""
+def with_fusion(*pairs: tuple[float, float], column: str = "horizontal") -> dict[str, Any]:
+    """EKF2 fields with a fusion flag that changes at these times."""
     time, value = zip(*pairs, strict=True)
     return {"fusing": pd.DataFrame({column: value}, index=list(time), dtype=float)}
 
 
-def one_of(name: str, level: Any = "error", caused_by: str | None = None) -> Finding:
-    return Finding(name, level, "It is.", "Do.", caused_by=caused_by)
+def make_finding(name: str, level: Any = "error", caused_by: str | None = None) -> Finding:
+    return Finding(name, level, "It is so.", "Do it.", caused_by=caused_by)
 
 
-# ---------------------------------------------------------------- words, times and order
+# ---------------------------------------------------------------- times and order
 
 
 @pytest.mark.parametrize(
-    ("spans", "said"),
+    ("spans", "expected"),
     [
         ((), ""), (((1.0, 1.0),) * 3, "1.0 s, 1.0 s, 1.0 s"),
         (((1.0, 1.0), (2.0, 2.0), (3.0, 3.0), (4.0, 5.0)), "from 1.0 s to 5.0 s"),
         (((0.0, 0.05),), "0.0 s"), (((0.0, 0.06),), "0.0 s to 0.1 s"),
     ],
 )  # fmt: skip
-def test_when_a_finding_shows(spans: Any, said: str) -> None:
-    assert replace(one_of("x"), spans_s=spans).when == said
+def test_finding_when_formats_spans(spans: Any, expected: str) -> None:
+    assert replace(make_finding("x"), spans_s=spans).when == expected
 
 
-def test_the_share_of_a_step_function_counts_its_first_value_before_it_begins() -> None:
+def test_fraction_on_first_value_extends_backwards() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
     assert fraction_on(flag, whole) == 0.5
     assert fraction_on(flag, Segment(25.0, 35.0, "")) == 0.5
@@ -99,16 +99,18 @@ def test_the_share_of_a_step_function_counts_its_first_value_before_it_begins() 
     assert spans_at(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
-def test_what_follows_stands_behind_its_cause() -> None:
-    first, other = one_of("kf_variance_overstated"), one_of("no_motion", "info")
-    follows = one_of("kf_variance_overstated", caused_by="kf_variance_overstated")
+def test_by_root_groups_consequences_behind_cause() -> None:
+    first, other = make_finding("kf_variance_overstated"), make_finding("no_motion", "info")
+    follows = make_finding("kf_variance_overstated", caused_by="kf_variance_overstated")
     assert by_root([first, follows, other]) == [[first, follows], [other]]
 
 
 # ---------------------------------------------------------------- EKF2
 
 
-def test_only_what_happens_in_the_segment_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ekf2_resets_and_dropouts_outside_segment_are_ignored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets undone"))
     switches = tuple((time, 1) for time in (-np.inf, 10.0, 10.5, 110.0, 110.1))
     resets = (
@@ -131,54 +133,70 @@ def test_only_what_happens_in_the_segment_counts(monkeypatch: pytest.MonkeyPatch
         (60.0, {"ekf2_fusion_interrupted": "warning"}), (59.9, {"ekf2_not_fusing": "error"}),
     ],
 )  # fmt: skip
-def test_fusion_that_stops(until_s: float, expected: dict[str, str]) -> None:
-    one = analysis(ekf2=steps((0.0, 1.0), (until_s, 0.0)))
+def test_ekf2_not_fusing_severity_follows_share(until_s: float, expected: dict[str, str]) -> None:
+    one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
     assert named(ekf2_not_fusing.detect, one) == expected
     for finding in ekf2_not_fusing.detect(one):
-        assert f"fused the source in only {(until_s - 10.0) / 100.0:.0%}" in finding.message
+        assert f"only in {until_s - 10.0:.0f} % of the segment" in finding.message
         if finding.id == "ekf2_fusion_interrupted":
-            # before that release it goes on for seven seconds
-            assert "EKF2 (v1.14 and later) stops after 0.4 s without a sample" in finding.remedy
+            # earlier releases stop after 7 s
+            assert "EKF2 (v1.14 and later) stops fusion 0.4 s after" in finding.remedy
             assert finding.spans_s == ((until_s, 110.0),)
 
 
-def never(rate_hz: float = 5.0, age_s: float | None = None, **parts: Any) -> Any:
-    """EKF2 that never fuses, fed by samples of this age, at a horizon of 0.2 s."""
+def never_fusing(rate_hz: float = 5.0, age_s: float | None = None, **parts: Any) -> Any:
+    """Make a flight on which EKF2 never fuses; samples have this age, the horizon is 0.2 s."""
     record: Any = NONE
     if age_s is not None:
         age = pd.Series([9.0, age_s, age_s, age_s, 9.0], index=[9.0, 20.0, 30.0, 40.0, 111.0])
         record = made(FusionRecord, vision_age_s=age)
     horizon, parameters = parts.pop("horizon_s", 0.2), parts.pop("parameters", {})
-    ekf2 = {**steps((0.0, 0.0)), "record": record, "horizon_s": horizon}
+    ekf2 = {**with_fusion((0.0, 0.0)), "record": record, "horizon_s": horizon}
     fed = source(rate_hz=rate_hz, **parts)
     return analysis(ekf2=ekf2, log=log(parameters=parameters), source=fed)
 
 
-UNKNOWN = "the log does not show why"
+UNKNOWN = "The log does not contain the reason"
 
 
 @pytest.mark.parametrize(
-    ("one", "says", "remedy"),
+    ("flight", "reason", "remedy"),
     [
-        (never(parameters={"EKF2_EV_CTRL": 14.0}), "EKF2_EV_CTRL is 14, bit 0", "to 15."),
-        (never(parameters={"EKF2_EV_CTRL": 15.0, "EKF2_AID_MASK": 1.0}), UNKNOWN, "EKF2_EV_CTRL"),
-        (never(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1, bit 3", "to 9."),
-        (never(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
-        (never(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # such a release has no limit
-        (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "come every 0.50 s", "10 Hz"),
-        (never(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2), UNKNOWN, "Check"),
-        (never(5.0, parameters={"EKF2_EV_CTRL": 15.0}), UNKNOWN, "Check"),
-        (never(age_s=0.29), UNKNOWN, "Check"), (never(age_s=5.0, horizon_s=NONE), UNKNOWN, "Check"),
-        (never(age_s=0.31), "arrive 0.31 s after their stamps, and EKF2 keeps no more than 0.20 s",
-         "EKF2_DELAY_MAX"),
-        (never(age_s=0.28, parameters={"EKF2_EV_DELAY": 50.0}), "arrive 0.33 s", "EKF2_DELAY_MAX"),
+        (never_fusing(parameters={"EKF2_EV_CTRL": 14.0}), "EKF2_EV_CTRL is 14: bit 0", "to 15."),
+        (
+            never_fusing(parameters={"EKF2_EV_CTRL": 15.0, "EKF2_AID_MASK": 1.0}),
+            UNKNOWN,
+            "EKF2_EV_CTRL",
+        ),
+        (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1: bit 3", "to 9."),
+        (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
+        (never_fusing(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # releases before v1.14 have no limit
+        (never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "come every 0.50 s", "10 Hz"),
+        (
+            never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2),
+            UNKNOWN,
+            "Check",
+        ),
+        (never_fusing(5.0, parameters={"EKF2_EV_CTRL": 15.0}), UNKNOWN, "Check"),
+        (never_fusing(age_s=0.29), UNKNOWN, "Check"),
+        (never_fusing(age_s=5.0, horizon_s=NONE), UNKNOWN, "Check"),
+        (
+            never_fusing(age_s=0.31),
+            "arrive 0.31 s after their timestamps, but EKF2 buffers only 0.20 s",
+            "EKF2_DELAY_MAX",
+        ),
+        (
+            never_fusing(age_s=0.28, parameters={"EKF2_EV_DELAY": 50.0}),
+            "arrive 0.33 s",
+            "EKF2_DELAY_MAX",
+        ),
     ],
-)  # fmt: skip
-def test_why_ekf2_does_not_fuse(one: Any, says: str, remedy: str) -> None:
-    finding = only(ekf2_not_fusing.detect, one)
+)
+def test_ekf2_not_fusing_states_reason_and_action(flight: Any, reason: str, remedy: str) -> None:
+    finding = only(ekf2_not_fusing.detect, flight)
     assert finding.severity == "error"
-    assert "never fused the source in this segment" in finding.message
-    assert says in finding.message
+    assert "in no part of the segment" in finding.message
+    assert reason in finding.message
     assert remedy in finding.remedy
 
 
@@ -192,67 +210,71 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     ("count", "of", "expected"),
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
-def test_rejections(count: int, of: int, expected: str | None) -> None:
-    """Of the horizontal vector, so that the first axis speaks for both."""
+def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: str | None) -> None:
+    """EKF2 rejects the horizontal vector, so the first axis is used."""
     axes = axis("north", ekf2_innovations=rejected(count, of)), axis("east")
     axes[1].ekf2_innovations = rejected(9, 9)
     level = analysis(ekf2={"gate": 5.0}, axes=axes)
     down = analysis(ekf2={"gate": 5.0}, axes=(axis("down", ekf2_innovations=rejected(count, of)),))
-    for one, what, remedy in (
-        (level, "for horizontal position (outside 5 √S)", "Not replayed: no topic for it."),
-        (down, "for height", "widen EKF2_EVP_GATE last."),
+    for one, quantity, remedy in (
+        (level, "for horizontal position (beyond 5 √S)", "no topic for it."),
+        (down, "for height", "Widen EKF2_EVP_GATE last."),
     ):
         assert severity(ekf2_rejecting.detect, one) == expected
         for finding in ekf2_rejecting.detect(one):
             assert finding.spans_s == moments(20.0 + np.arange(count))
-            assert what in finding.message
+            assert quantity in finding.message
             assert finding.remedy.endswith(remedy)
 
 
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_hidden_errors_are_told_of_the_worst_axis_first() -> None:
+def test_hidden_errors_report_worst_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(hiding(), ekf2)))
-    assert finding.message.startswith("Innovations small, errors large: ")
+    assert "although the innovations are small" in finding.message
     assert finding.evidence["filter"] == "ekf2"
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)
-    assert finding.remedy == hidden_errors.REMEDIES["shared"]
-    # it is EKF2's own where our filter errs less, not where it only knows its error
-    for ours_m, remedy in ((0.27, "ekf2"), (0.28, "shared"), (0.4, "shared")):
-        just = axis("east", kf=statement(2.0), kf_truth=against_truth(25.0, ours_m),
+    assert finding.remedy == hidden_errors.SHARED_REMEDY
+    # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
+    for kf_rmse_m, remedy in (
+        (0.27, hidden_errors.EKF2_REMEDY),
+        (0.28, hidden_errors.SHARED_REMEDY),
+        (0.4, hidden_errors.SHARED_REMEDY),
+    ):
+        just = axis("east", kf=statement(2.0), kf_truth=against_truth(25.0, kf_rmse_m),
                     ekf2=statement(0.5), ekf2_truth=against_truth(25.0))  # fmt: skip
         alone = only(hidden_errors.detect, analysis(axes=(just,)))
-        assert alone.remedy == hidden_errors.REMEDIES[remedy]
+        assert alone.remedy == remedy
     drifts = only(hidden_errors.detect, analysis(axes=(hiding(),), source=source(origin=DRIFTING)))
-    assert drifts.remedy == hidden_errors.REMEDIES["drift"]
+    assert drifts.remedy == hidden_errors.DRIFT_REMEDY
 
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_what_a_turn_and_shift_of_the_frame_leaves(left: float, frame: bool, drifts: bool) -> None:
-    """On a circle of 5 m: a shift, and an error that changes sign from sample to sample."""
+def test_hidden_errors_report_rmse_after_alignment(left: float, frame: bool, drifts: bool) -> None:
+    """Circle of 5 m with a shift and an error that changes its sign with each sample."""
     time = np.arange(20.0, 100.0, 0.1)
     angle = 0.2 * np.pi * time
     true = 5.0 * np.column_stack([np.cos(angle), np.sin(angle)])
-    own = true + np.array([0.0, np.sqrt(1.0 - left**2)])
-    own[::2, 0] += left
-    own[1::2, 0] -= left
-    own[0] = np.nan  # unknown there
+    estimate = true + np.array([0.0, np.sqrt(1.0 - left**2)])
+    estimate[::2, 0] += left
+    estimate[1::2, 0] -= left
+    estimate[0] = np.nan
     axes = [
         axis(name, ekf2=statement(), ekf2_truth=against_truth(9.0),
              truth=pd.DataFrame({"position_m": true[:, at]}, index=time),
-             ekf2_state=pd.DataFrame({"position_m": own[:, at]}, index=time))
+             ekf2_state=pd.DataFrame({"position_m": estimate[:, at]}, index=time))
         for at, name in enumerate(("north", "east"))
     ]  # fmt: skip
-    moves = source(origin=DRIFTING if drifts else RECEIVED)
-    finding = only(hidden_errors.detect, analysis(axes=tuple(axes), source=moves))
+    track = source(origin=DRIFTING if drifts else RECEIVED)
+    finding = only(hidden_errors.detect, analysis(axes=tuple(axes), source=track))
     assert finding.evidence["position_rmse_horizontal_m"] == pytest.approx(1.0, rel=0.01)
     assert finding.evidence["position_rmse_aligned_m"] == pytest.approx(left, rel=0.01)
-    assert ("Most of it is how the source's frame lies" in finding.message) is frame
-    assert ("and the filter follows it" in finding.message) is (drifts and not frame)
-    assert (finding.remedy == hidden_errors.REMEDIES["frame"]) is frame
+    assert ("the frame is misaligned" in finding.message) is frame
+    assert ("the source drifts" in finding.message) is (drifts and not frame)
+    assert (finding.remedy == hidden_errors.FRAME_REMEDY) is frame
 
 
 # ---------------------------------------------------------------- the log
@@ -266,8 +288,8 @@ def test_what_a_turn_and_shift_of_the_frame_leaves(left: float, frame: bool, dri
         ((10.0, 109.9), (10.0, 110.0), [(39.99, 42.0), (109.9, 110.0)]),
     ],
 )  # fmt: skip
-def test_when_the_imu_is_missing(ends: Any, segment: Any, spans: Any) -> None:
-    """Inside, at the ends by more than a moment, and not outside the segment."""
+def test_imu_gap_spans_are_found_inside_the_segment(ends: Any, segment: Any, spans: Any) -> None:
+    """Gaps at an end count if longer than 0.05 s; gaps outside the segment do not."""
     time = np.concatenate([np.arange(ends[0], 40.0, 0.01), np.arange(42.0, ends[1], 0.01)])
     found = imu._gap_spans(pd.DataFrame(index=time), Segment(*segment, ""))
     assert len(found) == len(spans)
@@ -278,16 +300,16 @@ def test_when_the_imu_is_missing(ends: Any, segment: Any, spans: Any) -> None:
     ("imu_hz", "attitude_hz", "expected"),
     [(49.1, 9.9, []), (48.9, 9.9, [100.0]), (49.1, 9.7, [20.0])],
 )
-def test_topics_that_were_logged_too_slowly(imu_hz, attitude_hz, expected) -> None:
+def test_imu_rates_below_98_percent_are_reported(imu_hz, attitude_hz, expected) -> None:
     flight = {"imu": at_rate(imu_hz), "attitude": at_rate(attitude_hz)}
-    for info, says in (
-        (log(), "into etc/logging/logger_topics.txt"),
+    for info, action in (
+        (log(), "Add 16 to SDLOG_PROFILE"),
         (log(format="MAVLink tlog", has_ulog=False), "at {:g} Hz (MAV_CMD_SET"),
-        (log(format="MAVLink tlog"), "-r {:g} in PX4's console)"),
+        (log(format="MAVLink tlog"), "at {0:g} Hz (PX4 console: mavlink stream"),
     ):
         found = list(imu.rates(analysis(flight=flight, log=info).flight))
         assert [finding.evidence["needed_hz"] * 2.0 for finding in found] == expected
-        assert all(says.format(hz) in f.remedy for f, hz in zip(found, expected, strict=True))
+        assert all(action.format(hz) in f.remedy for f, hz in zip(found, expected, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -300,10 +322,12 @@ def test_topics_that_were_logged_too_slowly(imu_hz, attitude_hz, expected) -> No
         (2.0, "estimator_aid_src_ev_pos", True), (5.0, "ekf2_state_plus_innovation", True),
     ],
 )  # fmt: skip
-def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated: bool) -> None:
+def test_source_as_sent_logger_limit_is_reported(
+    rate_hz: float, name: str, decimated: bool
+) -> None:
     lacks = (
         Unavailable("another", "no", "Do."),
-        Unavailable("it", "it was off", "Do.", source="vehicle_visual_odometry"),
+        Unavailable("it", "it was disabled", "Do.", source="vehicle_visual_odometry"),
     )
     profile = log(parameters={"SDLOG_PROFILE": 2.0})
     for origin in (ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS):
@@ -312,7 +336,7 @@ def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated:
         assert [one.id for one in found] == ["source_not_logged", "source_decimated"][
             : 1 + decimated
         ]
-        assert "as it arrived (it was off); " in found[0].message
+        assert "lacks vehicle_visual_odometry (it was disabled)" in found[0].message
         assert all("SDLOG_PROFILE to 130 " in each.remedy for each in found)
         for each in found[1:]:
             assert rate_hz == pytest.approx(each.evidence["logger_limit_hz"], rel=0.35)
@@ -325,8 +349,8 @@ def test_positions_that_the_logger_thinned(rate_hz: float, name: str, decimated:
 
 
 @pytest.mark.parametrize(("rate_hz", "least_s"), [(2.0, 2.5), (10.0, 1.0)])
-def test_a_silent_source(rate_hz: float, least_s: float) -> None:
-    """Five intervals, and a second at least."""
+def test_gaps_above_five_intervals_and_1_s_are_reported(rate_hz: float, least_s: float) -> None:
+    """The limit is five intervals, but at least 1 s."""
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
         one = analysis(axes=(axis(),), source=source(rate_hz=rate_hz))
@@ -337,7 +361,7 @@ def test_a_silent_source(rate_hz: float, least_s: float) -> None:
         ] * there
 
 
-def test_the_range_of_the_motion_leaves_out_a_twentieth_at_either_end() -> None:
+def test_motion_range_ignores_5_percent_at_each_end() -> None:
     moving = positions(10.0 + np.arange(100))
     moving["east_m"] = np.repeat([-9.0, -1.0, -0.5, 0.0, 0.5, 1.0, 9.0], [3, 4, 3, 80, 3, 4, 3])
     outside = positions([5.0, 111.0], 99.0)
@@ -348,7 +372,7 @@ def test_the_range_of_the_motion_leaves_out_a_twentieth_at_either_end() -> None:
 # ---------------------------------------------------------------- frames
 
 
-def test_what_is_poorly_known_of_a_files_place_is_told_with_its_option() -> None:
+def test_placement_conflict_is_error_and_doubt_is_warning() -> None:
     placed = SimpleNamespace(
         misplaced=("as good as ned: give --position-frame ned.",), warnings=("it is weak.",)
     )
@@ -358,9 +382,9 @@ def test_what_is_poorly_known_of_a_files_place_is_told_with_its_option() -> None
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "info")])
-def test_a_frame_that_is_not_north(until_s: float, expected: str) -> None:
+def test_frame_not_north_severity_depends_on_fused_yaw(until_s: float, expected: str) -> None:
     frd = source(frame="FRD")
-    one = analysis(source=frd, ekf2=steps((0.0, 1.0), (until_s, 0.0), column="yaw"))
+    one = analysis(source=frd, ekf2=with_fusion((0.0, 1.0), (until_s, 0.0), column="yaw"))
     finding = only(source_frame.detect, one)
     assert finding.severity == expected
     assert ("EKF2 fused its yaw" in finding.message) is (expected == "info")
@@ -371,34 +395,30 @@ def test_a_frame_that_is_not_north(until_s: float, expected: str) -> None:
         one = analysis(source=frd, ekf2={"fusing": NONE}, log=log(has_ulog=has_ulog))
         finding = only(source_frame.detect, one)
         assert finding.severity == "info"
-        assert ("the ULog says" in finding.remedy) is has_ulog
+        assert ("The ULog shows" in finding.remedy) is has_ulog
 
 
-def combine_heading_parts(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
+def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
     parts = (HeadingPart(10.0 * n, 10.0 * n + 10.0, d, sigma_deg) for n, d in enumerate(degrees))
     return together(tuple(parts), p, "positions")
 
 
-def test_a_turn_is_told_with_its_interval_and_undone_by_its_opposite() -> None:
-    finding = only(
-        source_frame.detect, analysis(heading=combine_heading_parts(20.0, sigma_deg=2.0))
-    )
+def test_misalignment_reports_interval_and_opposite_rotation() -> None:
+    finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
     assert finding.id == "source_frame_turned"
-    assert "turned by +20° ± 4° (clockwise" in finding.message
-    assert "Turn the positions by -20°" in finding.remedy
+    assert "rotated by +20° ± 4° (clockwise" in finding.message
+    assert "Rotate the positions by -20°" in finding.remedy
     aligned = source(name="estimator_visual_odometry_aligned")
     for has_ulog in (True, False):
-        one = analysis(
-            heading=combine_heading_parts(20.0), source=aligned, log=log(has_ulog=has_ulog)
-        )
+        one = analysis(heading=heading_error(20.0), source=aligned, log=log(has_ulog=has_ulog))
         assert only(source_frame.detect, one).id == "ekf2_heading_wrong"
         assert ("EKF2_EV_CTRL bit 3" in only(source_frame.detect, one).remedy) is has_ulog
 
 
-def test_a_heading_that_drifts_is_told_from_end_to_end() -> None:
-    finding = only(source_frame.detect, analysis(heading=combine_heading_parts(2.0, 30.0, p=0.0)))
+def test_misalignment_heading_drift_reports_both_ends() -> None:
+    finding = only(source_frame.detect, analysis(heading=heading_error(2.0, 30.0, p=0.0)))
     assert finding.id == "ekf2_heading_wrong"
-    assert "lies at +2° from 0 to 10 s and at +30° from 10 to 20 s" in finding.message
+    assert "+2° from 0 to 10 s, +30° from 10 to 20 s" in finding.message
     assert "by the positions and the IMU" in finding.message
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
 
@@ -406,30 +426,30 @@ def test_a_heading_that_drifts_is_told_from_end_to_end() -> None:
 # ---------------------------------------------------------------- limits
 
 
-def decimated(logged: int) -> Any:
+def with_innovations(logged: int) -> Any:
     frame = pd.DataFrame(index=range(logged))
     axes = (axis(ekf2_innovations=frame, replay=SimpleNamespace(updates=range(100))),)
     return analysis(ekf2={"innovation_topics": ("topic",)}, axes=axes)
 
 
-def beside_vision(name: str, first: float) -> Any:
+def motion_capture_flight(name: str, first: float) -> Any:
     fed = source(name=name, origin=MOTION_CAPTURE)
-    return analysis(ekf2=steps((0.0, first), (100.0, 0.0)), source=fed)
+    return analysis(ekf2=with_fusion((0.0, first), (100.0, 0.0)), source=fed)
 
 
-def moved(extent_m: float) -> Any:
+def with_extent(extent_m: float) -> Any:
     samples = positions(10.0 + np.arange(100), np.repeat([0.0, extent_m], 50))
     return analysis(source=source(samples=samples))
 
 
 FUSED, FRAME = ekf2_not_fusing.detect, source_frame.detect
 EDGES = [
-    (missing.innovations, decimated(75), None),
-    (missing.innovations, decimated(74), "info"),
-    # motion capture; with external vision beside it, it is an independent reference
-    (FUSED, beside_vision("vehicle_mocap_odometry", 0.0), "warning"),
-    (FUSED, beside_vision("vehicle_mocap_odometry", 1.0), None),
-    (FUSED, beside_vision("GPS", 0.0), None),
+    (missing.innovations, with_innovations(75), None),
+    (missing.innovations, with_innovations(74), "info"),
+    # motion capture is an independent reference if EKF2 fuses external vision
+    (FUSED, motion_capture_flight("vehicle_mocap_odometry", 0.0), "warning"),
+    (FUSED, motion_capture_flight("vehicle_mocap_odometry", 1.0), None),
+    (FUSED, motion_capture_flight("GPS", 0.0), None),
     *(
         (hidden_errors.detect, analysis(axes=(hiding(nis, nees),)), expected)
         for nis, nees, expected in (
@@ -458,24 +478,24 @@ EDGES = [
             (0.501, 4.0, "warning"),
         )
     ),
-    (source_positions.motion, moved(0.5), None),
-    (source_positions.motion, moved(0.499), "warning"),
+    (source_positions.motion, with_extent(0.5), None),
+    (source_positions.motion, with_extent(0.499), "warning"),
     *(
         (FRAME, analysis(heading=heading), expected)
         for heading, expected in (
-            (combine_heading_parts(5.0), "warning"),
-            (combine_heading_parts(4.9), None),
-            (combine_heading_parts(14.9), "warning"),
-            (combine_heading_parts(15.0), "error"),
-            (combine_heading_parts(8.0, sigma_deg=2.0), "warning"),
-            (combine_heading_parts(7.9, sigma_deg=2.0), None),
-            (combine_heading_parts(0.0, 14.9, p=0.0), "warning"),
-            (combine_heading_parts(0.0, 15.0, p=0.0), "error"),
+            (heading_error(5.0), "warning"),
+            (heading_error(4.9), None),
+            (heading_error(14.9), "warning"),
+            (heading_error(15.0), "error"),
+            (heading_error(8.0, sigma_deg=2.0), "warning"),
+            (heading_error(7.9, sigma_deg=2.0), None),
+            (heading_error(0.0, 14.9, p=0.0), "warning"),
+            (heading_error(0.0, 15.0, p=0.0), "error"),
         )
     ),
     (
         FRAME,
-        analysis(heading=combine_heading_parts(20.0), source=source(origin=LOGGED_BY_EKF2)),
+        analysis(heading=heading_error(20.0), source=source(origin=LOGGED_BY_EKF2)),
         None,
     ),
 ]
@@ -485,11 +505,11 @@ EDGES = [
 
 MOVING = positions(np.arange(0.0, 120.0), np.arange(120.0))
 ODOMETRY = {"source": source(orientation=object(), samples=MOVING)}
-MADE_OF_EKF2 = {"source": source(origin=LOGGED_BY_EKF2, samples=MOVING)}
+REBUILT = {"source": source(origin=LOGGED_BY_EKF2, samples=MOVING)}
 
 
 def bias_of_ekf2(*bias: float) -> dict[str, Any]:
-    """EKF2's bias in the segment, and another one outside it."""
+    """EKF2 bias in the segment, and a larger one outside it."""
     rows = [[9.0] * 3, bias, bias, bias, [9.0] * 3]
     index = [9.0, 10.0, 50.0, 110.0, 111.0]
     return {"accelerometer_bias": pd.DataFrame(rows, index=index, columns=Columns.SPECIFIC_FORCE)}
@@ -516,7 +536,7 @@ def slow(gain: float, lag: float, slow_m: float = 0.1) -> TimeCorrelatedNoise:
 
 
 def repeating(again: int, count: int, moved_m: float = 5.0) -> Any:
-    """So many of the positions are the one before."""
+    """Make positions of which the last `again` repeat the previous one."""
     each = np.arange(count + 1.0)
     each[-again:] = each[-again - 1]
     return analysis(
@@ -536,7 +556,7 @@ def scaled(value: float, sigma: float = 0.01, imu_hz: float = 49.1, **parts: Any
 
 
 def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -> Any:
-    """A source that reports a standard deviation, and has this one."""
+    """Make a source that reports one standard deviation (m) and has another one."""
     low, high = interval or (0.99 * noise, 1.01 * noise)
     states = source(samples=positions(np.arange(0.0, 120.0), variance_m2=reported**2))
     usual = {"smoothing": SourceLowPass(0.0, 0.0, 0.0, noise), "source": states,
@@ -555,7 +575,7 @@ def no_truth(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 BIAS, JUMPS, SCALE = imu.bias, source_positions.jumps, source_positions.scale
-ARRIVALS, THINNED, CLOCK = (
+ARRIVALS, DOWNSAMPLED, CLOCK = (
     source_stamps.arrivals,
     source_intervals.downsampling,
     source_clock.detect,
@@ -573,32 +593,32 @@ SOURCE_EDGES = [
       for bias, sigma, expected in (
           (0.2, 0.01, "warning"), (0.199, 0.01, None), (0.3, 0.01, "error"),
           (0.299, 0.01, "warning"), (0.25, 0.0625, "warning"), (0.25, 0.0626, None))),
-    # EKF2's bias where there is none of ours; horizontally our estimate is the better one
-    *((BIAS, analysis(bias_scale_jump_fit=ours, ekf2=bias_of_ekf2(*bias)), expected)
-      for bias, ours, expected in (
+    # EKF2's bias if the positions give none; horizontally that of the positions is better
+    *((BIAS, analysis(bias_scale_jump_fit=fit, ekf2=bias_of_ekf2(*bias)), expected)
+      for bias, fit, expected in (
           ((0.2, 0.0, 0.0), NONE, "warning"), ((0.199, 0.0, 0.0), NONE, None),
           ((0.0, 0.0, 0.2), with_bias(0.0), "warning"), ((0.5, 0.5, 0.1), with_bias(0.0), None))),
     *((ARRIVALS, analysis(ekf2=ekf2), expected) for ekf2, expected in (
-        (ages(20, 0), "warning"), (ages(19, 0), None),  # 20 samples at least
+        (ages(20, 0), "warning"), (ages(19, 0), None),  # at least 20 samples
         (ages(20, 0, wrong=1), "warning"), (ages(20, 0, wrong=2), None),  # 95 %
         (ages(10, 20), "warning"), (ages(9, 20), None), (ages(20, 10), "warning"),
-        (ages(20, 9), None),  # 10 on either side
+        (ages(20, 9), None),  # at least 10 on each side
         (ages(20, 20, wrong=1), "warning"), (ages(20, 20, wrong=2), None),
         (ages(20, 20, 0.02), "warning"), (ages(20, 20, 0.0199), None),
         (ages(20, 20, 0.1), "error"), (ages(20, 20, 0.0999), "warning"),
         (ages(0, 30, 0.00099), "warning"), (ages(0, 30, 0.001), None))),
-    (ARRIVALS, analysis(ekf2=ages(20, 20), **MADE_OF_EKF2), None),
-    *((THINNED, at_multiples(multiples), expected) for multiples, expected in (
-        ([1, 1, 2] * 20, "warning"), ([1, 1, 2] * 19 + [1, 1, 1], None),  # a quarter is missing
-        ([1, 2] * 25, "warning"), ([1, 2] * 24 + [1], None),  # 50 intervals at least
-        ([2, 3] * 30, "error"),  # 0.31 s apart: EKF2 does not start
-        ([2] * 54 + [3] * 6, "error"), ([2] * 55 + [3] * 5, None),  # a tenth is of each
+    (ARRIVALS, analysis(ekf2=ages(20, 20), **REBUILT), None),
+    *((DOWNSAMPLED, at_multiples(multiples), expected) for multiples, expected in (
+        ([1, 1, 2] * 20, "warning"), ([1, 1, 2] * 19 + [1, 1, 1], None),  # 25 % missing
+        ([1, 2] * 25, "warning"), ([1, 2] * 24 + [1], None),  # at least 50 intervals
+        ([2, 3] * 30, "error"),  # intervals of 0.31 s: EKF2 does not start
+        ([2] * 54 + [3] * 6, "error"), ([2] * 55 + [3] * 5, None),  # at least 10 % of each multiple
         ([1] * 50 + [2] * 35 + [4] * 15, "error"), ([1] * 50 + [2] * 34 + [4] * 16, None))),
-    # the intervals of what others made tell nothing
-    (THINNED, at_multiples([1, 2] * 30, clock_map=clock_map()), None),
-    (THINNED, at_multiples([1, 2] * 30, origin=ALIGNED), None),
-    (THINNED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE), "warning"),
-    # single losses, two of them in one interval
+    # mapped timestamps and topics rebuilt by EKF2 show nothing
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, clock_map=clock_map()), None),
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=ALIGNED), None),
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE), "warning"),
+    # two samples lost in one interval
     *((source_intervals.losses, at_multiples([1] * singles + [3], 0.25, **parts), expected)
       for singles, parts, expected in (
           (96, {"clock_map": clock_map()}, "info"), (97, {"clock_map": clock_map()}, None),
@@ -607,7 +627,7 @@ SOURCE_EDGES = [
     *((source_positions.smoothing, low_pass(gain, lag_s), expected) for gain, lag_s, expected in (
         (6.0, 0.05, "warning"), (5.9, 0.05, None), (6.0, 0.049, None),
         (6.0, 0.0999, "warning"), (6.0, 0.1, "error"))),
-    # errors that hang together without a lag are slow, not smoothed
+    # correlated errors without a lag are not from a low pass
     *((source_positions.smoothing, low_pass(99.0, 1.0, coloured=slow(99.0, lag)), expected)
       for lag, expected in ((0.9, None), (1.0, "error"))),
     *((source_noise.time_correlated_noise, analysis(coloured=slow(gain, lag)), expected)
@@ -618,16 +638,16 @@ SOURCE_EDGES = [
         (29, 100, "warning"))),
     (source_noise.repeats, repeating(50, 100, moved_m=0.5), None),
     *((source_noise.detect, analysis(coloured=slow(99.0, 0.0), **parts), None)
-      for parts in (ODOMETRY, MADE_OF_EKF2)),
+      for parts in (ODOMETRY, REBUILT)),
     (JUMPS, jumping(jump(0.0, 0.9), coloured=slow(0.0, 0.0, 0.2)), None),
     (JUMPS, jumping(jump(0.0, 1.0), coloured=slow(0.0, 0.0, 0.2)), "error"),
     (SCALE, scaled(0.5, coloured=slow(0.0, 0.0)), None),
     (SCALE, scaled(0.5, ekf2=ages(20, 20)), None),
     (source_positions.detect, low_pass(99.0, 1.0, **ODOMETRY), None),
-    (source_positions.detect, low_pass(99.0, 1.0, **MADE_OF_EKF2), None),
+    (source_positions.detect, low_pass(99.0, 1.0, **REBUILT), None),
     *((JUMPS, jumping(jump(0.0, size), jump(0.1, 0.0)), expected) for size, expected in (
         (0.199, None), (0.2, "warning"), (0.499, "warning"), (0.5, "error"))),
-    # a moving vehicle's positions jump where the stamps do
+    # a step of the time offset also shifts the positions of a moving vehicle
     (JUMPS, jumping(jump(0.0, 1.0), ekf2=ages(20, 20)), None),
     *((SCALE, scaled(sign * scale, sigma), expected)
       for sign in (1.0, -1.0)
@@ -635,13 +655,13 @@ SOURCE_EDGES = [
           (0.12, 0.01, "warning"), (0.119, 0.01, None), (0.15, 0.01, "error"),
           (0.149, 0.01, "warning"), (0.1875, 0.0625, "error"), (0.187, 0.0625, None))),
     (SCALE, scaled(0.5, imu_hz=48.9), None), (SCALE, scaled(0.5, source=source(origin=GNSS)), None),
-    # stamps that could not be judged may be late
+    # without an estimated time offset the timestamps may be late
     *((which, of(clock=clock), expected)
       for which, of in ((SCALE, partial(scaled, 0.5)),
                         (source_positions.smoothing, partial(low_pass, 99.0, 1.0)))
       for clock, expected in ((NONE, None), (late(0.0, determinable=False), "error"))),
     (SCALE, scaled(0.5, smoothing=SourceLowPass(0.5, 1.0, 99.0, 0.1)), None),
-    *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, MADE_OF_EKF2)),
+    *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, REBUILT)),
     *((source_positions.outliers,
        analysis(tuning=tuned(outlier_time_s=20.0 + np.arange(outliers), count=count)), expected)
       for outliers, count, expected in (
@@ -651,7 +671,7 @@ SOURCE_EDGES = [
         (3.0, 2.0, "warning"), (2.0, 3.0, "warning"), (1.41, 1.0, None), (1.42, 1.0, "warning"),
         (1.0, 1.41, None), (1.0, 1.42, "warning"), (1.73, 1.0, "warning"), (1.74, 1.0, "error"),
         (1.0, 1.74, "error"))),
-    # inside the interval, no interval, nothing known of smoothing, nothing stated, odometry
+    # inside the interval, no interval, unknown low pass, no reported variance, odometry
     *((STATED, stating(3.0, 1.0, interval), None) for interval in (
         (0.1, 9.0), (None, 9.0), (0.1, None))),
     (STATED, stating(3.0, 1.0, tuning=tuned(Noise(None, None, 9.0))), None),
@@ -664,24 +684,24 @@ SOURCE_EDGES = [
           (0.03, 0.001, None), (0.031, 0.001, "warning"), (0.1, 0.001, "warning"),
           (0.101, 0.001, "error"), (0.0625, 0.0208, "warning"), (0.0625, 0.0209, None))),
     *((CLOCK, analysis(**{"clock": late(0.2), **parts}), None) for parts in (
-        {"clock": late(0.2, determinable=False)}, MADE_OF_EKF2, {"ekf2": ages(20, 20)},
+        {"clock": late(0.2, determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
         {"smoothing": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
     *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
           (30.0, 0.001, "warning"), (29.0, 0.001, None), (40.0, 0.01, "warning"),
           (39.0, 0.01, None), (None, 0.001, None))),
     (CLOCK, delayed(90.0, late(0.0, determinable=False)), None),
-    (CLOCK, delayed(90.0, late(0.0), **MADE_OF_EKF2), None),
+    (CLOCK, delayed(90.0, late(0.0), **REBUILT), None),
 ]  # fmt: skip
 
 
-def test_an_accelerometer_bias_is_told_with_its_interval_and_tilt_and_what_ekf2_says() -> None:
+def test_bias_reports_interval_tilt_and_ekf2_estimate() -> None:
     one = analysis(
         bias_scale_jump_fit=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0)
     )
     finding = only(imu.bias, one)
-    assert "off by 2.9° does the same" in finding.message  # 0.5 of 9.80665 m/s²
-    assert "EKF2 subtracts +0.10 forward, -0.20 right." in finding.message
+    assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
+    assert "EKF2 estimates +0.10 m/s² forward and -0.20 m/s² right." in finding.message
     assert finding.evidence == {"bias_m_s2": 0.5, "sigma_m_s2": 0.05}
     outside = bias_of_ekf2(9.0, 9.0, 9.0)["accelerometer_bias"].iloc[[0, 4]]
     assert named(imu.bias, analysis(ekf2={"accelerometer_bias": outside})) == {}
@@ -693,11 +713,11 @@ def test_an_accelerometer_bias_is_told_with_its_interval_and_tilt_and_what_ekf2_
      (clock_map("receive time", 2, 0.011), ["source_stamps_constant", "source_receipt_jitter"]),
      (clock_map(jitter_s=0.5), []), (clock_map("arrival time"), ["companion_not_synchronised"])],
 )  # fmt: skip
-def test_what_a_recordings_stamps_tell(clock: Any, expected: list[str]) -> None:
+def test_source_stamps_recording_reports_clock_faults(clock: Any, expected: list[str]) -> None:
     assert list(named(source_stamps.detect, analysis(source=source(clock_map=clock)))) == expected
 
 
-def test_stamps_of_arrival_end_at_the_first_true_one() -> None:
+def test_arrivals_end_at_first_measurement_time() -> None:
     one = analysis(ekf2=ages(12, 20, 0.05))
     finding = only(source_stamps.arrivals, one)
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}
@@ -706,64 +726,67 @@ def test_stamps_of_arrival_end_at_the_first_true_one() -> None:
     assert source_stamps.until_synchronised(analysis(ekf2=ages(30, 0))) is None
 
 
-def test_the_interval_that_all_are_multiples_of_is_sought_within_its_jitter() -> None:
+def test_base_interval_is_found_within_jitter() -> None:
     def base(intervals: Any) -> float | None:
         found = source_intervals._base_interval(np.array(intervals))
         return None if found is None else found[0]
 
     assert base([1.0, 1.0, 2.0]) == 1.0
-    # a quarter of the usual interval is looked at, a fifth is not
+    # divisors up to 4 are tested
     assert base([1.0] * 5 + [1.25] * 2) is not None
     assert base([1.0] * 5 + [1.2] * 2) is None
     for off, there in ((0.058, True), (0.062, False)):
-        # of multiples of a second, by so much off at random, root mean square
+        # intervals of 1 s with this RMS deviation
         found = base(np.sort(1.0 + off * np.tile([1.0, -1.0], 15)))
         assert (found == pytest.approx(1.0)) if there else found is None
 
 
-def test_a_gap_is_not_counted_as_single_lost_samples() -> None:
-    for longest, lost in ((5.0, [4]), (5.1, [])):  # of 0.25 s each
+def test_losses_do_not_count_gaps() -> None:
+    for longest, lost in ((5.0, [4]), (5.1, [])):  # intervals of 0.25 s
         one = at_multiples([1.0] * 20 + [longest], 0.25, clock_map=clock_map())  # type: ignore[list-item]
         assert [each.evidence["lost"] for each in source_intervals.losses(one)] == lost
 
 
-def test_the_largest_of_several_jumps_is_told() -> None:
+def test_jumps_report_count_and_largest() -> None:
     sizes = (jump(0.3, 0.0, at_s=30.0), jump(0.6, 0.8, at_s=60.0), jump(0.1, 0.0, at_s=90.0))
     finding = only(source_positions.jumps, jumping(*sizes))
     assert finding.evidence == {"count": 2, "size_m": 1.0, "at_s": 60.0, "sigma_m": 0.02}
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_a_scale_and_a_variance_are_told_with_their_side() -> None:
+def test_scale_and_reported_variance_state_direction() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.scale, scaled(signed))
-        assert f"20% too {word} (± 2%)" in finding.message
+        assert f"20 % too {word} (± 2 %)" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.stated_variance, stating(reported, 1.0))
-        assert f"4 times too {word}{', unless slow' * (word == 'large')}" in finding.message
+        assert f"4 times too {word}{', unless it covers' * (word == 'large')}" in finding.message
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
-def test_a_variance_that_covers_the_errors_against_the_truth_is_not_too_large(error_m, expected):
+def test_stated_variance_covering_true_errors_is_accepted(error_m, expected):
     time = np.arange(0.0, 120.0)
     still = pd.DataFrame({"position_m": 0.0 * time}, index=time)
     axes = tuple(axis(name, truth=still) for name in ("north", "east"))
     for each in axes:
         each.axis.measurement_time_s, each.axis.measurement_m = time, error_m * (-1.0) ** time
     assert severity(source_positions.stated_variance, stating(2.0, 1.0, axes=axes)) == expected
-    # it is too small all the same
+    # a variance that is too small is reported in both cases
     assert severity(source_positions.stated_variance, stating(0.5, 1.0, axes=axes)) == "error"
 
 
 @pytest.mark.parametrize(
-    ("jumps", "count", "says"),
-    [((), 5, " s and more)"), ((jump(1.0, 0.0, at_s=20.0),), 3, "at 18.9, 26.0, 27.0 s)")],
+    ("jumps", "count", "times_text"),
+    [
+        ((), 5, "; first at 18.9, 19.0, 25.9 s)"),
+        ((jump(1.0, 0.0, at_s=20.0),), 3, "; at 18.9, 26.0, 27.0 s)"),
+    ],
 )
-def test_what_lies_a_second_before_a_jump_and_six_after_it_is_no_outlier(jumps, count, says):
+def test_outliers_next_to_a_jump_are_ignored(jumps, count, times_text):
     outliers = tuned(outlier_time_s=np.array([18.9, 19.0, 25.9, 26.0, 27.0]), count=100)
     finding = only(source_positions.outliers, jumping(*jumps, tuning=outliers))
     assert (finding.evidence["count"], finding.evidence["first_s"]) == (count, 18.9)
-    assert says in finding.message
+    assert times_text in finding.message
 
 
 # ---------------------------------------------------------------- clock and delay
@@ -771,65 +794,96 @@ def test_what_lies_a_second_before_a_jump_and_six_after_it_is_no_outlier(jumps, 
 APPLIED = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
 
 
-def test_a_clock_offset_is_told_with_what_was_applied() -> None:
+def test_clock_offset_action_includes_offset_in_use() -> None:
     one = analysis(clock=late(-0.1, applied_s=-0.05), settings=APPLIED)
     finding = only(source_clock.detect, one)
-    assert "late by 0.100 s against the IMU (95 % 0.080 to 0.110 s)" in finding.message
-    assert "an error of 0.10 m" in finding.message
+    assert "0.100 s late relative to the IMU (95 % 0.080 to 0.110 s)" in finding.message
+    assert "a position error of 0.10 m" in finding.message
     assert "--clock-offset -0.150." in finding.remedy
-    told = {"offset_s": -0.15, "interval_low_s": -0.16, "interval_high_s": -0.13}
-    assert finding.evidence == pytest.approx(told)
+    expected = {"offset_s": -0.15, "interval_low_s": -0.16, "interval_high_s": -0.13}
+    assert finding.evidence == pytest.approx(expected)
     early = only(source_clock.detect, analysis(clock=late(0.1)))
-    assert "early by 0.100 s against the IMU (95 % 0.090 to 0.120 s)" in early.message
+    assert "0.100 s early relative to the IMU (95 % 0.090 to 0.120 s)" in early.message
     placed = source(alignment=SimpleNamespace(clock_offset_s=2.0))
     finding = only(source_clock.detect, analysis(clock=late(0.1), source=placed))
     assert "--clock-offset 2.100." in finding.remedy
 
 
 @pytest.mark.parametrize(("p", "there"), [(0.005, False), (0.0049, True), (None, False)])
-def test_a_clock_offset_that_changes(p: float | None, there: bool) -> None:
+def test_clock_offset_change_below_p_limit_is_reported(p: float | None, there: bool) -> None:
     found = only(source_clock.detect, analysis(clock=late(0.1, change_p=p)))
     assert found.id == ("source_clock_changes" if there else "source_clock_offset")
     if there:
-        assert "-0.10 s at the beginning, +0.30 s at the end" in found.message
+        assert "from -0.10 s at the beginning to +0.30 s at the end" in found.message
         assert found.evidence["change_p"] == p
 
 
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
-def test_a_clock_offset_that_the_truth_contradicts_is_not_told(monkeypatch, after_m, there) -> None:
+def test_clock_offset_contradicted_by_truth_has_no_finding(monkeypatch, after_m, there) -> None:
     def errors_m(_: Any, shifted: Settings) -> tuple[float, float]:
-        assert shifted.clock_offset_s == 0.123  # as it is typed
+        assert shifted.clock_offset_s == 0.123  # rounded as printed
         return 1.0, after_m
 
     monkeypatch.setattr(remedies, "filter_errors_m", errors_m)
     found = list(source_clock.detect(analysis(clock=late(0.12345))))
-    said = f"position error 1.000 → {after_m:.3f} m (replayed)"
-    assert [said in each.remedy for each in found] == [True] * there
+    effect = f"KF position RMSE 1.000 → {after_m:.3f} m (re-run)"
+    assert [effect in each.remedy for each in found] == [True] * there
 
 
 @pytest.mark.parametrize(
-    ("clock", "delay_ms", "says", "remedy"),
+    ("clock", "delay_ms", "text", "remedy"),
     [
-        # with what was applied
-        (late(-0.1, applied_s=-0.02), 0.0, "the data ask for 120 ms (95 % 100 to 130):",
-         "Set EKF2_EV_DELAY to 120 ms. Not replayed: no topic for it."),
-        (late(0.0, interval_s=(-0.01, 0.01)), 50.0, "ask for none (95 % -10 to 10 ms)",
-         "Set EKF2_EV_DELAY to 0 ms. Not replayed: no topic for it."),
-        (late(-0.02, interval_s=(-0.04, 0.0)), 100.0, "ask for none", "EKF2_EV_DELAY to 0 ms"),
-        (late(0.02, interval_s=(0.0, 0.04)), 100.0, "none (95 % -40 to 0 ms)", "DELAY to 0 ms"),
-        (late(0.05, interval_s=(0.04, 0.07)), 0.0, "early by 50 ms (95 % 40 to 70), for which",
-         "stamps that are early"),
-        (late(-0.301, interval_s=(-0.4, -0.2)), 0.0, "ask for 301 ms", "PX4 allows 300 ms"),
-        (late(-0.3, interval_s=(-0.4, -0.2)), 0.0, "ask for 300 ms", "EKF2_EV_DELAY to 300 ms"),
+        # plus the offset in use
+        (
+            late(-0.1, applied_s=-0.02),
+            0.0,
+            "the estimated delay is 120 ms (95 % 100 to 130 ms)",
+            "Set EKF2_EV_DELAY to 120 ms. ",
+        ),
+        (
+            late(0.0, interval_s=(-0.01, 0.01)),
+            50.0,
+            "is not significant (95 % -10 to 10 ms)",
+            "Set EKF2_EV_DELAY to 0 ms. ",
+        ),
+        (
+            late(-0.02, interval_s=(-0.04, 0.0)),
+            100.0,
+            "is not significant",
+            "EKF2_EV_DELAY to 0 ms",
+        ),
+        (
+            late(0.02, interval_s=(0.0, 0.04)),
+            100.0,
+            "not significant (95 % -40 to 0 ms)",
+            "DELAY to 0 ms",
+        ),
+        (
+            late(0.05, interval_s=(0.04, 0.07)),
+            0.0,
+            "50 ms early (95 % 40 to 70 ms)",
+            "no parameter for early timestamps",
+        ),
+        (
+            late(-0.301, interval_s=(-0.4, -0.2)),
+            0.0,
+            "delay is 301 ms",
+            "PX4 allows at most 300 ms",
+        ),
+        (late(-0.3, interval_s=(-0.4, -0.2)), 0.0, "delay is 300 ms", "EKF2_EV_DELAY to 300 ms"),
     ],
-)  # fmt: skip
-def test_a_delay_stays_in_px4s_range(clock: Any, delay_ms: float, says: str, remedy: str) -> None:
+)
+def test_delay_remedy_stays_in_px4_range(
+    clock: Any, delay_ms: float, text: str, remedy: str
+) -> None:
     finding = only(wrong_delay, delayed(delay_ms, clock))
-    assert says in finding.message
+    assert text in finding.message
     assert remedy in finding.remedy
     assert finding.evidence["asked_ms"] == pytest.approx(-1e3 * clock.offset_s)
 
 
 @pytest.mark.parametrize(("detect", "one", "expected"), EDGES + SOURCE_EDGES)
-def test_from_where_on_it_is_a_finding(detect: Any, one: Any, expected: str | None) -> None:
+def test_detectors_at_limits_have_expected_severity(
+    detect: Any, one: Any, expected: str | None
+) -> None:
     assert severity(detect, one) == expected

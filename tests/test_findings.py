@@ -1,4 +1,4 @@
-"""Findings on a clean flight, faulty ones, ones without a field, short ones and real logs."""
+"""Findings on clean, faulty, incomplete and short flights, on real logs, and px4fuse explain."""
 
 import math
 import re
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from cli_tools import run_main
 from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplained, with_noises
 from golden_tools import agrees, rounded, value
@@ -20,6 +21,7 @@ from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import NAMES, Finding, by_root, find
+from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, Reset, Unavailable
 from px4fuse.origin import ALIGNED, LOGGED_BY_EKF2
 from px4fuse.readers import read_log
@@ -36,9 +38,9 @@ pytestmark = pytest.mark.usefixtures("quick_filter")
 
 @dataclass(frozen=True)
 class Fault:
-    """A mistake, the finding that names it, and the evidence that must be in it.
+    """A mistake in a flight, the expected finding, and its expected evidence.
 
-    Its options that are no evidence: of the flight, of the filter and what changes the flight.
+    The other fields make the flight: options of aisle_flight, filter settings, a change.
     """
 
     id: str
@@ -49,7 +51,7 @@ class Fault:
     change: Change = lambda flight: flight
 
     def fly(self, **other: Any) -> Flight:
-        """The flight with the mistake in it."""
+        """Make the flight with the mistake."""
         return self.change(aisle_flight(**{**self.flight, **other}))
 
 
@@ -59,12 +61,12 @@ def with_source(**changes: Any) -> Change:
 
 
 def with_log(**changes: Any) -> Change:
-    """Change what is said of the log."""
+    """Change the description of the log."""
     return lambda flight: replace(flight, log=replace(flight.log, **changes))
 
 
 def without_every(nth: int) -> Change:
-    """A recording of a link that lost every nth position."""
+    """Drop every nth position, as a recorded link does."""
 
     def change(flight: Flight) -> Flight:
         samples = flight.positions[0].samples
@@ -86,20 +88,20 @@ def with_ekf2(**changes: Any) -> Change:
 
 
 def as_recording(flight: Flight) -> Flight:
-    """Without innovations, as MAVLink carries it."""
+    """Make a MAVLink recording, which has no innovations."""
     none = Unavailable("EKF2 innovations", "MAVLink does not carry them", "")
     recorded = with_ekf2(innovations=dict.fromkeys(AXIS_NAMES, none))(flight)
     return with_log(format="MAVLink tlog")(recorded)
 
 
-def biased(flight: Flight) -> Flight:
-    """EKF2 that found a bias along the body's axes."""
-    none = flight.ekf2.state.iloc[:, :3].set_axis(Columns.SPECIFIC_FORCE, axis=1) * 0.0
-    return with_ekf2(accelerometer_bias=none + np.array([0.2, -0.1, 0.2]))(flight)
+def with_ekf2_bias(flight: Flight) -> Flight:
+    """Add an accelerometer bias (forward, right, down) to the EKF2 log."""
+    zero = flight.ekf2.state.iloc[:, :3].set_axis(Columns.SPECIFIC_FORCE, axis=1) * 0.0
+    return with_ekf2(accelerometer_bias=zero + np.array([0.2, -0.1, 0.2]))(flight)
 
 
 def as_odometry(flight: Flight) -> Flight:
-    """The source comes with an orientation that turns."""
+    """Give the source an orientation that rotates, as VIO does."""
     (track,) = flight.positions
     turn = np.linspace(0.0, 0.5, len(track.samples))
     quaternions = np.column_stack([np.cos(turn), 0.0 * turn, 0.0 * turn, np.sin(turn)])
@@ -107,8 +109,8 @@ def as_odometry(flight: Flight) -> Flight:
     return with_source(orientation=orientation, origin=replace(track.origin, kind="vio"))(flight)
 
 
-def apart(flight: Flight, *, grows: bool) -> Flight:
-    """The truth is a metre from where source and EKF2 are, on average where that grows."""
+def with_offset_truth(flight: Flight, *, grows: bool) -> Flight:
+    """Move ground truth 1 m north, or by a growing distance of 1 m RMS."""
     samples = flight.truth.samples.copy()
     samples["north_m"] += np.linspace(0.0, np.sqrt(3.0), len(samples)) if grows else 1.0
     return replace(flight, truth=replace(flight.truth, samples=samples))
@@ -124,7 +126,7 @@ def ekf2(**parts: Any) -> dict[str, Any]:
 
 TUNED_FIELDS = {"sigma_z_asked_m": about(0.10, 0.2)}
 FAULTS = [
-    # a recording of its own
+    # recordings of a link
     Fault("source_stamps_constant", "error", {"stamps": 600, "distinct": 2},
           change=with_source(clock_map=mapped("receive time", distinct=2))),
     Fault("source_receipt_jitter", "warning", {"jitter_s": 0.02},
@@ -139,13 +141,13 @@ FAULTS = [
     Fault("receipt_out_of_order", "info", change=with_log(receipt_went_back=3)),
     Fault("position_file_placement", "warning",
           change=with_source(alignment=given_placement("yaw is known to 5° only"))),
-    # the filter's own settings
+    # settings of KF
     Fault("kf_variance_understated", "error", TUNED_FIELDS, settings={"sigma_z_m": 0.01}),
     Fault("kf_variance_overstated", "error", TUNED_FIELDS, settings={"sigma_z_m": 1.0}),
     Fault("process_noise_forgotten", "error", {"relative_growth": pytest.approx(0.01, abs=0.01)},
           settings={"sigma_a_m_s2": 1e-4}),
-    # EKF2's
-    Fault("accelerometer_bias", "warning", {"bias_m_s2": about(0.3, 0.01)}, change=biased),
+    # EKF2
+    Fault("accelerometer_bias", "warning", {"bias_m_s2": about(0.3, 0.01)}, change=with_ekf2_bias),
     Fault("ekf2_variance_overstated", "error", {"sigma_factor": about(7.1, 0.15), **TUNED_FIELDS},
           ekf2(nis=0.02, noise_m=0.7)),
     Fault("ekf2_variance_overstated", "warning", {"sigma_factor": about(1.6, 0.15)},
@@ -185,14 +187,15 @@ FAULTS = [
           {"uwb": Uwb(gap_s=(40.0, 48.0))}),
     Fault("errors_larger_than_claimed", "error",
           {"filter": "ekf2", "ekf2_nees_position_mean": about(400, 0.2)},
-          change=lambda f: as_odometry(apart(f, grows=True))),
-    Fault("errors_larger_than_claimed", "error", change=lambda flight: apart(flight, grows=False)),
+          change=lambda f: as_odometry(with_offset_truth(f, grows=True))),
+    Fault("errors_larger_than_claimed", "error",
+          change=lambda f: with_offset_truth(f, grows=False)),
     Fault("source_may_drift", "info", {"source": "vehicle_visual_odometry"}, {"truth": False},
           change=as_odometry),
     Fault("no_motion", "warning", {"range_m": about(0.33, 0.15)}, {"length_m": 0.0}),
     # the log
     Fault("imu_gap", "warning", {"total_s": about(2.0, 1e-6)}, {"imu": Imu(gap_s=(40.0, 42.0))}),
-    Fault("vehicle_tumbled", "error", {"total_s": 4.0}, {"tumbled": ((100.0, 104.0),)}),
+    Fault("vehicle_tumbled", "error", {"total_s": 4.0}, {"tumble_spans": ((100.0, 104.0),)}),
     Fault("accelerometer_clipped", "warning", {"count": 30, "total_s": about(0.3, 0.01)},
           {"imu": Imu(clipped_s=(50.0, 50.295))}),
     Fault("logger_dropouts", "warning", {"count": 2, "total_s": about(0.5, 1e-9)},
@@ -203,12 +206,13 @@ FAULTS = [
           {"attitude_hz": 5.0}),
     Fault("input_unavailable", "warning", flight={"imu": None}),
     Fault("input_unavailable", "warning", flight={"attitude_hz": None}),
-    Fault("log_damaged", "warning", {"ends_in_flight": 0.0}, {"damage": ("it is damaged",)}),
+    Fault("log_damaged", "warning", {"ends_in_flight": 0.0},
+          {"damage": ("128 bytes do not form complete messages",)}),
     Fault("samples_dropped", "info", {"notes": 2}, change=with_log(dropped={"x": 2, "y": 1})),
     Fault("too_few_innovations", "warning", {"count": 7}, {"duration_s": 1.5}),
 ]  # fmt: skip
-# Tested where their estimates are
-ELSEWHERE = {
+# Findings tested in other files, with the estimates that they need
+TESTED_ELSEWHERE = {
     "accelerometer_bias", "aid_biased", "aid_changed", "aid_starved", "aid_understated",
     "ekf2_ev_delay_wrong", "ekf2_gate_small",
     "ekf2_heading_wrong", "false_loop_closure",
@@ -219,15 +223,15 @@ ELSEWHERE = {
     "source_scale_wrong", "source_smoothed", "source_stamps_of_arrival", "source_thinned",
     "source_variance_wrong",
 }  # fmt: skip
-# An error that another fault brings with it
-FOLLOWS = {
+# Second finding of severity error that the mistake causes
+ALSO_ERROR = {
     "kf_variance_understated": "sigma_z_small",
     "kf_variance_overstated": "sigma_z_large",
     "source_receipt_jitter": "source_stamps_constant",
     "process_noise_forgotten": "kf_variance_understated",
     "ekf2_rejecting": "ekf2_variance_understated",
 }
-# What a flight without the field must (not) say: the finding's id and what stands instead
+# Finding that must not appear on an incomplete flight, the flight, and a finding that must
 MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
     ("ekf2_not_fusing", ekf2(fusing=None), None),
     ("ekf2_not_fusing", {"ekf2": None}, "ekf2_unavailable"),
@@ -242,23 +246,23 @@ MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
     ("logging_rate_low", {"attitude_hz": None}, "input_unavailable"),
     ("source_not_logged", {"parameters": {}}, None),
     ("ekf2_variance_overstated", {"parameters": {}, **ekf2(noise_logged=False)}, None),
-    # an unknown noise of EKF2 is not printed as a number
-    ("nothing", {"parameters": {}, **ekf2(nis=0.02, noise_logged=False)},
+    # an unknown EKF2 noise is not printed as a number
+    ("no_finding", {"parameters": {}, **ekf2(nis=0.02, noise_logged=False)},
      "ekf2_variance_overstated"),
-    # innovations are not called decimated where the source is made of them
+    # innovations are not decimated if the source is rebuilt from them
     ("ekf2_innovations_decimated",
      {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=LOGGED_BY_EKF2), **ekf2(every=3)}, None),
 ]  # fmt: skip
 
 
 def found(comparison: Comparison, *, tuned: bool = False) -> tuple[Finding, ...]:
-    """All findings on a comparison that is not explained, each checked for form."""
+    """Find all mistakes of a comparison without re-runs, and check the form of each finding."""
     findings = find(with_noises(comparison) if tuned else unexplained(comparison))
-    behind: set[str | None] = {None}
+    earlier_ids: set[str | None] = {None}
     for finding in findings:
         assert finding.id in NAMES
-        assert finding.caused_by in behind
-        behind.add(finding.id)
+        assert finding.caused_by in earlier_ids
+        earlier_ids.add(finding.id)
         assert re.fullmatch(r"[A-Z0-9a-z].*[^.: ;]", finding.headline)
         assert finding.message.startswith(finding.headline)
         for text in (finding.message, finding.remedy):
@@ -275,13 +279,13 @@ def ids(findings: tuple[Finding, ...]) -> set[str]:
 
 
 @pytest.mark.parametrize("seed", range(2, 8))
-def test_a_clean_flight_has_no_findings(seed: int) -> None:
+def test_find_clean_flight_returns_nothing(seed: int) -> None:
     assert found(compare(aisle_flight(seed=seed))) == ()
 
 
 @pytest.mark.reallogs
-def test_a_crash_is_told_first(shared_logs: Path) -> None:
-    """Flight Review's "ekf_failure": vibration to the end of the range, then a tumble at 68 s."""
+def test_find_crash_lists_tumbling_first(shared_logs: Path) -> None:
+    """Flight Review log "ekf_failure": accelerometer clipping, then roll and pitch at 68 s."""
     flight = read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg")
     first, second = found(compare(flight))[:2]
     assert (first.id, second.id) == ("vehicle_tumbled", "accelerometer_clipped")
@@ -291,8 +295,8 @@ def test_a_crash_is_told_first(shared_logs: Path) -> None:
     assert second.spans_s[0][0] == pytest.approx(24.9, abs=0.1)
 
 
-def test_the_faults_cover_every_finding() -> None:
-    assert set(NAMES) == {fault.id for fault in FAULTS} | ELSEWHERE
+def test_faults_cover_all_findings() -> None:
+    assert set(NAMES) == {fault.id for fault in FAULTS} | TESTED_ELSEWHERE
 
 
 @pytest.mark.parametrize(
@@ -300,52 +304,52 @@ def test_the_faults_cover_every_finding() -> None:
     list(enumerate(FAULTS)),
     ids=[f"{fault.id}-{fault.severity}" for fault in FAULTS],
 )
-def test_a_fault_is_named_with_its_evidence_and_no_unrelated_error(at: int, fault: Fault) -> None:
-    """Its words are kept as those of commands are, see test_golden."""
-    of_noise = "sigma_z_asked_m" in fault.evidence or fault.id == "process_noise_forgotten"
-    findings = found(compare(fault.fly(), Settings(**fault.settings)), tuned=of_noise)
+def test_find_fault_reports_evidence_and_no_other_error(at: int, fault: Fault) -> None:
+    """Messages and actions are compared with tests/golden/findings.txt (see test_golden)."""
+    is_tuned = "sigma_z_asked_m" in fault.evidence or fault.id == "process_noise_forgotten"
+    findings = found(compare(fault.fly(), Settings(**fault.settings)), tuned=is_tuned)
     first = next((each for each in findings if each.id == fault.id), None)
     assert first, f"{fault.id} is not among {sorted(ids(findings))}"
     assert first.severity == fault.severity
     assert {name: first.evidence.get(name) for name in fault.evidence} == fault.evidence
-    said = [f"{first.id} {first.severity} {value(first.evidence)}", first.message, first.remedy]
-    agrees("findings", [rounded(line) for line in said], paragraph=at)
+    lines = [f"{first.id} {first.severity} {value(first.evidence)}", first.message, first.remedy]
+    agrees("findings", [rounded(line) for line in lines], paragraph=at)
     errors = {f.id for f in findings if f.severity == "error" and f.caused_by is None}
-    assert errors <= {fault.id, FOLLOWS.get(fault.id)}
+    assert errors <= {fault.id, ALSO_ERROR.get(fault.id)}
 
 
 @pytest.mark.parametrize(
-    ("gate", "must"), [(1.0, 0.5340), (1.5, 0.2494), (2.0, 0.0889), (2.8, 0.0102), (3.0, None)]
+    ("gate", "expected"), [(1.0, 0.5340), (1.5, 0.2494), (2.0, 0.0889), (2.8, 0.0102), (3.0, None)]
 )
-def test_a_gate_that_must_reject_is_named_before_what_it_does(gate, must) -> None:
-    """Shares as tables of the normal distribution have them, for two axes."""
+def test_find_narrow_gate_lists_gate_before_rejections(gate, expected) -> None:
+    """Expected shares: tables of the normal distribution, two axes."""
     flown = with_ekf2(gate=gate)(aisle_flight(**ekf2(rejected_share=0.3)))
     first, *others = found(compare(flown))
-    if must is None:
+    if expected is None:
         assert "ekf2_gate_small" not in ids((first, *others))
         return
     assert (first.id, first.severity) == ("ekf2_gate_small", "error")
-    assert first.evidence == {"gate": gate, "rejected_by_gate": pytest.approx(must, abs=1e-4)}
-    assert "here it rejected 3" in first.message or "here it rejected 2" in first.message
+    assert first.evidence == {"gate": gate, "rejected_by_gate": pytest.approx(expected, abs=1e-4)}
+    assert re.search(r"EKF2 rejected [23]\d %", first.message)
     group = by_root((first, *others))[0]
     assert {"ekf2_rejecting", "ekf2_variance_understated"} <= {one.id for one in group}
-    # a gate that rejects nothing is nobody's mistake
+    # a gate without rejections is not reported
     assert not found(compare(with_ekf2(gate=gate)(aisle_flight())))
 
 
 @pytest.mark.parametrize(
-    ("silent", "flight", "instead"), MISSING_FIELD, ids=lambda value: str(value)[:40]
+    ("absent", "flight", "present"), MISSING_FIELD, ids=lambda value: str(value)[:40]
 )
-def test_a_missing_field_is_not_guessed(silent: str, flight: Any, instead: str | None) -> None:
-    named = ids(found(compare(aisle_flight(duration_s=60.0, **flight))))
-    assert silent not in named
-    assert instead is None or instead in named
+def test_find_missing_field_is_not_guessed(absent: str, flight: Any, present: str | None) -> None:
+    found_ids = ids(found(compare(aisle_flight(duration_s=60.0, **flight))))
+    assert absent not in found_ids
+    assert present is None or present in found_ids
 
 
 @pytest.mark.parametrize("duration_s", [0.4, 2.0])
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.id}-{fault.severity}")
-def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s: float) -> None:
-    # of which one in ten may be lost
+def test_find_very_short_flight_does_not_raise(fault: Fault, duration_s: float) -> None:
+    # one in ten of these is lost
     rate_hz = 10.0 if fault.id == "source_samples_lost" else 5.0
     uwb = replace(fault.flight.get("uwb", Uwb()), rate_hz=rate_hz, gap_s=None)
     short: dict[str, Any] = {"duration_s": duration_s, "uwb": uwb}
@@ -354,3 +358,68 @@ def test_a_flight_of_a_moment_does_not_break_a_detector(fault: Fault, duration_s
     comparison = compare(fault.fly(**short), Settings(**fault.settings))
     few = len(next(iter(comparison.axes.values())).replay.updates) < MIN_INNOVATIONS
     assert ("too_few_innovations" in ids(found(comparison))) == few
+
+
+def test_catalogue_entries_have_known_group_and_full_sentences() -> None:
+    for entry in CATALOGUE.values():
+        assert entry.group in GROUPS
+        assert not entry.title.endswith(".")
+        assert entry.meaning.endswith(".")
+
+
+def test_examples_contain_rates_of_the_study() -> None:
+    examples = load_examples()
+    assert list(examples) == list(CATALOGUE)
+    rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")
+    for name, example in examples.items():
+        clean = rows[(rows["finding"] == name) & (rows["condition"] == "none")]
+        assert example.clean_flights == clean["flights"].sum()
+        assert example.false_alarms == pytest.approx((clean["flights"] * clean["rate"]).sum())
+        faulty = rows[(rows["finding"] == name) & (rows["condition"] != "none")]
+        assert example.detection == dict(zip(faulty["condition"], faulty["rate"], strict=True))
+
+
+@pytest.mark.parametrize("typed", ["source_scale_wrong", "Source-Scale-Wrong"])
+def test_explain_finding_prints_its_page(typed, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
+    code, out, err = run_main(monkeypatch, capsys, "explain", typed)
+    assert (code, err) == (0, "")
+    example = load_examples()["source_scale_wrong"]
+    for text in (
+        NAMES["source_scale_wrong"],
+        CATALOGUE["source_scale_wrong"].meaning,
+        example.message,
+        example.remedy,
+        "source_repeats",  # a possible cause
+        "errors_larger_than_claimed",  # a possible effect
+        "1 of 450 simulated flights",
+        "scale=15%: 75 %",
+    ):
+        assert text in out
+
+
+def test_explain_unmeasured_finding_states_it(monkeypatch, capsys) -> None:
+    _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
+    assert "Not measured" in out
+
+
+def test_explain_without_argument_lists_all_by_group(monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
+    code, out, _ = run_main(monkeypatch, capsys, "explain")
+    assert code == 0
+    lines = out.splitlines()
+    places = [lines.index(group[0].upper() + group[1:]) for group in GROUPS]
+    assert places == sorted(places)
+    for name, title in NAMES.items():
+        assert re.search(rf"^{name} +{re.escape(title)} *$", out, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("typed", "suggestion"), [("source_gapp", "Did you mean source_gap? "), ("xyz", "")]
+)
+def test_explain_unknown_finding_exits_with_2(typed, suggestion, monkeypatch, capsys) -> None:
+    code, out, err = run_main(monkeypatch, capsys, "explain", typed)
+    assert (code, out) == (2, "")
+    assert err == (
+        f"px4fuse: '{typed}' is not a finding. {suggestion}For a list, run px4fuse explain.\n"
+    )

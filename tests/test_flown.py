@@ -51,7 +51,7 @@ FLIGHTS = {
     ),
     "v1.16.1_aisle_clock_late": Flown(
         (("ekf2_ev_delay_wrong", None, {}, "position error 0.34 → 0.11 m"),
-         ("source_clock_offset", None, {}, "for EKF2 set EKF2_EV_DELAY to 264 ms")),
+         ("source_clock_offset", None, {}, "For EKF2 set EKF2_EV_DELAY to 264 ms")),
         offset_s=-0.25,
     ),
     "v1.13.3_aisle_evdelay175": Flown(

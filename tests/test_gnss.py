@@ -325,7 +325,7 @@ def test_a_smaller_r_is_advised_only_where_the_parameter_holds_it_up(
     )
     assert bool(words) is said
     if said:
-        assert words.startswith("EKF2_GPS_P_NOISE 2 m holds R above what the receiver states (0.3")
+        assert words.startswith("EKF2_GPS_P_NOISE 2 m exceeds the accuracy reported by GNSS (0.3")
         assert words.endswith("set EKF2_GPS_P_NOISE to 0.3 m. Not replayed: no IMU.")
 
 

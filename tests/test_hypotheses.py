@@ -171,7 +171,7 @@ def test_a_mistake_is_named_first_with_its_size(mistake, name, severity, evidenc
     [
         ("source_clock_offset", "clock-offset=250ms", {}, "error", "--clock-offset -0."),
         ("source_clock_changes", "clock-jump=400ms", {}, "error", "--start"),
-        ("source_frame_turned", "yaw=30", {}, "error", "Turn the positions by -2|by -3"),
+        ("source_frame_turned", "yaw=30", {}, "error", "Rotate the positions by -2|by -3"),
         ("source_outliers", "nlos=5%", {}, "error", "line of sight"),
         ("sigma_z_large", "", {"sigma_z_m": 0.3}, "warning", "--sigma-z 0.09|--sigma-z 0.1"),
         ("sigma_a_large", "", {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),

@@ -173,7 +173,7 @@ def test_the_cause_of_ekf2_is_what_was_made_wrong(
     found = cause_of(analysis.causes, "ekf2", "aisle", of)
     assert found.change[name] == pytest.approx(value, abs=within)
     assert found.brings_into_band
-    assert "since EKF2" in story(analysis, find(analysis))[0].split("; our filter")[0]
+    assert "Re-run with EKF2" in story(analysis, find(analysis))[0].split(" KF has ")[0]
 
 
 def test_what_if_predicts_the_flight_with_the_other_delay() -> None:
@@ -207,7 +207,7 @@ def test_the_delay_that_is_asked_for_is_that_of_the_receiver_where_it_has_one() 
     since_v1_17 = structs.replace(log, parameters={**log.parameters, "SENS_GPS0_DELAY": 110.0})
     changed = replace(analysis, flight=replace(analysis.flight, log=since_v1_17))
     said = next(source_clock.detect(changed)).remedy
-    (asked,) = re.findall(r"110 ms old \(SENS_GPS0_DELAY\), that would be (\d+) ms", said)
+    (asked,) = re.findall(r"110 ms old \(SENS_GPS0_DELAY\); the estimate is (\d+) ms", said)
     assert int(asked) == pytest.approx(110 + 250, abs=60)
 
 
@@ -215,7 +215,7 @@ def test_a_magnetometer_that_is_rejected_from_a_change_on_is_told_once() -> None
     changed, starved = [one for one in find(flown("mag=0.2")) if one.id.startswith("aid_")]
     assert (changed.id, starved.id) == ("aid_changed", "aid_starved")
     assert starved.caused_by == "aid_changed"
-    assert "Innovations of the magnetometer change" in changed.message
+    assert "mean innovation of the magnetometer shifts" in changed.message
     # the middle of the flight
     assert changed.evidence["time_s"] == pytest.approx(67.0, abs=10.0)
 

@@ -1,4 +1,4 @@
-"""What remedies propose, with their effect: confirmed by a replay or by the truth, or not."""
+"""Actions for KF and EKF2: their effect is confirmed by a replay or ground truth, or not."""
 
 import re
 from functools import cache
@@ -22,8 +22,7 @@ from px4fuse.simulation.scenario import Scenario
 
 AXES = ("north", "east", "down")
 FIELDS = {"sigma-z": "sigma_z_m", "sigma-a": "sigma_a_m_s2", "clock-offset": "clock_offset_s"}
-# What rounding to the digits that are printed may do
-ROUNDING = 1.01
+ROUNDING = 1.01  # factor on the RMSE, from rounding settings to the printed digits
 AISLE = Scenario(passes=3, seed=3)
 LOOP = Scenario(kind="loop", passes=1, length_m=8.0, vio_rate_hz=10.0)
 
@@ -39,7 +38,7 @@ def errors_m(comparison: Comparison) -> float:
 
 
 def typed(remedy: str) -> dict[str, float]:
-    """Settings of our filter that a remedy names."""
+    """KF settings in an action."""
     number = r"(-?\d+(?:\.\d+)?(?:e-?\d+)?)"
     return {
         FIELDS[name]: float(value)
@@ -48,7 +47,7 @@ def typed(remedy: str) -> dict[str, float]:
 
 
 def parameters(remedy: str) -> dict[str, float]:
-    """Parameters of EKF2 that a remedy sets."""
+    """EKF2 parameters that an action sets."""
     found = re.findall(r"(EKF2_\w+) to (\d+(?:\.\d+)?)", remedy)
     return {name: float(value) for name, value in found}
 
@@ -59,21 +58,21 @@ def parameters(remedy: str) -> dict[str, float]:
      ({}, ("clock-offset=250ms",)), ({}, ("nlos=5%",))],
     ids=str,
 )  # fmt: skip
-def test_no_remedy_increases_the_error_to_the_truth(settings, mistakes) -> None:
+def test_remedies_followed_do_not_increase_rmse(settings, mistakes) -> None:
     analysis = flown(AISLE, Settings(**settings), *mistakes)
     comparison, model = analysis, analysis.ekf2_model
     followed = 0
     for remedy in (finding.remedy for finding in find(analysis)):
-        if "Leave it" in remedy or "no remedy" in remedy:
+        if re.search(r"Leave it|No change advised|no remedy|does not help", remedy):
             continue
-        if ours := typed(remedy):
+        if kf_settings := typed(remedy):
             segment = {each: getattr(analysis.segment, each) for each in ("start_s", "end_s")}
-            chosen = replace(analysis.settings, **ours)
+            chosen = replace(analysis.settings, **kf_settings)
             again = compare(analysis.flight, chosen, axes=AXES, **segment)
             assert errors_m(again) <= ROUNDING * errors_m(comparison), remedy
             followed += 1
-        if theirs := parameters(remedy):
-            done = what_if(model, [theirs])
+        if changes := parameters(remedy):
+            done = what_if(model, [changes])
             before, after = (
                 each.position_rmse_to_truth_m for each in (done.replayed, *done.whatif)
             )
@@ -83,8 +82,8 @@ def test_no_remedy_increases_the_error_to_the_truth(settings, mistakes) -> None:
 
 
 @pytest.mark.parametrize(("seed", "mistakes"), [(1, ()), (2, ("ekf2-noise=50cm",))])
-def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, mistakes) -> None:
-    """Neither where EKF2 trusts the VIO nor where its noise is 50 times the short-term one."""
+def test_find_drifting_vio_lists_error_first_and_keeps_noises(seed, mistakes) -> None:
+    """With PX4's default noise, and with an EKF2 noise of 50 times the short-term noise."""
     analysis = flown(replace(LOOP, seed=seed), Settings(), *mistakes)
     findings = find(analysis)
     first = findings[0]
@@ -93,15 +92,16 @@ def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, 
     for finding in findings:
         assert "set EKF2_EVP_NOISE" not in finding.remedy
         assert "--sigma-z" not in finding.remedy
-    asked = ml_ekf2_parameters(analysis, analysis.ekf2_model, analysis.tuning, analysis.clock)
+    estimated = ml_ekf2_parameters(analysis, analysis.ekf2_model, analysis.tuning, analysis.clock)
     flown_with = analysis.ekf2_model.inputs.settings["EKF2_EVP_NOISE"]
-    assert asked.get("EKF2_EVP_NOISE", flown_with) >= flown_with
+    assert estimated.get("EKF2_EVP_NOISE", flown_with) >= flown_with
 
 
-def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> None:
+def test_kf_remedy_contradicted_by_truth_is_not_advised() -> None:
     comparison = flown(AISLE, Settings())
     worse = remedies.format_kf_remedy(comparison, {"sigma_z_m": 3.0})
-    assert worse.startswith("Leave it: --sigma-z 3 fits")
+    assert not worse.startswith("px4fuse compare")
+    assert "--sigma-z 3 fits the innovations better" in worse
     truth = Unavailable("ground truth", "none", "")
     axes = {}
     for name, axis in comparison.axes.items():
@@ -110,18 +110,18 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
     blind = replace(comparison, axes=axes)
     typed = "px4fuse compare LOG --sigma-z 0.2."
     assert remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=0.1) == typed
-    assert remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1).startswith(
-        "Leave"
-    )
+    unseen = remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1)
+    assert not unseen.startswith("px4fuse compare")
+    assert "first half" in unseen
 
 
-# ---------------------------------------------------------------- of EKF2
+# ---------------------------------------------------------------- EKF2
 
 NO_TRUTH = Unavailable("truth", "none", "None.")
 
 
 def flown_with(analysis: Analysis, **changes: float) -> Analysis:
-    """The same, had EKF2 been flown with other parameters."""
+    """Make the analysis of a flight with other EKF2 parameters."""
     model = analysis.ekf2_model
     (flown,) = replay_settings(model, [changes])
     inputs = replace(model.inputs, settings={**model.inputs.settings, **changes})
@@ -129,7 +129,7 @@ def flown_with(analysis: Analysis, **changes: float) -> Analysis:
 
 
 def offset(analysis: Analysis, offset_s: float) -> Analysis:
-    """The same with stamps that are said to be off."""
+    """Make the analysis with another estimated time offset."""
     clock = replace(
         analysis.clock, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
         sigma_s=0.005, determinable=True, change_p=None,
@@ -152,15 +152,15 @@ def summary(
     [
         (summary(1.0, 0.0, 0.08, 0.09), True, True, True),
         (summary(1.0, 0.0, NO_TRUTH, 0.09), True, True, True),
-        (summary(1.0, 0.0, 0.12, 0.09), False, False, False),  # no small error
-        (summary(9.0, 0.0, 0.08, 0.09), False, True, True),  # the NIS stays
-        (summary(0.05, 0.0, 0.08, 0.09), False, True, True),  # as far off on the other side
+        (summary(1.0, 0.0, 0.12, 0.09), False, False, False),  # RMSE 20 % larger
+        (summary(9.0, 0.0, 0.08, 0.09), False, True, True),  # mean NIS unchanged
+        (summary(0.05, 0.0, 0.08, 0.09), False, True, True),  # mean NIS as far below 1
         (summary(1.0, 0.2, 0.08, 0.09), True, False, True),
         (summary(1.0, 0.3, 0.08, 0.09), False, False, False),
         (summary(1.0, 0.0, 0.08, 0.11), True, True, False),
     ],
 )  # fmt: skip
-def test_a_remedy_must_help_and_not_harm(after, noise, fewer, delay) -> None:
+def test_remedy_tests_require_improvement_without_larger_rmse(after, noise, fewer, delay) -> None:
     known = isinstance(after.axes["north"].position_rmse_to_truth_m, float)
     before = summary(10.0, 0.25, 0.1 if known else NO_TRUTH, 0.1)
     assert remedies.noise_helps(before, after) is noise
@@ -168,54 +168,57 @@ def test_a_remedy_must_help_and_not_harm(after, noise, fewer, delay) -> None:
     assert remedies.delay_helps(before, after) is delay
 
 
-def words(analysis: Analysis, **changes: float) -> str:
-    model, why, fallback_remedy = analysis.ekf2_model, "Because: ", "Look elsewhere:"
+def ekf2_remedy(analysis: Analysis, **changes: float) -> str:
+    model, why, fallback_remedy = analysis.ekf2_model, "Reason: ", "Other action."
     return remedies.format_ekf2_remedy(
         model, changes, remedies.noise_helps, why=why, fallback_remedy=fallback_remedy
     )
 
 
-def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
-    sure = flown_with(sample, EKF2_EVP_NOISE=0.03)
-    said = words(sure, EKF2_EVP_NOISE=0.1)
-    assert said.startswith("Because: set EKF2_EVP_NOISE to 0.1 m: rejected ")
-    assert "→ 0%, mean NIS" in said
-    assert said.endswith("m (replayed).")
-    said = words(sample, EKF2_EVP_NOISE=0.5)  # what was flown is right
-    assert said.startswith("Look elsewhere: EKF2_EVP_NOISE 0.5 is no remedy: mean NIS 0.9 → 0.041")
+def test_ekf2_remedy_states_replay_result_or_reason(sample: Analysis) -> None:
+    overconfident = flown_with(sample, EKF2_EVP_NOISE=0.03)
+    text = ekf2_remedy(overconfident, EKF2_EVP_NOISE=0.1)
+    assert text.startswith("Reason: set EKF2_EVP_NOISE to 0.1 m: rejected ")
+    assert re.search(r"→ 0 ?%, mean NIS", text)
+    text = ekf2_remedy(sample, EKF2_EVP_NOISE=0.5)  # the flown value is correct
+    assert text.startswith("Other action. EKF2_EVP_NOISE 0.5")
+    assert "mean NIS 0.9 → 0.041" in text
     blind = replace(sample, ekf2_model=Unavailable("EKF2 replay", "no IMU", "Record it."))
-    said = words(blind, EKF2_EVP_NOISE=0.2)
-    assert said == "Because: set EKF2_EVP_NOISE to 0.2 m. Not replayed: no IMU."
+    text = ekf2_remedy(blind, EKF2_EVP_NOISE=0.2)
+    assert text.startswith("Reason: set EKF2_EVP_NOISE to 0.2 m. ")
+    assert "no IMU" in text
     model = sample.ekf2_model
-    agreement = replace(model.agreement, good=False, reason="they part")
+    agreement = replace(model.agreement, good=False, reason="they differ")
     doubtful = replace(sample, ekf2_model=replace(model, agreement=agreement))
-    assert "Not replayed: the model does not reproduce what EKF2 logged: they part." in words(
-        doubtful, EKF2_EVP_NOISE=0.2
-    )
+    assert "they differ" in ekf2_remedy(doubtful, EKF2_EVP_NOISE=0.2)
 
 
-def test_what_the_data_ask_for(sample: Analysis) -> None:
+def test_ml_ekf2_parameters_follow_noise_and_time_offset(sample: Analysis) -> None:
     model, comparison = sample.ekf2_model, sample
 
-    def asked(analysis: Analysis) -> dict[str, float]:
+    def estimated(analysis: Analysis) -> dict[str, float]:
         return ml_ekf2_parameters(comparison, model, analysis.tuning, analysis.clock)
 
-    assert asked(sample) == {"EKF2_EVP_NOISE": 0.098}
-    assert asked(replace(sample, tuning={})) == {}
+    assert estimated(sample) == {"EKF2_EVP_NOISE": 0.098}
+    assert estimated(replace(sample, tuning={})) == {}
     aisle = {"aisle": sample.tuning["horizontal"]}  # --axis aisle
-    assert asked(replace(sample, tuning=aisle))["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
-    late = asked(offset(sample, -0.25))
+    assert estimated(replace(sample, tuning=aisle))["EKF2_EVP_NOISE"] == pytest.approx(
+        0.1, abs=0.01
+    )
+    late = estimated(offset(sample, -0.25))
     assert late == {"EKF2_EVP_NOISE": 0.098, "EKF2_EV_DELAY": 250.0, "EKF2_DELAY_MAX": 300.0}
-    assert asked(offset(sample, -0.14))["EKF2_EV_DELAY"] == 140.0
-    assert "EKF2_EV_DELAY" not in asked(offset(sample, -0.019))  # 0 may be right
-    assert "EKF2_DELAY_MAX" not in asked(offset(sample, -0.14))
-    assert "EKF2_EV_DELAY" not in asked(offset(sample, -0.4))  # beyond PX4's range
-    assert "EKF2_EV_DELAY" not in asked(offset(sample, 0.2))  # early: it is 0 already
+    assert estimated(offset(sample, -0.14))["EKF2_EV_DELAY"] == 140.0
+    assert "EKF2_EV_DELAY" not in estimated(offset(sample, -0.019))  # 0 is within the interval
+    assert "EKF2_DELAY_MAX" not in estimated(offset(sample, -0.14))
+    assert "EKF2_EV_DELAY" not in estimated(offset(sample, -0.4))  # beyond PX4's range
+    assert "EKF2_EV_DELAY" not in estimated(
+        offset(sample, 0.2)
+    )  # early: EKF2_EV_DELAY is already 0
     other = replace(comparison, source=replace(comparison.source, name="another"))
     assert ml_ekf2_parameters(other, model, sample.tuning, sample.clock) == {}
 
 
-def test_a_noise_that_the_sender_reports_is_overruled(sample: Analysis) -> None:
+def test_noise_change_reported_variance_sets_noise_mode(sample: Analysis) -> None:
     model = sample.ekf2_model
     assert noise_used_m(model) == pytest.approx(0.1)
     flown = model.inputs.aid, model.inputs.settings, noise_used_m(model)
@@ -235,16 +238,16 @@ def only(name: str, analysis: Analysis) -> Finding:
     return finding
 
 
-def test_a_delay_that_the_replay_refutes_is_not_proposed(sample: Analysis) -> None:
-    """The stamps of the sample are right; a clock estimate that says otherwise is refuted."""
+def test_delay_remedy_worse_replay_is_not_proposed(sample: Analysis) -> None:
+    """The timestamps of the sample are correct; a replay with 150 ms is worse."""
     finding = only("ekf2_ev_delay_wrong", offset(sample, -0.15))
-    assert finding.remedy.startswith("Correct the stamps at the sender: EKF2_EV_DELAY 150 is no")
-    # neither is ours, which the truth refutes as well
+    assert finding.remedy.startswith("Correct the timestamps at the sender. EKF2_EV_DELAY 150 ")
+    # ground truth contradicts --clock-offset too
     found = [finding.id for finding in source_clock.detect(offset(sample, -0.15))]
     assert found == ["ekf2_ev_delay_wrong"]
 
 
-def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
+def test_delay_remedy_better_replay_is_proposed(sample: Analysis) -> None:
     flight = sample.flight
     parameters = {**flight.log.parameters, "EKF2_EV_DELAY": 150.0}
     wrong = replace(flight, log=replace(flight.log, parameters=parameters))
@@ -252,4 +255,4 @@ def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
     late = replace(late, flight=wrong)
     remedy = only("ekf2_ev_delay_wrong", late).remedy
     assert remedy.startswith("Set EKF2_EV_DELAY to 0 ms: mean NIS")
-    assert remedy.endswith("(replayed).")
+    assert re.search(r"\((replayed|re-run)\)\.$", remedy)

@@ -160,7 +160,7 @@ def test_samples_that_come_too_late_are_never_fused_and_that_is_said():
     early = flown("clock-offset=-350ms")
     compared = compare(early, RIGHT, axes=("north",))
     (finding,) = (f for f in find(unexplained(compared)) if f.id == "ekf2_not_fusing")
-    assert "arrive 0.38 s after their stamps, and EKF2 keeps no more than 0.23 s" in finding.message
+    assert "arrive 0.38 s after their timestamps, but EKF2 buffers only 0.23 s" in finding.message
     assert "EKF2_DELAY_MAX" in finding.remedy
 
 

@@ -1,4 +1,4 @@
-"""Noise of positions that is not white, equal and the same throughout: told apart, and by size."""
+"""Position noise that is correlated, repeated, unequal or varying: kind and size are found."""
 
 from functools import cache, partial
 from typing import Any
@@ -31,20 +31,20 @@ NEW = {"source_coloured", "source_repeats", "source_axes_unequal", "source_noise
 
 @cache
 def flown(seed: int, passes: int) -> tuple[Flight, CubicSpline]:
-    """A simulated flight and its true way, which all models are laid over."""
+    """Simulate a flight; return it with a spline of its true path, to which errors are added."""
     flight = simulate_flight(Scenario(seed=seed, passes=passes, ekf2=False))
     truth = flight.truth.samples[Columns.POSITION].dropna()
     return flight, CubicSpline(truth.index.to_numpy(), truth.to_numpy())
 
 
 @cache
-def judged(
+def analysed(
     model: errors.Model, rate_hz: float = 10.0, seed: int = 1, truth_for: float | None = None,
     passes: int | None = None,
 ) -> Analysis:  # fmt: skip
-    """A simulated flight whose positions have errors of the study's models, without EKF2.
+    """Analyse a simulated flight without EKF2, with position errors of a model of the study.
 
-    With its truth where there is a SIGMA_Z (m) to try for that.
+    Ground truth is included if `truth_for`, a SIGMA_Z (m), is given.
     """
     flight, known = flown(seed, passes or PASSES.get(model, 3))
     flight, chosen = errors.laid_over(flight, known, model, rate_hz, seed), RIGHT
@@ -55,8 +55,8 @@ def judged(
     return explain(compare(flight, chosen, axes=("north", "east")))
 
 
-def told(analysis: Analysis) -> dict[str, Finding]:
-    """What is no information, no setting of ours, and follows from nothing else, by id."""
+def root_findings(analysis: Analysis) -> dict[str, Finding]:
+    """Findings by id without infos, KF settings and consequences."""
     left_out = SETTINGS | {"ekf2_unavailable"}
     return {
         one.id: one for one in find(analysis)
@@ -71,13 +71,12 @@ MIXED = partial(errors.coloured, tau_s=0.3, share=0.5)
 HELD, OFTEN_HELD = partial(errors.held, share=0.15), partial(errors.held, share=0.6)
 SMOOTH = partial(errors.low_pass, tau_s=0.5)
 LOUDER, SCALED = partial(errors.two_levels, factor=6.0), partial(errors.scaled, scale=0.2)
-# What three passes are too short for
 PASSES = {UNEQUAL: 5, LOUDER: 5, SCALED: 5}
 
 
-def test_white_noise_is_no_other() -> None:
-    analysis = judged(errors.white)
-    assert told(analysis) == {}
+def test_find_white_noise_returns_nothing() -> None:
+    analysis = analysed(errors.white)
+    assert root_findings(analysis) == {}
     assert list(detect(analysis)) == []
     assert isinstance(analysis.coloured, Unavailable)
 
@@ -85,7 +84,7 @@ def test_white_noise_is_no_other() -> None:
 @pytest.mark.parametrize(
     ("model", "name", "severity", "evidence"),
     [
-        (SLOW, "source_coloured", "error",  # as what it brings with it
+        (SLOW, "source_coloured", "error",  # the severity of its consequences
          {"tau_s": (0.5, 0.35), "slow_m": (0.1, 0.03), "white_m": (0.0, 0.04)}),
         (MIXED, "source_coloured", "warning", {"slow_m": (0.07, 0.03), "white_m": (0.07, 0.02)}),
         (HELD, "source_repeats", "warning", {"share": (0.15, 0.03)}),
@@ -96,28 +95,28 @@ def test_white_noise_is_no_other() -> None:
         (LOUDER, "source_noise_changes", "error", {"ratio": (6.0, 1.3)}),
     ],
 )  # fmt: skip
-def test_each_is_named_with_its_size_and_nothing_else(model, name, severity, evidence) -> None:
-    found = told(judged(model))
+def test_find_noise_model_reports_kind_and_size(model, name, severity, evidence) -> None:
+    found = root_findings(analysed(model))
     assert set(found) == {name}
     assert found[name].severity == severity
     for key, (value, within) in evidence.items():
         assert found[name].evidence[key] == pytest.approx(value, abs=within)
 
 
-def test_the_noisy_part_is_where_it_was() -> None:
-    analysis = judged(LOUD)
-    ((start, end),) = told(analysis)["source_noise_changes"].spans_s
+def test_noise_variation_reports_the_noisy_third() -> None:
+    analysis = analysed(LOUD)
+    ((start, end),) = root_findings(analysis)["source_noise_changes"].spans_s
     time = analysis.axes["north"].axis.measurement_time_s
     third = (time[-1] - time[0]) / 3.0
     assert start == pytest.approx(time[0] + third, abs=third / 3.0)
     assert end == pytest.approx(time[0] + 2.0 * third, abs=third / 3.0)
 
 
-def test_a_slow_error_is_no_low_pass_and_a_low_pass_no_slow_error() -> None:
-    slow, smooth = judged(SLOW), judged(SMOOTH)
+def test_find_separates_correlated_noise_from_low_pass() -> None:
+    slow, smooth = analysed(SLOW), analysed(SMOOTH)
     assert "source_smoothed" not in {one.id for one in find(slow)}
     assert "source_coloured" not in {one.id for one in find(smooth)}
-    assert "source_smoothed" in told(smooth)
+    assert "source_smoothed" in root_findings(smooth)
     for analysis, lags in ((slow, False), (smooth, True)):
         found = analysis.coloured
         assert found.gain_nats > 30.0
@@ -125,47 +124,47 @@ def test_a_slow_error_is_no_low_pass_and_a_low_pass_no_slow_error() -> None:
         assert 0.5 < found.share <= 1.0
 
 
-def test_outliers_and_a_jump_are_none_of_them() -> None:
+def test_find_other_mistakes_report_no_noise_kind() -> None:
     for model, name in (
         (partial(errors.with_outliers, share=0.05), "source_outliers"),
         (partial(errors.jumped, size=1.0), "source_jumps"),
         (partial(errors.clock, late=0.3), "source_clock_offset"),
     ):
-        found = told(judged(model))
+        found = root_findings(analysed(model))
         assert name in found
         assert not NEW & set(found)
 
 
 @pytest.mark.parametrize(
-    ("model", "sigma_z_m", "denied"),
+    ("model", "sigma_z_m", "contradicts"),
     [(partial(errors.coloured, tau_s=20.0), 0.10, True), (errors.white, 0.14, False)],
 )
-def test_what_no_innovation_shows_asks_for_no_smaller_noise(model, sigma_z_m, denied) -> None:
-    """Innovations ask for 0.7 of SIGMA_Z in both; slow errors make up the rest in one."""
-    analysis = judged(model, truth_for=sigma_z_m)
+def test_rerun_smaller_noise_is_checked_against_truth(model, sigma_z_m, contradicts) -> None:
+    """The estimate is 0.7 SIGMA_Z in both cases; the first one has time-correlated errors too."""
+    analysis = analysed(model, truth_for=sigma_z_m)
     tried = [each for each in analysis.causes if "sigma_z_m" in each.change and each.of == "nis"]
     assert {each.axis for each in tried} == {"north", "east"}
-    assert all(each.denied_by_truth == denied for each in tried)
+    assert all(each.denied_by_truth == contradicts for each in tried)
     assert all(each.change["sigma_z_m"] == pytest.approx(0.7 * sigma_z_m, rel=0.05)
                for each in tried)  # fmt: skip
-    if denied:
-        assert set(told(analysis)) == {"source_coloured"}
+    if contradicts:
+        assert set(root_findings(analysis)) == {"source_coloured"}
 
 
 @pytest.mark.parametrize(("tau_s", "seed"), [(5.0, 1), (20.0, 2)])
-def test_a_truth_shows_slow_errors_that_pass_for_those_of_the_imu(tau_s: float, seed: int) -> None:
-    """As long as errors of the IMU are, so that no innovation shows them."""
-    analysis = judged(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
-    found = told(analysis)
+def test_find_slow_errors_with_truth_reports_correlation(tau_s: float, seed: int) -> None:
+    """Correlation times of IMU errors, so the innovations do not show them."""
+    analysis = analysed(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
+    found = root_findings(analysis)
     assert set(found) == {"source_coloured"}
     finding = found["source_coloured"]
     evidence = finding.evidence
     assert evidence["low_s"] < tau_s < 1.1 * evidence.get("high_s", np.inf)
     assert evidence["white_m"] == pytest.approx(0.07, abs=0.015)
     assert 0.03 < evidence["slow_m"] < 0.15
-    assert ("at least" in finding.headline) == ("high_s" not in evidence)
-    blind = told(judged(partial(errors.coloured, tau_s=tau_s), 5.0, seed))
-    assert "source_coloured" not in blind or "at least" in blind["source_coloured"].headline
+    assert ("over at least" in finding.headline) == ("high_s" not in evidence)
+    blind = root_findings(analysed(partial(errors.coloured, tau_s=tau_s), 5.0, seed))
+    assert "source_coloured" not in blind or "over at least" in blind["source_coloured"].headline
 
 
 @pytest.mark.parametrize(
@@ -179,20 +178,22 @@ def test_a_truth_shows_slow_errors_that_pass_for_those_of_the_imu(tau_s: float, 
         (partial(errors.low_pass, tau_s=0.3), "source_smoothed"),
     ],
 )
-def test_what_a_truth_shows_of_other_errors_is_no_slow_one(model: errors.Model, name: str) -> None:
-    analysis = judged(model, truth_for=0.10)
-    assert set(told(analysis)) == {name}
+def test_find_other_mistakes_with_truth_report_no_correlation(
+    model: errors.Model, name: str
+) -> None:
+    analysis = analysed(model, truth_for=0.10)
+    assert set(root_findings(analysis)) == {name}
 
 
-def test_a_clock_that_changes_too_little_to_be_told_is_no_slow_error() -> None:
-    """Errors along the motion, from one time on: against the truth they hang together."""
+def test_find_small_clock_jump_reports_no_correlation() -> None:
+    """Errors along the motion after the jump are correlated in time against ground truth."""
     changes = partial(errors.clock_jump, late=0.15)
-    assert "source_coloured" not in told(judged(changes, 20.0, truth_for=0.10))
+    assert "source_coloured" not in root_findings(analysed(changes, 20.0, truth_for=0.10))
 
 
-def test_a_low_pass_lags_by_less_than_its_time_constant() -> None:
-    """By Δt ρ / (1 - ρ) behind a steady motion."""
-    found = told(judged(SMOOTH, 5.0))["source_smoothed"]
+def test_find_low_pass_reports_lag_below_time_constant() -> None:
+    """Expected lag for steady motion: Δt ρ / (1 - ρ)."""
+    found = root_findings(analysed(SMOOTH, 5.0))["source_smoothed"]
     assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)
 
 
@@ -200,28 +201,30 @@ def test_a_low_pass_lags_by_less_than_its_time_constant() -> None:
 @pytest.mark.parametrize(
     ("name", "model", "seed", "finding"),
     [
-        # no slow error of late stamps, which fits as well and has two numbers more
+        # not a time-correlated error with a time offset, which fits as well
         ("nominal", partial(errors.low_pass, tau_s=0.3), 8, "source_smoothed"),
-        # no jump of 0.5 m, for which the larger noise passed where one was for both axes
+        # not a jump of 0.5 m, which one noise for both axes would suggest
         ("10hz", UNEQUAL, 1107, "source_axes_unequal"),
     ],
 )
-def test_flights_of_ekf2s_own_have_no_other(shared_logs, name, model, seed, finding) -> None:
+def test_find_px4_flight_reports_only_the_added_mistake(
+    shared_logs, name, model, seed, finding
+) -> None:
     log = shared_logs / "simulated" / f"v1.16.1_aisle_{name}.ulg"
     flight = read_log(log)
     flight = errors.laid_over(flight, errors.truth_of(log, flight), model, 5.0, seed)
-    assert set(told(explain(compare(flight, RIGHT, axes=("north", "east"))))) == {finding}
+    assert set(root_findings(explain(compare(flight, RIGHT, axes=("north", "east"))))) == {finding}
 
 
-def test_a_filter_that_outliers_pull_is_no_noisy_part() -> None:
-    """At 2 Hz most innovations of 13 s are large, since outliers lead the filter away."""
-    analysis = judged(partial(errors.with_outliers, share=0.05), 2.0, seed=13)
-    assert {"source_outliers"} == set(told(analysis))
+def test_noise_variation_fused_outliers_are_not_reported() -> None:
+    """At 2 Hz outliers pull KF away, so most innovations within 13 s are large."""
+    analysis = analysed(partial(errors.with_outliers, share=0.05), 2.0, seed=13)
+    assert {"source_outliers"} == set(root_findings(analysis))
     assert list(noise_variation(analysis)) == []
 
 
-def test_too_few_and_no_imu_are_said() -> None:
-    analysis = judged(MIXED)
+def test_time_correlation_few_samples_or_no_imu_is_unavailable() -> None:
+    analysis = analysed(MIXED)
     axis, given = analysis.axes["north"].axis, {"outlier_time_s": NONE, "clock_offset_s": 0.0}
     few = replace(axis, measurement_time_s=axis.measurement_time_s[:99],
                   measurement_m=axis.measurement_m[:99])  # fmt: skip
@@ -232,10 +235,10 @@ def test_too_few_and_no_imu_are_said() -> None:
     assert time_correlation_fit(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
 
 
-def test_slow_error_is_searched_at_zero_and_at_the_clock_offset(
+def test_time_correlation_fit_tries_zero_and_estimated_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    analysis, tried = judged(MIXED), []
+    analysis, tried = analysed(MIXED), []
 
     def none_better(moved: Any, offsets: list[float], noises: Any) -> tuple[float, Any]:
         tried.append(offsets)
@@ -250,10 +253,12 @@ def test_slow_error_is_searched_at_zero_and_at_the_clock_offset(
     assert tried[::2] == tried[1::2] == [[0.0], [0.0, 0.3], [-0.2, 0.0]]
 
 
-def test_a_slow_error_shows_beside_a_jump_and_outliers() -> None:
-    """Both are taken out first, and named besides."""
-    assert {"source_jumps", "source_coloured"} <= set(told(judged(partial(both, jump_m=2.0))))
-    found = told(judged(partial(both, outliers=0.03)))
+def test_find_correlated_noise_with_outliers_reports_both() -> None:
+    """Jumps and outliers are removed before the correlation is estimated."""
+    assert {"source_jumps", "source_coloured"} <= set(
+        root_findings(analysed(partial(both, jump_m=2.0)))
+    )
+    found = root_findings(analysed(partial(both, outliers=0.03)))
     assert {"source_outliers", "source_coloured"} <= set(found)
     assert "source_jumps" not in found
 
@@ -265,8 +270,8 @@ def both(rng: Any, time: Any, true: Any, jump_m: float = 0.0, outliers: float = 
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_jump_among_outliers_is_one_with_its_size_and_time(seed: int) -> None:
-    """Real outliers in the seconds after it used to make it one of them."""
+def test_find_jump_among_outliers_reports_one_jump(seed: int) -> None:
+    """Outliers in the seconds after the jump must not hide it."""
     kept: dict[str, float] = {}
 
     def model(rng: Any, time: Any, true: Any) -> Any:
@@ -276,7 +281,7 @@ def test_a_jump_among_outliers_is_one_with_its_size_and_time(seed: int) -> None:
         error[at:, 0] += 1.0
         return error, 0.0
 
-    found = told(judged(model, seed=seed, passes=5))
+    found = root_findings(analysed(model, seed=seed, passes=5))
     assert {"source_jumps", "source_outliers"} == set(found)
     evidence = found["source_jumps"].evidence
     assert evidence["count"] == 1

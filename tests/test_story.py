@@ -1,4 +1,4 @@
-"""The sentences that open a report: what they say is what was made to happen."""
+"""Summary of a flight: it states the mistakes and events that the flight contains."""
 
 from __future__ import annotations
 
@@ -14,73 +14,76 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import EV_POS, FLOW, Aid
 from px4fuse.findings import find
-from px4fuse.findings.story import MAX_SENTENCES, story
+from px4fuse.findings.story import MAX_PARAGRAPHS, story
 from px4fuse.flight import AidLog
 
 ALONG_DEG = 30.0
 
 
-def told(comparison: Comparison) -> tuple[str, ...]:
-    """Story of a comparison, each sentence checked for form."""
+def summary(comparison: Comparison) -> tuple[str, ...]:
+    """Summarise a comparison, and check the form of each paragraph."""
     analysis = with_noises(comparison)
-    sentences = story(analysis, find(analysis))
-    assert 1 <= len(sentences) <= MAX_SENTENCES
-    for sentence in sentences:
-        assert re.fullmatch(r"[A-Z0-9].*[^.]\.", sentence), sentence
-        assert "nan" not in sentence
-    return sentences
+    paragraphs = story(analysis, find(analysis))
+    assert 1 <= len(paragraphs) <= MAX_PARAGRAPHS
+    for paragraph in paragraphs:
+        assert re.fullmatch(r"[A-Z0-9].*[^.]\.", paragraph), paragraph
+        assert "nan" not in paragraph
+    return paragraphs
 
 
-def test_a_clean_flight_is_told_in_one_sentence_with_its_errors() -> None:
+def test_summary_clean_flight_states_rmse_and_consistency() -> None:
     flight = aisle_flight(heading_deg=ALONG_DEG, ekf2=Estimator(sigma_p_m=0.05))
     comparison = compare(flight)
-    (only,) = told(comparison)
+    (only,) = summary(comparison)
     steps = comparison.main.replay.steps
     true = motion(steps.index.to_numpy(), ALONG_DEG, 10.0)[0] @ comparison.main.axis.direction
-    ours_cm = 100.0 * float(np.sqrt(np.mean((steps["position_m"] - true) ** 2)))
+    kf_rmse_m = float(np.sqrt(np.mean((steps["position_m"] - true) ** 2)))
+    ekf2_rmse_m = comparison.main.filters["ekf2"].truth.position_rmse_m
     assert only == (
-        "Along the aisle EKF2 was 5 cm from the truth (RMS) and honest about it; our filter was "
-        f"{ours_cm:.0f} cm from the truth (RMS) and honest about it."
+        f"Along the aisle EKF2 has a position RMSE of {ekf2_rmse_m:.3f} m and is consistent. "
+        f"Along the aisle KF has a position RMSE of {kf_rmse_m:.3f} m and is consistent."
     )
+    assert ekf2_rmse_m == pytest.approx(0.05, abs=0.005)
 
 
-def test_a_silent_source_is_told_with_how_far_both_filters_coasted() -> None:
-    silence = (50.0, 58.0)
-    comparison = compare(aisle_flight(uwb=Uwb(gap_s=silence), heading_deg=ALONG_DEG))
-    sentences = told(comparison)
-    gap = next(sentence for sentence in sentences if "silent" in sentence)
-    assert gap.startswith("From 50 s to 58 s the source was silent: both filters coasted")
+def test_summary_source_gap_states_errors_at_its_end() -> None:
+    gap_s = (50.0, 58.0)
+    comparison = compare(aisle_flight(uwb=Uwb(gap_s=gap_s), heading_deg=ALONG_DEG))
+    gap = next(text for text in summary(comparison) if text.startswith("Gap in the position"))
+    assert "from 50 s to 58 s" in gap
+    assert BOTH_IMU in gap
     steps = comparison.main.replay.steps
-    before = steps[steps.index < silence[1]].iloc[-1]
-    moved = before["velocity_m_s"] * (silence[1] - steps.index[steps.index < silence[1]][-1])
-    true = motion(np.array([silence[1]]), ALONG_DEG, 10.0)[0][0] @ comparison.main.axis.direction
-    off = abs(before["position_m"] + moved - true)
-    assert f"ours was {off:.1f} m " in gap
+    before = steps[steps.index < gap_s[1]].iloc[-1]
+    moved = before["velocity_m_s"] * (gap_s[1] - steps.index[steps.index < gap_s[1]][-1])
+    true = motion(np.array([gap_s[1]]), ALONG_DEG, 10.0)[0][0] @ comparison.main.axis.direction
+    error_m = abs(before["position_m"] + moved - true)
+    assert f"position error was {error_m:.2f} m (KF)" in gap
 
 
-COASTED = "both filters coasted on the IMU;"
+BOTH_IMU = "KF and EKF2 relied on the IMU."
 
 
 @pytest.mark.parametrize("aid", [FLOW, EV_POS])
-@pytest.mark.parametrize(("fused", "silent_s", "by"), [
-    (1.0, (0.0, 0.0), "ours coasted on the IMU, EKF2 went on by {};"),
-    (0.0, (0.0, 0.0), COASTED),
-    (1.0, (50.5, 57.5), COASTED),  # silent too, but for the ends
+@pytest.mark.parametrize(("fused", "gap_s", "expected"), [
+    (1.0, (0.0, 0.0), "KF relied on the IMU, EKF2 also on {}."),
+    (0.0, (0.0, 0.0), BOTH_IMU),
+    (1.0, (50.5, 57.5), BOTH_IMU),  # fused only at the ends of the gap
 ])  # fmt: skip
-def test_what_carried_ekf2_through_a_silence_is_told(
-    aid: Aid, fused: float, silent_s: tuple[float, float], by: str
+def test_summary_source_gap_names_aid_that_ekf2_fused(
+    aid: Aid, fused: float, gap_s: tuple[float, float], expected: str
 ) -> None:
     flight = aisle_flight(uwb=Uwb(gap_s=(50.0, 58.0)), heading_deg=ALONG_DEG)
     times_s = np.arange(45.0, 65.0, 0.2)
     innovation = np.random.default_rng(3).normal(size=len(times_s))
     columns = {"innovation_x": innovation, "variance_x": 1.0, "noise_x": 0.5, "ratio_x": 0.1}
     samples = pd.DataFrame({**columns, "fused": fused, "rejected": 0.0}, times_s)
-    samples = samples[(times_s <= silent_s[0]) | (times_s >= silent_s[1])]
+    samples = samples[(times_s <= gap_s[0]) | (times_s >= gap_s[1])]
     log = AidLog(("estimator_aid_src",), ("x",), samples, None)
-    sentences = told(compare(replace(flight, ekf2=replace(flight.ekf2, aids={aid.name: log}))))
-    assert any(f"silent: {by.format(aid.label)}" in sentence for sentence in sentences)
+    paragraphs = summary(compare(replace(flight, ekf2=replace(flight.ekf2, aids={aid.name: log}))))
+    assert any(expected.format(aid.label) in paragraph for paragraph in paragraphs)
 
 
-def test_without_ekf2_its_absence_is_told_with_the_reason() -> None:
-    first, *_ = told(compare(aisle_flight(ekf2=None)))
-    assert "there is no EKF2 beside it: no topic for EKF2" in first
+def test_summary_without_ekf2_states_the_reason() -> None:
+    first, *_ = summary(compare(aisle_flight(ekf2=None)))
+    assert first.startswith("Along the aisle KF has a position RMSE of ")
+    assert first.endswith("The log contains no EKF2 state: no topic for EKF2.")

@@ -25,6 +25,7 @@ COMMANDS = {
     "explore": "Turn the filter's knobs on a flight, in a web page.",
     "practice": "Find what is wrong with simulated flights, in a web page.",
     "info": "Say what is in a log and what can be done with it.",
+    "explain": "Explain a finding: meaning, example, action, false alarms.",
     "extract": "Write a log's data as tidy tables, CSV or Parquet.",
     "tune": "Find the noises that the data ask for, with intervals.",
     "sync": "Estimate the position source's clock offset.",

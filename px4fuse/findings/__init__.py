@@ -1,11 +1,11 @@
-"""The mistakes that px4fuse names: a file for those that share a condition.
+"""Detectors of mistakes and conditions, one file for those that share a condition.
 
-A file declares thresholds with unit and source and, in ``detect``, the condition and evidence of
-its findings; their words stand in ``words.toml``. A detector never prints and never guesses: what
-it cannot see it does not mention.
+A file declares thresholds with unit and source and, in ``detect``, the condition, message, action
+and evidence of its findings. A detector does not print, and reports nothing that the log does not
+show.
 
-To add a finding: its file with a ``detect``, the file in :data:`DETECTORS`, its words in
-``words.toml``, and the flights on which its rate is measured in ``tests/studies/rates.csv``.
+To add a finding: its file with a ``detect``, the file in :data:`DETECTORS`, its title, group and
+meaning in ``catalogue.toml``, and the flights for its rate in ``tests/studies/rates.csv``.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,9 +35,18 @@ from px4fuse.findings.causes import group_by_cause
 from px4fuse.findings.model import NAMES, Finding, Found, Severity, by_root
 from px4fuse.loop.model import Loop
 
-__all__ = ["NAMES", "Finding", "Severity", "by_root", "find", "find_aids", "find_loop", "named"]
+__all__ = [
+    "NAMES",
+    "Finding",
+    "Severity",
+    "by_root",
+    "find",
+    "find_aids",
+    "find_loop",
+    "finding_title",
+]
 
-# Detectors of a comparison; by_cause orders their findings
+# Detectors of a comparison; group_by_cause orders their findings
 DETECTORS: tuple[Callable[[Analysis], Found], ...] = (
     aids.detect,
     ekf2_not_fusing.detect,
@@ -59,33 +68,31 @@ DETECTORS: tuple[Callable[[Analysis], Found], ...] = (
 
 
 def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
-    """Findings, most severe first and what the recording lacks before noises.
-
-    What follows from another stands behind it, see :attr:`Finding.caused_by`.
+    """Find all mistakes of a flight, most severe first, consequences behind their cause.
 
     Parameters
     ----------
     subject : Analysis or Comparison
-        A comparison is explained first, which takes some seconds.
+        A comparison is first explained (re-runs with changes), which takes some seconds.
     """
     analysis = subject if isinstance(subject, Analysis) else explain(subject)
     return group_by_cause(found for detect in DETECTORS for found in detect(analysis))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
-    """All findings about a loop, most severe first."""
+    """Find mistakes of a loop, most severe first."""
     return group_by_cause(loops.find_in(loop))
 
 
 def find_aids(results: Mapping[str, AidResult]) -> tuple[Finding, ...]:
-    """All findings about EKF2's aids alone, most severe first."""
+    """Find faults of EKF2's aids on a flight without position source, most severe first."""
     return group_by_cause(aids.find_in(results))
 
 
 def finding_title(finding: str) -> str:
-    """A finding as part of a sentence; one that this version does not know by its id.
+    """Title of a finding; an unknown id is returned with blanks.
 
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
-    ('a time without positions', 'of a later version')
+    ('Gap in the position source', 'of a later version')
     """
     return NAMES.get(finding, finding.replace("_", " "))

@@ -1,6 +1,6 @@
-"""An aid of EKF2 that it did not get, does not believe, or is pulled to one side by.
+"""EKF2 aids that are not fused, overconfident, shifted or biased.
 
-External vision's position is judged by the detectors of the lab, with what a replay shows.
+The external vision position is tested by the other detectors, which can replay it.
 """
 
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.findings.causes import CAUSE, CHANGE, SENSOR
-from px4fuse.findings.model import Found, info, warning
+from px4fuse.findings.model import Found, format_percent, info, warning
 from px4fuse.flight import Unavailable
 from px4fuse.plain import format_factor, format_number
 
@@ -17,16 +17,20 @@ EVALUATED_ELSEWHERE = ("ev_pos", "ev_hgt")
 
 
 def detect(analysis: Analysis) -> Found:
-    """Of a comparison."""
+    """Detect faults of the aids of a compared flight."""
     if not isinstance(analysis.aids, Unavailable):
         own = analysis.source.origin.aid
         yield from find_in(analysis.aids, "" if own is None else own.name)
 
 
 def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
-    """One finding for each aid that has one; ``source`` is the one that our filter was given too.
+    """Yield at most one finding per aid; aids of one sensor that are not fused share one finding.
 
-    Its variance is judged beside ours. What one sensor gives is missing together, and told once.
+    Parameters
+    ----------
+    aids : mapping from aid name to AidResult
+    source : str
+        Aid whose positions KF uses too; its variance is tested by the other detectors.
     """
     evaluated = {name: aid for name, aid in aids.items() if name not in EVALUATED_ELSEWHERE}
     not_fused: dict[str, list[AidResult]] = {}
@@ -40,6 +44,12 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
         cause = _sensor_cause(switch, source) or (CHANGE if changed else "")
         yield warning(
             "aid_starved",
+            f"EKF2 fused no sample of {labels} for {longest.longest_without:.0f} s, although "
+            f"fusion was enabled. The limit is {NOT_FUSED_LIMIT_S:g} s; "
+            f"{format_percent(longest.rejected_share, 1)} of the samples were rejected. EKF2 "
+            "relied on its other aids and the IMU, so its error grew.",
+            "Check the sensor in that time (reception, range, light), and whether EKF2 rejected "
+            "its samples.",
             {
                 "aid": labels,
                 "longest_without_s": longest.longest_without,
@@ -47,35 +57,40 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
                 CAUSE: cause,
             },
             (longest.longest_without_s,),
-            most_s=NOT_FUSED_LIMIT_S,
         )
     for name, aid in evaluated.items():
         changes = {axis: one.change for axis, one in aid.axes.items() if one.change is not None}
+        label = _aid_label(aid)
         if changes and not _sensor_cause(AIDS[name].switch, source):
             axis, (time_s, moved) = max(changes.items(), key=lambda item: abs(item[1][1]))
             yield warning(
                 "aid_changed",
+                f"The mean innovation of {label} shifts by {abs(moved):.1f} √S at about "
+                f"{time_s:.0f} s ({axis}). From then on this aid and the other aids contradict "
+                "each other, until the EKF2 states absorb the difference.",
+                "Check what was switched, moved or passed near the sensor then (current, metal, "
+                "propeller wash, heat).",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": moved},
                 ((time_s, time_s + WINDOW_S),),
-                label=_aid_label(aid),
-                by=abs(moved),
             )
         elif aid.verdict == "variance understated" and name != source:
+            # no value is proposed: innovations alone cannot separate noise from a wrong delay
             noise = AIDS[name].noise
+            action = f"increase {noise}" if noise else "correct the accuracy that it reports"
             yield warning(
                 "aid_understated",
+                f"EKF2 is overconfident about {label}: σ is {format_factor(aid.nis_mean**0.5)} "
+                f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1); "
+                f"{format_percent(aid.rejected_share, 1)} of the samples were rejected. The errors "
+                f"of this aid exceed R{_format_noise(aid)}, or another aid contradicts it.",
+                "First check outliers, delay and mounting of the sensor, and the other aids. If "
+                f"the sensor is noisier than assumed, {action}.",
                 {
                     "aid": name,
                     "nis_mean": aid.nis_mean,
                     "rejected_share": aid.rejected_share,
                     CAUSE: _sensor_cause(AIDS[name].switch, source),
                 },
-                label=_aid_label(aid),
-                times=format_factor(aid.nis_mean**0.5),
-                r=_format_noise(aid),
-                nis=format_number(aid.nis_mean),
-                raised=bool(noise),
-                noise=noise,
             )
         elif aid.verdict == "biased":
             axis, worst = max(
@@ -83,16 +98,17 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
             )
             yield info(
                 "aid_biased",
+                f"The innovations of {label} have a mean of {format_number(worst.innovation_mean)} "
+                f"{aid.unit} ({axis}; √S is {format_number(worst.s_sqrt_median)} {aid.unit}). This "
+                "aid and another one contradict each other.",
+                "Find the wrong one: check calibration, mounting and interference. Changing noises "
+                "does not correct a bias.",
                 {
                     "aid": name,
                     "axis": axis,
                     "innovation_mean": worst.innovation_mean,
                     "s_sqrt_median": worst.s_sqrt_median,
                 },
-                label=_aid_label(aid),
-                unit=aid.unit,
-                mean=format_number(worst.innovation_mean),
-                s=format_number(worst.s_sqrt_median),
             )
 
 
@@ -101,7 +117,7 @@ def _aid_label(aid: AidResult) -> str:
 
 
 def _sensor_cause(switch: str, source: str) -> str:
-    """Whether the sensor that is switched so is the one whose positions our filter was given."""
+    """Return SENSOR if the parameter `switch` also enables the aid that KF uses, else ""."""
     return SENSOR if source and AIDS[source].switch == switch else ""
 
 

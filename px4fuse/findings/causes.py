@@ -1,7 +1,6 @@
-"""Which findings have one cause, and in which order they are told.
+"""Order of the findings, and grouping of consequences behind their cause.
 
-What a cause brings with it stands behind it, with its evidence, so that a report has one finding
-per thing to put right.
+A report then has one finding per fault to correct; its consequences keep their evidence.
 """
 
 from collections.abc import Iterable
@@ -11,7 +10,7 @@ from msgspec.structs import replace
 from px4fuse.findings.model import NAMES, SEVERITIES, Finding, by_root
 from px4fuse.record import table
 
-# In the evidence of a finding about a variance: what the detector holds it to be the effect of
+# Key in the evidence of a finding about a variance: kind of the cause, by the re-runs
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -23,10 +22,10 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# In the evidence of a slow error: how many times what a filter assumes of the noise its white part
-# is; where it is beyond that, the noise is wrong by itself
-WHITE_BEYOND = "white_over_assumed"
-# Likewise of an aid: it is of the sensor that the positions are of, or changed in flight
+# Key in the evidence of time-correlated noise: its white part over the σ that a filter assumes. It
+# is set if the ratio is large: the assumed noise is then wrong in addition
+WHITE_RATIO = "white_over_assumed"
+# Kinds of cause of an aid's finding: the sensor of the position source, or a shift in flight
 SENSOR, CHANGE = "the source's sensor", "change"
 
 _KF_VARIANCES = frozenset({"kf_variance_overstated", "kf_variance_understated"})
@@ -34,7 +33,7 @@ SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_
 VARIANCES = _KF_VARIANCES | {"ekf2_variance_overstated", "ekf2_variance_understated"}
 NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}
 CONSEQUENCES = table(__file__, "consequences.toml", dict[str, tuple[str, ...]])
-# What the recording lacks: put right first, since noises are judged by what was recorded
+# Findings about the recording: listed before those about noises, which depend on the recording
 RECORDING = frozenset(
     {
         "autopilot_restarted",
@@ -53,16 +52,16 @@ RECORDING = frozenset(
 
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings in the order in which to put them right, each behind what it follows from.
+    """Sort findings in the order of correction, consequences behind their cause.
 
-    By severity and then in the order of :data:`NAMES`, except that what the recording lacks comes
-    before errors of noises. A cause is as severe as what it brings with it.
+    By severity, then in the order of :data:`NAMES`; findings about the recording come before errors
+    of noises. A cause is at least as severe as its consequences.
     """
     places = list(NAMES)
     groups = sorted(by_root(findings), key=lambda group: places.index(group[0].id))
     for cause, listed in CONSEQUENCES.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
-        if cause_group is None or WHITE_BEYOND in cause_group[0].evidence:
+        if cause_group is None or WHITE_RATIO in cause_group[0].evidence:
             continue
         effect_groups = [
             group for group in groups if group is not cause_group and _is_effect(group[0], listed)
@@ -70,7 +69,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         groups = [group for group in groups if group not in effect_groups]
         for first, *rest in effect_groups:
             cause_group += [replace(first, caused_by=cause), *rest]
-        # the variance of our filter is judged by the setting that it follows from
+        # the severity of a KF variance follows from the setting that causes it
         severities = (
             first.severity for first, *_ in effect_groups if first.id not in _KF_VARIANCES
         )
@@ -84,6 +83,6 @@ def _is_effect(finding: Finding, listed: tuple[str, ...]) -> bool:
 
 
 def _report_rank(group: list[Finding]) -> int:
-    """Place in a report."""
+    """Sort key of a group in a report: severity, recording before noises."""
     error, warning = 2 if group[0].id in NOISES else 0, 1 if group[0].id in RECORDING else 3
     return {"error": error, "warning": warning, "info": 4}[group[0].severity]

@@ -1,20 +1,19 @@
-"""EKF2 did not use the source for horizontal position, or not all the time."""
-
-from typing import Any
+"""EKF2 does not use the source for horizontal position, or only for part of the flight."""
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.findings.model import Found, error, fraction_on, spans_at, warning
+from px4fuse.findings.model import Found, error, format_percent, fraction_on, spans_at, warning
 from px4fuse.flight import Ekf2, FusionRecord, Unavailable
 
-FUSING_SHARE_ERROR = 0.5  # of the segment: below, EKF2's track is mostly not the source's
-FUSING_SHARE_WARNING = 0.98  # of the segment: one second in a flight of a minute
+MIN_FUSING_SHARE_ERROR = 0.5  # of the segment; below, EKF2's track mostly uses other sensors
+MIN_FUSING_SHARE_WARNING = 0.98  # of the segment; 2 % of a minute are about 1 s
 EV_START_INTERVAL_S = 0.2  # EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cpp
 EV_STOP_INTERVAL_S = 0.4  # two times EV_MAX_INTERVAL, ev_pos_control.cpp
-MAX_LATE_S = 0.1  # older than that by the horizon, no sample is fused: RingBuffer.h
+MAX_LATE_S = 0.1  # s beyond the fusion horizon; older samples are dropped (RingBuffer.h)
+CHECK_SWITCH = "Check EKF2_EV_CTRL (EKF2_AID_MASK before v1.14)."
 
 
 def detect(analysis: Comparison) -> Found:
-    """Fused in too small a share of the segment."""
+    """Detect a small fraction of the segment in which EKF2 fuses the source."""
     ekf2, segment, source = analysis.flight.ekf2, analysis.segment, analysis.source
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
         return
@@ -23,45 +22,62 @@ def detect(analysis: Comparison) -> Found:
     evidence = {"fusing_share": share, "source_interval_s": 1.0 / source.rate_hz}
     if not source.origin.is_vision:
         if source.name == "vehicle_mocap_odometry" and share == 0.0:
-            yield warning("ekf2_not_fusing", {"fusing_share": share}, case="mocap")
-    elif share < FUSING_SHARE_ERROR:
-        case_name, facts = _find_cause(analysis, ekf2)
-        frequency = "seldom" if share else "never"
-        yield error("ekf2_not_fusing", evidence, case=case_name, headline=frequency, **facts)
-    elif share < FUSING_SHARE_WARNING:
-        spans = spans_at(0.0, fusing, segment)
-        yield warning("ekf2_fusion_interrupted", evidence, spans, stop_s=EV_STOP_INTERVAL_S)
+            yield warning(
+                "ekf2_not_fusing",
+                "EKF2 never fuses motion capture (ATT_POS_MOCAP), and received no other external "
+                "vision. Its track does not come from this source.",
+                "Send the position as VISION_POSITION_ESTIMATE if EKF2 shall fuse it.",
+                {"fusing_share": share},
+            )
+    elif share < MIN_FUSING_SHARE_ERROR:
+        reason, action = _reason_and_action(analysis, ekf2)
+        extent = f"only in {format_percent(share)}" if share else "in no part"
+        message = f"EKF2 fused the position source {extent} of the segment. {reason}"
+        yield error("ekf2_not_fusing", message, action, evidence)
+    elif share < MIN_FUSING_SHARE_WARNING:
+        yield warning(
+            "ekf2_fusion_interrupted",
+            f"EKF2 fused the position source only in {format_percent(share)} of the segment. In "
+            "the rest EKF2 relied on its other sensors, and its position error grew.",
+            "Check the gaps and rejections below. EKF2 (v1.14 and later) stops fusion "
+            f"{EV_STOP_INTERVAL_S:g} s after the last sample.",
+            evidence,
+            spans_at(0.0, fusing, segment),
+        )
 
 
-def _find_cause(analysis: Comparison, ekf2: Ekf2) -> tuple[str, dict[str, Any]]:
-    """Why EKF2 does not fuse the source, in the word of its text and remedy, and their facts."""
+def _reason_and_action(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str]:
+    """Reason why EKF2 does not fuse the source, as a sentence, and the action."""
     parameters, interval_s = analysis.flight.log.parameters, 1.0 / analysis.source.rate_hz
     control = parameters.get("EKF2_EV_CTRL")
-    switch, bit, of = "EKF2_EV_CTRL", 0, "horizontal position"
+    switch, bit, quantity = "EKF2_EV_CTRL", 0, "horizontal position"
     if control is None:  # before v1.14
-        switch, bit, of = "EKF2_AID_MASK", 3, "vision position"
+        switch, bit, quantity = "EKF2_AID_MASK", 3, "vision position"
     value = parameters.get(switch)
     if value is not None and not int(value) >> bit & 1:
-        wanted_value = int(value) | 1 << bit
-        return "off", {
-            "switch": switch,
-            "value": value,
-            "bit": bit,
-            "of": of,
-            "asked": wanted_value,
-        }
+        reason = f"{switch} is {value:.0f}: bit {bit} ({quantity}) is not set."
+        return reason, f"Set {switch} to {int(value) | 1 << bit}."
     horizon_s, age_s = ekf2.horizon_s, _age_s(analysis, ekf2)
     if isinstance(horizon_s, float) and age_s > horizon_s + MAX_LATE_S:
-        return "late", {"age_s": age_s, "horizon_s": horizon_s}
-    # the rate of a reconstructed source is the logger's, not its own
-    own_rate = control is not None and not analysis.source.origin.reconstructed
-    if own_rate and interval_s > EV_START_INTERVAL_S:
-        return "slow", {"start_s": EV_START_INTERVAL_S, "stop_s": EV_STOP_INTERVAL_S}
-    return "unknown", {}
+        return (
+            f"Samples arrive {age_s:.2f} s after their timestamps, but EKF2 buffers only "
+            f"{horizon_s:.2f} s.",
+            "Check the source's clock: timestamps that are too early have the same effect. Then "
+            "increase EKF2_DELAY_MAX (v1.15 and later).",
+        )
+    # the rate of a reconstructed source is that of the logger
+    has_source_rate = control is not None and not analysis.source.origin.reconstructed
+    if has_source_rate and interval_s > EV_START_INTERVAL_S:
+        return (
+            f"Samples come every {interval_s:.2f} s. EKF2 (v1.14 and later) starts fusion below "
+            f"{EV_START_INTERVAL_S:g} s between samples, and stops above {EV_STOP_INTERVAL_S:g} s.",
+            "Send the position at 10 Hz. At 5 Hz fusion starts only because of jitter.",
+        )
+    return "The log does not contain the reason.", CHECK_SWITCH
 
 
 def _age_s(analysis: Comparison, ekf2: Ekf2) -> float:
-    """Time (s) from a sample's stamp to its arrival, less what EKF2 takes off; NaN if unknown."""
+    """Median time (s) from timestamp to arrival, plus EKF2_EV_DELAY; NaN if unknown."""
     if not isinstance(ekf2.record, FusionRecord):
         return float("nan")
     age_s = ekf2.record.vision_age_s.loc[analysis.segment.start_s : analysis.segment.end_s]

@@ -1,4 +1,4 @@
-"""EKF2's output jumped, or another instance took over."""
+"""Resets of EKF2's position, and changes of the primary EKF2 instance."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from px4fuse.flight import Ekf2
 
 
 def detect(analysis: Analysis) -> Found:
-    """Resets of the position, and switches, in the segment."""
+    """Detect position resets and instance changes in the segment."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     if not isinstance(ekf2, Ekf2):
         return
@@ -22,20 +22,29 @@ def detect(analysis: Analysis) -> Found:
         sizes = [float(np.linalg.norm(r.delta)) for r in inside]
         at_s = inside[int(np.argmax(sizes))].time_s
         horizontal = sum(any(r.delta[:2]) for r in inside)
-        _, treated = continuous_state(ekf2, analysis.source, segment)
+        _, treatment = continuous_state(ekf2, analysis.source, segment)
+        often = format_count(len(inside))
+        if 0 < horizontal < len(inside):
+            often += f" ({horizontal} horizontally)"
         yield finding(
             "warning" if horizontal else "info",
             "ekf2_resets",
+            f"EKF2 reset its {'position' if horizontal else 'height'} {often}, by up to "
+            f"{max(sizes):.2f} m at {at_s:.1f} s. In the comparison: {treatment}.",
+            "Check the gap or the rejections at that time."
+            if horizontal
+            else "A height reset at take-off is normal. In flight, check for a change of the "
+            "height source.",
             {"count": len(inside), "largest_m": max(sizes), "at_s": at_s},
             moments(r.time_s for r in inside),
-            often=format_count(len(inside)),
-            treated=treated,
-            horizontal=horizontal,
-            part=0 < horizontal < len(inside),
-            case=horizontal > 0,
         )
     switches = [time for time, _ in ekf2.instances if segment.start_s < time <= segment.end_s]
     if switches:
-        evidence = {"count": len(switches), "at_s": switches[0]}
-        often = format_count(len(switches))
-        yield warning("ekf2_instance_switch", evidence, moments(switches), often=often)
+        yield warning(
+            "ekf2_instance_switch",
+            f"The primary EKF2 instance changed {format_count(len(switches))}, first at "
+            f"{switches[0]:.1f} s. The comparison uses the primary instance at each time.",
+            "Compare the IMUs (vehicle_imu_status). Set EKF2_MULTI_IMU to 1 for a lab flight.",
+            {"count": len(switches), "at_s": switches[0]},
+            moments(switches),
+        )

@@ -1,8 +1,7 @@
-"""What innovations cannot show: errors against the truth, and the drift of a source.
+"""Errors that innovations do not show: errors against ground truth, and drift of the source.
 
-Innovations judge a filter against its source, truth judges both: an error that filter and source
-share shows in no innovation. Normalised by the variance that the filter states, the squared error
-is the NEES (1 is consistent).
+Innovations compare a filter with its source, so an error that both share does not show. Normalised
+by the reported variance, the squared error against ground truth is the NEES (expected 1).
 """
 
 from collections.abc import Mapping
@@ -23,24 +22,42 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.causes import CAUSE
-from px4fuse.findings.model import WORDS, Finding, Found, finding, info
-from px4fuse.findings.since import format_cause, format_remedy, kind_of
+from px4fuse.findings.model import Finding, Found, finding, info
+from px4fuse.findings.since import format_remedy, format_rerun, kind_of
 from px4fuse.loop.model import Loop
-from px4fuse.plain import format_factor, format_number
+from px4fuse.plain import capitalise_first, format_factor, format_number
 from px4fuse.trajectory.alignment import fit_alignment
 
-NEES_ERROR = 16.0  # errors four times as large as σ
-MAX_SMALL_NIS = 0.5  # innovations are 30 % smaller than claimed
-MAX_KF_ERROR_RATIO = 0.7  # times: of EKF2's mean square error half is its own
-FRAME_SHARE = 0.5  # of the error: what is left is less than what turning took away
-FILTERS: Mapping[FilterName, str] = {"kf": "our filter", "ekf2": "EKF2"}
-REMEDIES: Mapping[str, str] = WORDS["errors_larger_than_claimed"]["remedy"]
+MIN_NEES_ERROR = 16.0  # mean NEES; errors of 4 σ
+MAX_SMALL_NIS = 0.5  # mean NIS; innovations are 30 % smaller than expected
+MAX_KF_ERROR_RATIO = 0.7  # RMSE of KF over EKF2; below, half of EKF2's mean square error is its own
+MAX_ALIGNED_SHARE = 0.5  # RMSE after over RMSE before alignment; below, misalignment dominates
+FILTERS: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
+DRIFT_REMEDY = (
+    "Do not take SIGMA_Z or EKF2_EVP_NOISE from these innovations. Correct the drift with a loop "
+    "(px4fuse loop LOG), or add a second, absolute source."
+)
+FRAME_REMEDY = (
+    "Rotate and shift the source's frame into that of the ground truth. Do not take noises from "
+    "these innovations."
+)
+EKF2_REMEDY = (
+    "KF has a smaller error with the same source. Check EKF2's delay, heading and other aids."
+)
+SHARED_REMEDY = (
+    "Check errors that source and filter share: time offset (px4fuse sync LOG), low-pass filtering "
+    "in the source, multipath, anchor geometry and survey, scale."
+)
+GNSS_REMEDY = (
+    "Check errors that receiver and filter share: age of a fix (px4fuse sync LOG), time-correlated "
+    "reception errors, EKF2's heading, lever arm of the antenna."
+)
 
 
 def hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorBeyondSigma]]:
-    """Where the error is larger than claimed and no innovation says so, by filter and axis.
+    """Errors beyond the reported σ that innovations do not show: filter, axis, numbers.
 
-    The worst comes first.
+    The largest mean NEES comes first.
     """
     found = [
         (owner, name, hidden)
@@ -52,7 +69,7 @@ def hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorBe
 
 
 def detect(analysis: Analysis) -> Found:
-    """Errors that innovations hide, or a drift that nothing shows."""
+    """Detect errors that innovations do not show, else a source that may drift."""
     if hidden := hidden_errors(analysis):
         yield error_exceeds_sigma(analysis, hidden)
     elif analysis.source.origin.may_drift:
@@ -62,10 +79,12 @@ def detect(analysis: Analysis) -> Found:
 def error_exceeds_sigma(
     analysis: Analysis, hidden: list[tuple[FilterName, str, ErrorBeyondSigma]]
 ) -> Finding:
-    """Told of each filter's worst axis."""
+    """Make the finding, with numbers of the worst axis of each filter."""
     (worst_filter, main, worst), drifts = hidden[0], analysis.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": main, "filter": worst_filter}
-    sentences, causes = [], dict[FilterName, Intervention | None]()
+    size = "small" if worst.nis_mean < MAX_SMALL_NIS else "consistent"
+    sentences = [f"Position errors exceed the reported σ, although the innovations are {size}."]
+    causes = dict[FilterName, Intervention | None]()
     for owner, name in FILTERS.items():
         for _, axis, one in [each for each in hidden if each[0] == owner][:1]:
             evidence |= {
@@ -74,53 +93,59 @@ def error_exceeds_sigma(
                 f"{owner}_position_rmse_m": one.rmse_m,
                 f"{owner}_sigma_p_m": one.reported_sigma_m,
             }
-            causes[owner] = cause_of(analysis.causes, owner, axis, "nees")
+            causes[owner] = cause = cause_of(analysis.causes, owner, axis, "nees")
+            along = analysis.axes[axis].axis.called
             sentences.append(
-                f"{name} claims σ {one.reported_sigma_m:.2g} m along {axis} and errs by "
-                f"{one.rmse_m:.2f} m RMS (mean NEES {format_factor(one.nees)}, mean NIS "
-                f"{format_number(one.nis_mean, 2)}; 1 is consistent)"
-                f"{format_cause(analysis, causes[owner])}"
+                f"{name} along {along}: position RMSE {one.rmse_m:.2f} m, reported σ "
+                f"{one.reported_sigma_m:.2g} m (mean NEES {format_factor(one.nees)}, mean NIS "
+                f"{format_number(one.nis_mean, 2)}; expected 1)."
             )
-    words = "; ".join(sentences) + "."
+            if cause is not None:
+                sentences.append(f"{capitalise_first(format_rerun(analysis, cause))}.")
     kf_truth = analysis.axes[main].filters["kf"].truth
     is_kf_better = (
         isinstance(kf_truth, AgainstTruth)
         and kf_truth.position_rmse_m < MAX_KF_ERROR_RATIO * worst.rmse_m
     )
     is_ekf2_alone = is_kf_better and all(owner == "ekf2" for owner, *_ in hidden)
-    shared = "gnss" if analysis.source.origin.is_gnss else "shared"
-    remedy = "drift" if drifts else "ekf2" if is_ekf2_alone else shared
+    shared_remedy = GNSS_REMEDY if analysis.source.origin.is_gnss else SHARED_REMEDY
+    remedy = DRIFT_REMEDY if drifts else EKF2_REMEDY if is_ekf2_alone else shared_remedy
     known_causes = filter(None, (causes[worst_filter], *causes.values()))
     evidence |= {CAUSE: kind_of(analysis, next(known_causes, None))}
     if cures := {
         format_remedy(analysis, cause): None for cause in causes.values() if cause is not None
     }:
-        remedy = "cured"
+        remedy = " ".join(cures)
     elif frame := _rmse_after_alignment(analysis, worst_filter):
         horizontal_rmse_m, aligned_rmse_m = frame
         evidence |= {
             "position_rmse_horizontal_m": horizontal_rmse_m,
             "position_rmse_aligned_m": aligned_rmse_m,
         }
-        remainder_text = f"of {horizontal_rmse_m:.2f} m horizontally {aligned_rmse_m:.2f} m remain after the best shift and turn"
-        if aligned_rmse_m < FRAME_SHARE * horizontal_rmse_m:
-            words += f" Most of it is how the source's frame lies: {remainder_text}."
-            remedy = "frame"
-        elif drifts:
-            words += f" The source drifts, and the filter follows it: {remainder_text}."
+        is_misaligned = aligned_rmse_m < MAX_ALIGNED_SHARE * horizontal_rmse_m
+        if is_misaligned:
+            remedy = FRAME_REMEDY
+        if is_misaligned or drifts:
+            sentences.append(
+                f"After the best shift and rotation {aligned_rmse_m:.2f} m of the horizontal RMSE "
+                f"of {horizontal_rmse_m:.2f} m remain: "
+                f"{'the frame is misaligned' if is_misaligned else 'the source drifts'}."
+            )
+    sentences.append(
+        "Innovations compare a filter with its source; only ground truth, a loop or a second "
+        "source shows the error."
+    )
     return finding(
-        "error" if worst.nees >= NEES_ERROR else "warning",
+        "error" if worst.nees >= MIN_NEES_ERROR else "warning",
         "errors_larger_than_claimed",
+        " ".join(sentences),
+        remedy,
         evidence,
-        small=worst.nis_mean < MAX_SMALL_NIS,
-        words=words,
-        remedy=remedy,
-        cures=" ".join(cures),
     )
 
 
 def _rmse_after_alignment(comparison: Comparison, owner: str) -> tuple[float, float] | None:
-    """Horizontal RMSE (m) to the truth, and what of it the best shift and turn leave."""
+    """Horizontal RMSE (m) against ground truth, before and after a shift and yaw alignment."""
     axes = [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]
     truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
     if len(truths) < 2:
@@ -137,7 +162,7 @@ def _rmse_after_alignment(comparison: Comparison, owner: str) -> tuple[float, fl
     estimate, true = estimate[known], true[known]
     try:
         aligned = fit_alignment(estimate, true, "yaw").apply(estimate)
-    except TrajectoryError:  # too little motion to turn by
+    except TrajectoryError:  # too little motion for a rotation
         return None
     errors = (estimate - true, aligned - true)
     rmse_m, aligned_rmse_m = (float(np.linalg.norm(error)) / len(true) ** 0.5 for error in errors)
@@ -145,24 +170,29 @@ def _rmse_after_alignment(comparison: Comparison, owner: str) -> tuple[float, fl
 
 
 def _published(result: AxisComparison, times: Array) -> Array:
-    """Position (m) of EKF2 along one axis; NaN where it is not known."""
-    assert isinstance(result.ekf2_state, pd.DataFrame)  # else no error of EKF2 is hidden
+    """Interpolate EKF2's position (m) along one axis; NaN outside the log."""
+    assert isinstance(result.ekf2_state, pd.DataFrame)  # a hidden error of EKF2 needs its state
     state = result.ekf2_state["position_m"]
     return np.asarray(np.interp(times, state.index, state, left=np.nan, right=np.nan))
 
 
 def drift(analysis: Analysis) -> Finding:
-    """Neither truth nor anything else judges it: what it scatters by, and what its loop shows."""
+    """Make the finding of a source that may drift, with its short-term noise and closure error."""
     name, tuned, loop = analysis.source.name, analysis.tuning.get(HORIZONTAL), analysis.loop
     evidence: dict[str, float | str] = {"source": name}
-    shown_text = ""
+    message = (
+        f"{name} may drift: it sends its own heading, as odometry (VIO, SLAM) does. Innovations "
+        "show how well a filter follows the source, not the position error."
+    )
     if isinstance(tuned, AxisTuning) and (noise := tuned.sigma_z.value or tuned.sigma_z.high):
         bound = "at most " if tuned.sigma_z.value is None else ""
         evidence |= {"short_term_noise_m": noise}
-        shown_text = (
-            f" Over a second or so it scatters by {bound}{noise:.2g} m, which is not its error."
-        )
+        message += f" Its short-term noise is {bound}{noise:.2g} m, which is not its error."
     if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
-        shown_text += f" Its loop misses by {gap_m:.2f} m after {loop.path_length_m:.0f} m."
-    return info("source_may_drift", evidence, shown=shown_text)
+        message += f" Its loop closure error is {gap_m:.2f} m after {loop.path_length_m:.0f} m."
+    action = (
+        "Check the error with a loop (px4fuse loop LOG) or with ground truth (ATT_POS_MOCAP). If "
+        "the source is motion capture, give --source-kind mocap."
+    )
+    return info("source_may_drift", message, action, evidence)

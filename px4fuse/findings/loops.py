@@ -1,57 +1,96 @@
-"""What a loop shows: false closures, drift beyond what was stated, and what was assumed."""
+"""False or inconsistent loop closures, drift larger than stated, and assumptions about a loop."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Finding, Found, error, info, warning
 from px4fuse.loop.model import LANDING, Closure, Loop
+from px4fuse.plain import capitalise_first
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-MAX_DROPPED_SHARE = 0.5  # of several closures more are true than false
+MAX_DROPPED_SHARE = 0.5  # of the closures; most closures of a flight are true
 EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
-DOUBTFUL_WEIGHT = 0.5  # GNC ends at 0 or 1 (Yang et al. 2020)
+MIN_KEPT_WEIGHT = 0.5  # GNC weights end at 0 or 1 (Yang et al. 2020)
 
 
 def detect(analysis: Analysis) -> Found:
-    """What the loop of a flight shows, where it holds one."""
+    """Detect faults of the loop of a flight, if it has one."""
     if isinstance(analysis.loop, Loop):
         yield from find_in(analysis.loop)
 
 
 def find_in(loop: Loop) -> Found:
-    """What a loop shows."""
+    """Detect faults of a loop."""
     yield from closures(loop)
     yield from assumptions(loop)
 
 
 def closures(loop: Loop) -> Found:
-    """Closures that the drift cannot explain, or that the others contradict."""
+    """Detect closures that the drift does not explain, or that contradict the others."""
     weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
-    dropped = sum(weight < DOUBTFUL_WEIGHT for weight in weights)
+    dropped = sum(weight < MIN_KEPT_WEIGHT for weight in weights)
     most = dropped > MAX_DROPPED_SHARE * len(weights)
     if most:
-        yield warning("loop_drift_understated", {"dropped": dropped, "closures": len(weights)})
+        yield warning(
+            "loop_drift_understated",
+            f"Robust optimisation drops {dropped} of {len(weights)} loop closures. An odometry "
+            "drift larger than stated is more likely than that most closures are false.",
+            "Increase --drift or --heading-drift.",
+            {"dropped": dropped, "closures": len(weights)},
+        )
     for closure, weight in zip(loop.closures, weights, strict=True):
         if not closure.accepted:
             yield _false_closure(closure, loop.is_end_assumed)
-        elif weight < DOUBTFUL_WEIGHT and not most:
-            evidence = _evidence(closure) | {"gnc_weight": weight}
-            yield warning("loop_closure_doubtful", evidence, closure=closure)
+        elif weight < MIN_KEPT_WEIGHT and not most:
+            yield warning(
+                "loop_closure_doubtful",
+                f"{capitalise_first(str(closure))} contradicts the other closures. Robust "
+                "optimisation drops it, although the drift alone could explain its closure error.",
+                "Remove the closure, or use the robust solution (GNC).",
+                _evidence(closure) | {"gnc_weight": weight},
+            )
 
 
 def assumptions(loop: Loop) -> Found:
-    """The track does not drift, or nobody said where the vehicle landed."""
+    """Detect a loop on positions that do not drift, and a landing place that is assumed."""
     gap_m = loop.closure_error_m
     evidence = {} if gap_m is None else {"closure_error_m": gap_m}
     if loop.absolute:
-        yield warning("loop_of_absolute_track", evidence)
+        yield warning(
+            "loop_of_absolute_track",
+            "This track follows an absolute positioning system, so it does not drift. Its closure "
+            "error is the noise of one position. Distributing it along the path makes the path "
+            "worse.",
+            "Measure the loop on odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
+            evidence,
+        )
     if evidence and loop.is_end_assumed:
-        yield info("loop_end_assumed", evidence)
+        yield info(
+            "loop_end_assumed",
+            "The landing place is unknown, so px4fuse assumes the take-off place. A distance "
+            "between the two counts as closure error.",
+            "Measure the landing place and give --landed-at FORWARD,RIGHT (m, along and to the "
+            "right of the nose at take-off).",
+            evidence,
+        )
 
 
-def _false_closure(closure: Closure, assumed: bool) -> Finding:
-    landing = closure.source == LANDING
-    what = landing and assumed
+def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
+    is_landing = closure.source == LANDING
+    fault = f"False loop closure: {closure}"
+    if is_landing and is_end_assumed:
+        fault = "False loop closure: the vehicle did not land at the take-off place"
+    action = "Remove this closure; px4fuse does not use it."
+    if is_landing:
+        action = (
+            "If the vehicle landed elsewhere, give the place (--landed-at FORWARD,RIGHT) or leave "
+            "the landing out (--open)."
+        )
     return error(
-        "false_loop_closure", _evidence(closure), closure=closure, landing=landing, what=what
+        "false_loop_closure",
+        f"{fault}. The closure error is {closure.distance_m:.2f} m (d² {closure.d2:.0f}, "
+        f"{closure.degrees_of_freedom} degrees of freedom, p {closure.p:.1g}), which the stated "
+        "drift does not explain. Enforcing the closure would deform the whole path.",
+        f"{action} If the odometry really drifts this much, increase --drift and --heading-drift.",
+        _evidence(closure),
     )
 
 

@@ -1,9 +1,11 @@
-"""What a finding is, and the words that several of them share."""
+"""The record of a finding, and helpers that all detectors share."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 import pandas as pd
 from msgspec import Meta
@@ -13,13 +15,61 @@ from px4fuse.record import Record, Span, table
 
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
-# Of each finding, in the order in which those of one rank are told
-WORDS: Mapping[str, Mapping[str, Any]] = table(__file__, "words.toml", dict[str, Any])
-NAMES: Mapping[str, str] = {name: words["called"] for name, words in WORDS.items()}
-# More times are not listed one by one
-MAX_LISTED_SPANS = 3
-# Shorter is told as one moment
-MOMENT_S = 0.05
+MAX_LISTED_SPANS = 3  # more time spans are summarised as one range
+MAX_MOMENT_S = 0.05  # s; a shorter span is printed as one time
+
+
+class CatalogueEntry(Record, frozen=True):
+    """Title, group and explanation of a finding.
+
+    Attributes
+    ----------
+    title : str
+    group : str
+        Position source, time, IMU, tuning, EKF2, loops or logging.
+    meaning : str
+        Explanation for a reader who meets the finding for the first time.
+    """
+
+    title: str
+    group: str
+    meaning: str
+
+
+# By id; findings of equal rank are listed in this order
+CATALOGUE: Mapping[str, CatalogueEntry] = table(
+    __file__, "catalogue.toml", dict[str, CatalogueEntry]
+)
+GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
+NAMES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
+
+
+class Example(Record, frozen=True):
+    """Example of a finding, with its rates on simulated flights (tests/studies/rates.csv).
+
+    Attributes
+    ----------
+    message, remedy : str
+        Of one flight.
+    clean_flights, false_alarms : int
+        Flights without a mistake, and on how many of them the finding appears.
+    detection : dict
+        Share of the flights with a mistake on which it appears, by option of px4fuse simulate or
+        setting.
+    """
+
+    message: str
+    remedy: str
+    clean_flights: int
+    false_alarms: int
+    detection: Mapping[str, float]
+
+
+def load_examples() -> Mapping[str, Example]:
+    """Load the examples by id, made by docs/findings_pages.py."""
+    return msgspec.json.decode(
+        Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, Example]
+    )
 
 
 class Finding(Record, frozen=True, omit_defaults=False):
@@ -28,22 +78,23 @@ class Finding(Record, frozen=True, omit_defaults=False):
     Attributes
     ----------
     id : str
-        Stable, in snake case.
+        Stable id in snake case, a key of the catalogue.
     severity : {"error", "warning", "info"}
-        error: the comparison or the flight is misleading as it stands; warning: a number is
-        wrong or blind; info: know it when you read the report.
+        error: the comparison or the flight is misleading; warning: a number is wrong or missing;
+        info: background for reading the report.
     message : str
-        What is wrong, and what that means.
+        The fault, then its effect with numbers.
     remedy : str
-        What to type or to set.
+        Action: a command, a parameter with its value, or a check.
     evidence : dict
-        Numbers, with units in their names.
+        Numbers behind the finding, with units in their names.
     headline : str
-        The first part of the message: what is wrong, without full stop.
+        First sentence of the message, without full stop.
     caused_by : str or None
         Id of the finding that it follows from: the nearest one before it with that id.
     spans_s : tuple of (float, float)
-        From when to when it shows, seconds from the first data; empty where that is throughout.
+        Start and end of each occurrence, seconds from the first data; empty if it concerns the
+        whole flight.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
@@ -57,17 +108,17 @@ class Finding(Record, frozen=True, omit_defaults=False):
 
     @property
     def when(self) -> str:
-        """When it shows, in words; empty where that is throughout."""
+        """Time spans as text; empty if the finding concerns the whole flight."""
         if len(self.spans_s) > MAX_LISTED_SPANS:
             return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
         return ", ".join(
-            f"{start:.1f} s to {end:.1f} s" if end - start > MOMENT_S else f"{start:.1f} s"
+            f"{start:.1f} s to {end:.1f} s" if end - start > MAX_MOMENT_S else f"{start:.1f} s"
             for start, end in self.spans_s
         )
 
     @property
-    def says_when(self) -> bool:
-        """Whether the message names the moment, as the evidence does."""
+    def has_time_in_message(self) -> bool:
+        """Return True if the message names the time, as the evidence does."""
         return not {"at_s", "first_s", "until_s"}.isdisjoint(self.evidence)
 
     def __repr__(self) -> str:
@@ -80,31 +131,21 @@ Found = Iterator[Finding]
 def finding(
     severity: Severity,
     name: str,
+    message: str,
+    remedy: str,
     evidence: Mapping[str, int | float | str] = {},
     spans_s: tuple[Span, ...] = (),
-    **facts: Any,
 ) -> Finding:
-    """A finding in its words of ``words.toml``, filled with the evidence and more facts.
-
-    Of several texts a fact of their name chooses one, and ``case`` where there is none of it.
-    """
-    values: dict[str, Any] = {**evidence, **facts}
-    for part, text in WORDS[name].items():
-        template = (
-            text if isinstance(text, str) else text[values[part if part in values else "case"]]
-        )
-        values[part] = template.format_map(values)
-    message = f"{values['headline']}{values['more']}"
-    return Finding(
-        name, severity, message, values["remedy"], evidence, values["headline"], spans_s=spans_s
-    )
+    """Make a finding; its headline is the first sentence of the message."""
+    headline = message.partition(". ")[0].removesuffix(".")
+    return Finding(name, severity, message, remedy, evidence, headline, spans_s=spans_s)
 
 
 error, warning, info = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
-    """Findings that follow from no other, each with those behind it that follow from it."""
+    """Group findings: each root cause, followed by its consequences."""
     groups: list[list[Finding]] = []
     for one in findings:
         if one.caused_by is None:
@@ -114,22 +155,27 @@ def by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
 
 
 def moments(times_s: Iterable[float]) -> tuple[Span, ...]:
-    """Spans of no length, for what happens at a moment."""
+    """Spans of zero length at the given times (s)."""
     return tuple((float(time), float(time)) for time in times_s)
 
 
 def one_level_lower(severity: Severity) -> Severity:
-    """One step less severe: what nobody chose is advice."""
+    """Lower a severity by one level, for default settings that the user did not choose."""
     return "warning" if severity == "error" else "info"
 
 
 def format_count(count: int) -> str:
-    """How often, in words: "once", "2 times"."""
+    """Format a number of occurrences: "once", "2 times"."""
     return "once" if count == 1 else f"{count} times"
 
 
+def format_percent(share: float, digits: int = 0) -> str:
+    """Format a share as "57 %"."""
+    return f"{100.0 * share:.{digits}f} %"
+
+
 def spans_at(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ...]:
-    """Parts of a segment in which a step function has a value; its first one holds before too."""
+    """Parts of a segment in which a step function has a value; its first value extends back."""
     edges = np.clip(np.append(steps.index.to_numpy(), np.inf), segment.start_s, segment.end_s)
     edges[0] = segment.start_s
     there = (steps.to_numpy() == value) & (np.diff(edges) > 0.0)
@@ -137,6 +183,6 @@ def spans_at(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ..
 
 
 def fraction_on(steps: pd.Series, segment: Segment) -> float:
-    """Share of a segment in which a 0/1 step function is 1."""
+    """Fraction of a segment in which a 0/1 step function is 1."""
     on_s = sum(end - start for start, end in spans_at(1.0, steps, segment))
     return on_s / (segment.end_s - segment.start_s)

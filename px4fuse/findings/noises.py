@@ -1,9 +1,9 @@
-"""SIGMA_Z or SIGMA_A that the innovations do not ask for, and S larger or smaller than they are.
+"""SIGMA_Z or SIGMA_A that contradicts the innovations, and KF or EKF2 that is not consistent.
 
-The mean NIS alone cannot tell SIGMA_A from SIGMA_Z: both make S larger. The likelihood can, since
-SIGMA_A makes the innovations of a stretch agree with each other and SIGMA_Z does not. Both are
-fitted together, so that they are put right together: the one that is further off comes first. A
-setting that nobody chose is advice, one step less severe than one that was.
+The mean NIS alone cannot separate SIGMA_A from SIGMA_Z: both increase S. The likelihood can:
+SIGMA_A correlates the innovations that follow each other, SIGMA_Z does not. Both are estimated
+together and proposed together, the larger deviation first. A deviation of a default setting is one
+severity level lower than that of a chosen one.
 """
 
 from typing import NamedTuple
@@ -34,47 +34,76 @@ from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.hidden_errors import hidden_errors
-from px4fuse.findings.model import Finding, Found, Severity, error, finding, one_level_lower
-from px4fuse.findings.since import format_reason, format_remedy, format_remedy_of_ekf2, kind_of
+from px4fuse.findings.model import (
+    Finding,
+    Found,
+    Severity,
+    error,
+    finding,
+    format_percent,
+    one_level_lower,
+)
+from px4fuse.findings.since import format_remedy, format_remedy_of_ekf2, format_rerun, kind_of
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.plain import format_factor, format_number
+from px4fuse.request import OPTIONS
 
-MIN_NOISE_RATIO = 1.5  # times, in standard deviation; below, the tracks hardly change
-MIN_NOISE_RATIO_ERROR = 4.0  # times: the gain is a different one
-RESPONSE_TIME_S = 2.5  # five times the lesson's; a vehicle turns around in less
-INTERVAL_WIDENING = 1.5  # times the 95 % interval's reach; 0.3 % of clean flights lie beyond
-MIN_LAG1_AUTOCORRELATION = 0.3  # correlation; white innovations stay below 2/√n, 0.2 at n = 100
+MIN_NOISE_RATIO = 1.5  # ratio of σ; below, the tracks hardly change
+MIN_NOISE_RATIO_ERROR = 4.0  # ratio of σ; the gain differs clearly
+MIN_RESPONSE_TIME_S = 2.5  # s; five times that of the lesson, a vehicle turns around in less
+INTERVAL_WIDENING = 1.5  # factor on the 95 % interval (log scale); 0.3 % of clean flights exceed it
+MIN_LAG1_AUTOCORRELATION = 0.3  # white innovations stay below 2/√n, 0.2 for n = 100
 
-SIGMA_OFF_ERROR = 2.0  # times, in standard deviation
-NOISE_FITS = 1.25  # times: the median's own scatter below n = 100 (1.17/√n, two σ)
+SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse
+NOISE_RATIO_TOLERANCE = 1.25  # 2 σ of the median for n = 100 (σ of the median: 1.17/√n)
 NOT_EXPLAINED = (
-    "No change of a noise, the clock, the frame or the outliers explains half of it: look at the "
-    "acceleration input (IMU rate, gaps, vibration) and at what else the findings name."
+    "No tested change of noise, time offset, frame or outliers explains half of the deviation. "
+    "Check the IMU (rate, gaps, vibration) and the other findings."
 )
-UNKNOWN_NOISE = "Which noise the data ask for could not be told: see tuning."
+UNKNOWN_NOISE = "The noise could not be estimated; px4fuse tune prints the reason."
 
 
 GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
-ONLY_HORIZONTAL = Unavailable("EKF2 replay", "the model of EKF2 is of horizontal position", "None.")
-AGAINST_DRIFT = (
-    "Nothing follows from innovations alone: against a source that may drift they show how well "
-    "the filter follows it, not how wrong both are."
+ONLY_HORIZONTAL = Unavailable(
+    "EKF2 replay", "the EKF2 replay covers horizontal position only", "None."
 )
-AGAINST_SLOW_ERRORS = (
-    "Lower no noise for these innovations: errors of {} are slow for the most part, which R has to "
-    "cover and innovations do not show."
+KEEP_NOISES_DRIFT = (
+    "Do not reduce the noises. The source may drift, and innovations do not show this error."
 )
-AGAINST_TRUTH = (
-    "Lower no noise for these innovations: the filter would claim less than its errors against the "
+KEEP_NOISES_CORRELATED = (
+    "Do not reduce the noises. Most of the error of {} is time-correlated: R has to cover it, but "
+    "innovations do not show it."
+)
+KEEP_NOISES_TRUTH = (
+    "Do not reduce the noises. The reported σ would become smaller than the errors against ground "
     "truth."
 )
+# Effect of a wrong setting, by option and direction
+SETTING_EFFECTS = {
+    (SIGMA_Z, "small"): "The gain is too large, so KF follows the measurement noise.",
+    (SIGMA_Z, "large"): "The gain is too small, so KF corrects slowly.",
+    (SIGMA_A, "small"): "P grows too little between updates, the gain is too small, and KF lags.",
+    (SIGMA_A, "large"): (
+        "P grows too much between updates, the gain is too large, and KF follows the measurement "
+        "noise."
+    ),
+}
 
 Member = tuple[AxisComparison, FilterSummary]
 
 
 class SettingDeviation(NamedTuple):
-    """How a setting is off: ``size`` times from the most likely value, or from its bound."""
+    """Deviation of a setting.
+
+    Attributes
+    ----------
+    value : float
+        Maximum-likelihood estimate, or its upper bound.
+    size : float
+        Ratio of the setting and this value, at least 1.
+    severity : Severity
+    """
 
     value: float
     size: float
@@ -82,29 +111,29 @@ class SettingDeviation(NamedTuple):
 
 
 def detect(analysis: Analysis) -> Found:
-    """Settings first: the variances follow from them."""
+    """Detect wrong settings, then the inconsistent variances that follow from them."""
     yield from deviating_settings(analysis)
     yield from process_noise_near_zero(analysis)
     yield from variances(analysis)
 
 
 def deviating_settings(analysis: Analysis) -> Found:
-    """What is off beyond its interval, the worse one first."""
+    """Detect settings outside their (widened) 95 % interval, the larger deviation first."""
     axis_tuning = first_axis_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
     chosen = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
     ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.filter_sigma_a}
-    if hardly_moved(analysis):  # without motion the acceleration's noise is hardly seen
+    if hardly_moved(analysis):  # without motion SIGMA_A cannot be estimated
         del ml_noises[SIGMA_A]
     found = {
         name: setting_deviation(name, chosen[name], noise) for name, noise in ml_noises.items()
     }
     off = {name: each for name, each in found.items() if each is not None}
-    # where a source may drift, or the truth shows it, innovations tell too little noise alone, and
-    # a filter may follow such a source as closely as it likes
-    drifts, slow = analysis.source.origin.may_drift, analysis.source.origin.is_gnss
-    if drifts or slow or any(owner == "kf" for owner, *_ in hidden_errors(analysis)):
+    # innovations of a source with drift or time-correlated errors (also shown by ground truth) only
+    # prove that a noise is too small, not that it is too large
+    drifts, has_slow_errors = analysis.source.origin.may_drift, analysis.source.origin.is_gnss
+    if drifts or has_slow_errors or any(owner == "kf" for owner, *_ in hidden_errors(analysis)):
         off = {
             name: each
             for name, each in off.items()
@@ -122,10 +151,18 @@ def deviating_settings(analysis: Analysis) -> Found:
     remedy_text, first = remedy.format_kf_remedy(analysis, values, unseen_nats=held_out_gain), None
     for name in worst_first:
         (value, size, severity), noise = off[name], ml_noises[name]
-        known, side = noise.value is not None, "small" if chosen[name] < value else "large"
+        (value, size, severity), noise = off[name], ml_noises[name]
+        side, unit = "small" if chosen[name] < value else "large", OPTIONS[name].unit
+        is_bound = noise.value is None
+        interval = f"; 95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit}" if noise.high else ""
         setting_finding = finding(
             severity,
             f"{name[:7]}_{side}",
+            f"{name[:7].upper()} {chosen[name]:g} {unit} is {'at least ' if is_bound else ''}"
+            f"{format_factor(size)} times too {side}. The maximum-likelihood estimate is "
+            f"{'at most ' if is_bound else ''}{value:.3g} {unit} ({axis_tuning.name}"
+            f"{'' if is_bound else interval}). {SETTING_EFFECTS[name, side]}",
+            remedy_text,
             {
                 "chosen": chosen[name],
                 "most_likely": value,
@@ -134,20 +171,13 @@ def deviating_settings(analysis: Analysis) -> Found:
                     axis_tuning.before, "lag1_autocorrelation", float("nan")
                 ),
             },
-            axes=axis_tuning.name,
-            times=format_factor(size),
-            case=known,
-            low=noise.low or 0.0,
-            high=noise.high,
-            within=known and bool(noise.high),
-            remedy=remedy_text,
         )
         yield structs.replace(setting_finding, caused_by=first)
         first = first or setting_finding.id
 
 
 def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDeviation | None:
-    """How far a setting is off, and how bad that is; None where it is not."""
+    """Compare a setting with its maximum-likelihood estimate; None if the deviation is small."""
     value = _value_or_bound(ml_noise)
     if value is None:
         return None
@@ -165,10 +195,10 @@ def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDevia
 
 
 def process_noise_near_zero(analysis: Analysis) -> Found:
-    """SIGMA_A so small that σ hardly grows between updates and new measurements are ignored.
+    """Detect SIGMA_A so small that σ hardly grows between updates and KF ignores measurements.
 
-    A slow filter is no mistake where nothing happens: its innovations must say that it lags. Told
-    of the first axis on which it needs too long to follow.
+    A slow filter is correct without motion, so correlated, too large innovations are required. The
+    first axis with a long response time is reported.
     """
     for name, result in analysis.axes.items():
         updates, statement = result.replay.updates, result.filters["kf"]
@@ -178,7 +208,7 @@ def process_noise_near_zero(analysis: Analysis) -> Found:
             continue
         gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
         response_s = 1.0 / (sample_rate(updates) * gain)
-        if response_s < RESPONSE_TIME_S:
+        if response_s < MIN_RESPONSE_TIME_S:
             continue
         after = result.replay.steps["position_variance_m2"].reindex(updates.index).to_numpy()
         before = updates["prior_position_variance_m2"].to_numpy()
@@ -190,17 +220,20 @@ def process_noise_near_zero(analysis: Analysis) -> Found:
             if ml_sigma_a is None
             else f" {remedy.format_kf_remedy(analysis, {SIGMA_A: ml_sigma_a})}"
         )
+        sigma_a = analysis.settings.sigma_a_m_s2
         yield error(
             "process_noise_forgotten",
+            f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero. The position variance grows by only "
+            f"{format_percent(growth, 1)} between updates, and the gain falls to {gain:.3f}. KF "
+            f"needs {response_s:.0f} s to follow a change (along {result.axis.called}).",
+            f"Increase SIGMA_A.{remedy_text}",
             {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
-            sigma_a=analysis.settings.sigma_a_m_s2,
-            cure=remedy_text,
         )
         return
 
 
 def variances(analysis: Analysis) -> Found:
-    """One finding for the horizontal axes, which the vertical one follows: they have one noise."""
+    """Detect inconsistent variances; the vertical axis follows the horizontal group."""
     for owner in FILTERS:
         for over in (True, False):
             first = None
@@ -218,33 +251,33 @@ def variances(analysis: Analysis) -> Found:
 def _variance_finding(
     analysis: Analysis, owner: FilterName, group: str, members: list[Member]
 ) -> Finding:
-    """One finding for a group of axes, on the axis whose NIS is furthest from 1."""
+    """Make one finding for a group of axes, with the axis whose mean NIS is furthest from 1."""
     result, statement = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
     over, factor = statement.sigma_factor > 1.0, statement.sigma_error_factor
-    severity: Severity = "error" if factor >= SIGMA_OFF_ERROR else "warning"
+    severity: Severity = "error" if factor >= SIGMA_RATIO_ERROR else "warning"
     if _is_default(analysis, owner, result):
         severity = one_level_lower(severity)
     tuned = tuning_of_axis(analysis.tuning, result.axis.name)
     stated = "overstated" if over else "understated"
     if over and analysis.source.origin.may_drift:
-        severity, remedy_text, cause = "info", AGAINST_DRIFT, ELSEWHERE
+        severity, remedy_text, cause = "info", KEEP_NOISES_DRIFT, ELSEWHERE
     elif over and analysis.source.origin.is_gnss:
         is_barometer = analysis.source.aid(result.axis.name) == BAROMETER
         remedy_text = (
             _noise_above_reported(analysis) if owner == "ekf2" and not is_barometer else ""
         )
         cause = NOISE if remedy_text else ELSEWHERE
-        slow = AGAINST_SLOW_ERRORS.format("a barometer" if is_barometer else "GNSS")
-        severity, remedy_text = severity if remedy_text else "info", remedy_text or slow
+        keep = KEEP_NOISES_CORRELATED.format("a barometer" if is_barometer else "GNSS")
+        severity, remedy_text = severity if remedy_text else "info", remedy_text or keep
     elif over and any(each == owner for each, *_ in hidden_errors(analysis)):
-        remedy_text, cause = AGAINST_TRUTH, ELSEWHERE
+        remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
         cause_found = cause_of(analysis.causes, owner, result.axis.name)
         cause, remedy_text = (
             kind_of(analysis, cause_found),
             _remedy(analysis, owner, result, tuned, cause_found),
         )
-        severity = "info" if remedy_text == AGAINST_TRUTH else severity
+        severity = "info" if remedy_text == KEEP_NOISES_TRUTH else severity
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
         "sigma_factor": statement.sigma_factor,
@@ -255,50 +288,57 @@ def _variance_finding(
     if tuned is not None and (ml_sigma_z := _value_or_bound(tuned.sigma_z)) is not None:
         evidence["sigma_z_asked_m"] = ml_sigma_z
         evidence["sigma_z_asked_is_upper_bound"] = float(tuned.sigma_z.value is None)
+    low, high = statement.nis_band
+    name, gate_effect = {"kf": "KF", "ekf2": "EKF2"}[owner], ""
+    if owner == "ekf2":
+        accepted = "accept positions with large errors" if over else "reject good positions"
+        gate_effect = f" The gate of EKF2 may then {accepted}."
     return finding(
         severity,
         f"{owner}_variance_{stated}",
+        f"{name} is {'under' if over else 'over'}confident along {result.axis.called}: σ is "
+        f"{format_factor(factor)} times too {'large' if over else 'small'}. The mean NIS is "
+        f"{format_number(statement.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} axes)."
+        f"{gate_effect}",
+        remedy_text,
         evidence,
-        times=format_factor(factor),
-        nis=format_number(statement.nis_mean),
-        band=statement.nis_band,
-        group=group,
-        remedy=remedy_text,
     )
 
 
 def _noise_above_reported(analysis: Analysis) -> str:
-    """What to set where EKF2's parameter holds R above the accuracy that a receiver states."""
+    """Action if EKF2's parameter keeps R above the accuracy that the receiver reports, else ""."""
     name = aid_of(analysis).noise
     parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
     stated = within(analysis.source.samples, analysis.segment)[Columns.POSITION_VARIANCE[0]]
     stated_m = float(np.sqrt(stated.median()))
-    if not parameter_m > NOISE_FITS * stated_m:  # false for NaN too
+    if not parameter_m > NOISE_RATIO_TOLERANCE * stated_m:  # false for NaN too
         return ""
-    prefix = f"{name} {parameter_m:g} m holds R above what the receiver states ({stated_m:.2g} m)"
+    prefix = f"{name} {parameter_m:g} m exceeds the accuracy reported by GNSS ({stated_m:.2g} m)"
     return remedy.format_ekf2_remedy(
         analysis.ekf2_model,
         {name: float(f"{stated_m:.2g}")},
         remedy.noise_helps,
-        why=f"{prefix}: where you trust the receiver, ",
+        why=f"{prefix}. If the reported accuracy is right, ",
         fallback_remedy=f"{prefix}.",
     )
 
 
 def _is_default(analysis: Analysis, owner: FilterName, result: AxisComparison) -> bool:
-    """Whether the measurement noise in force is the one that comes with the program."""
+    """Return True if the noises in use are defaults of px4fuse (KF) or PX4 (EKF2)."""
     if owner == "kf":
         chosen, own = analysis.settings, Settings()
         return (chosen.sigma_z_m, chosen.sigma_a_m_s2) == (own.sigma_z_m, own.sigma_a_m_s2)
     name = aid_of(analysis, result.axis.name).noise
     default = PARAMETERS[name].default
     untouched = analysis.flight.log.parameters.get(name, default) == default
-    # a sender that reports a larger variance has chosen it
-    return untouched and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(NOISE_FITS)
+    # a variance that the sender reports is a choice of the user
+    return untouched and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(
+        NOISE_RATIO_TOLERANCE
+    )
 
 
 def _value_or_bound(noise: Noise) -> float | None:
-    """A noise by tuning, the same in all findings: a value, else an upper bound."""
+    """Maximum-likelihood value of a noise, else its upper bound."""
     return noise.high if noise.value is None else noise.value
 
 
@@ -309,7 +349,7 @@ def _remedy(
     tuned: AxisTuning | None,
     cause: Intervention | None,
 ) -> str:
-    """What to type or to set against the cause; where there is none, what it is not."""
+    """Action against the cause; without a cause, the changes that do not explain the deviation."""
     if cause is None:
         return _remedy_without_cause(analysis, owner, result, tuned)
     if owner == "ekf2":
@@ -320,21 +360,21 @@ def _remedy(
     if not bounded:
         return remedy.format_kf_remedy(analysis, cause.change)
     return (
-        "The source's noise is below what this rate can show. "
-        f"{remedy.format_kf_remedy(analysis, cause.change, ', and less SIGMA_A')}"
+        "The noise of the source is too small to be estimated at this rate. "
+        f"{remedy.format_kf_remedy(analysis, cause.change, ', and a smaller SIGMA_A')}"
     )
 
 
 def _remedy_without_cause(
     analysis: Analysis, owner: FilterName, result: AxisComparison, tuned: AxisTuning | None
 ) -> str:
-    """What was tried and how near it came, or that nothing could be."""
+    """Action if no re-run explains the deviation, with the closest re-run."""
     tried = interventions_on(analysis.causes, owner, result.axis.name)
     if any(each.denied_by_truth for each in tried):
-        return AGAINST_TRUTH
+        return KEEP_NOISES_TRUTH
     if tried:
         nearest = min(tried, key=lambda each: abs(each.explains - 1.0))
-        return f"{NOT_EXPLAINED} The nearest: {format_reason(analysis, nearest)}."
+        return f"{NOT_EXPLAINED} Closest: {format_rerun(analysis, nearest)}."
     if owner == "ekf2":
         return _remedy_without_replay(analysis, result, tuned)
     return UNKNOWN_NOISE if tuned is None else NOT_EXPLAINED
@@ -343,7 +383,7 @@ def _remedy_without_cause(
 def _remedy_without_replay(
     analysis: Analysis, result: AxisComparison, tuned: AxisTuning | None
 ) -> str:
-    """What the data ask of EKF2's noise where no replay can confirm it."""
+    """Compare EKF2's measurement noise with the estimated noise if no replay is possible."""
     aid, model = aid_of(analysis, result.axis.name), analysis.ekf2_model
     reason: Unavailable | None = model if isinstance(model, Unavailable) else None
     if result.axis.name == "down":
@@ -354,21 +394,25 @@ def _remedy_without_replay(
     if ml_noise_m is None or reason is None:
         return UNKNOWN_NOISE if tuned is None else NOT_EXPLAINED
     noise_m, used_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
-    prefix = f"The source's noise is {noise_m:.2g} m, EKF2 takes it to be {used_m:.2g} m"
+    prefix = f"The noise of the source is {noise_m:.2g} m, EKF2 uses {used_m:.2g} m"
     statement = result.filters["ekf2"]
     assert not isinstance(statement, Unavailable)
     ratio = noise_m / used_m
-    if not (ratio < 1.0 / NOISE_FITS if statement.sigma_factor > 1.0 else ratio > NOISE_FITS):
+    if not (
+        ratio < 1.0 / NOISE_RATIO_TOLERANCE
+        if statement.sigma_factor > 1.0
+        else ratio > NOISE_RATIO_TOLERANCE
+    ):
         return (
-            f"{prefix}: that is not it. Look at the clock ({aid.delay}) and at EKF2's process noise "
-            f"(EKF2_ACC_NOISE). {remedy.format_not_replayed(reason)}"
+            f"{prefix}: this does not explain the deviation. Check the time offset ({aid.delay}) "
+            f"and EKF2's process noise (EKF2_ACC_NOISE). {remedy.format_not_replayed(reason)}"
         )
     changes = remedy.noise_change(aid, analysis.flight.log.parameters, used_m, noise_m)
-    return f"{prefix}: set {remedy.format_settings(changes)}. {remedy.format_not_replayed(reason)}"
+    return f"{prefix}. Set {remedy.format_settings(changes)}. {remedy.format_not_replayed(reason)}"
 
 
 def ekf2_noise_m(result: AxisComparison) -> float:
-    """Median √R that EKF2 used; NaN where unknown."""
+    """Median √R (m) that EKF2 used; NaN if unknown."""
     frame = result.ekf2_innovations
     if isinstance(frame, Unavailable):
         return float("nan")

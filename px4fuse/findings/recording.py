@@ -1,4 +1,4 @@
-"""What the log says of itself: loss, restarts, and what it cannot hold."""
+"""Faults of the recording: lost data, restarts, clocks that went back, other estimators."""
 
 import pandas as pd
 
@@ -11,7 +11,7 @@ from px4fuse.plain import capitalise_first
 
 
 def detect(analysis: Analysis) -> Found:
-    """All of them; what was lost first."""
+    """Detect all faults of the recording, lost data first."""
     yield from dropouts(analysis)
     yield from loss(analysis.flight)
     yield from clocks_set_back(analysis.flight)
@@ -19,7 +19,7 @@ def detect(analysis: Analysis) -> Found:
 
 
 def dropouts(analysis: Comparison) -> Found:
-    """The logger stopped for a while."""
+    """Detect logger dropouts in the segment."""
     segment = analysis.segment
     lost = [
         each
@@ -27,63 +27,102 @@ def dropouts(analysis: Comparison) -> Found:
         if each.start_s <= segment.end_s and each.start_s + each.duration_s >= segment.start_s
     ]
     if lost:
+        total_s = sum(each.duration_s for each in lost)
+        longest_s = max(each.duration_s for each in lost)
         yield warning(
             "logger_dropouts",
-            {"count": len(lost), "total_s": sum(each.duration_s for each in lost)},
+            f"The logger lost data {format_count(len(lost))}, {total_s:.2f} s in total, at most "
+            f"{longest_s:.2f} s at once. All topics are missing in these intervals.",
+            "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
+            {"count": len(lost), "total_s": total_s},
             tuple((each.start_s, each.start_s + each.duration_s) for each in lost),
-            often=format_count(len(lost)),
-            longest_s=max(each.duration_s for each in lost),
         )
 
 
 def loss(flight: Flight) -> Found:
-    """Bytes that the reader had to pass over, a flight that goes on, single samples."""
+    """Detect bytes that cannot be read, a log that ends in flight, and dropped samples."""
     log = flight.log
     if log.damage or log.ends_in_flight:
-        first, *others = map(
-            _sentence,
-            log.damage
-            or (f"the log ends in flight, after {log.duration_s:.1f} s: the landing is not in it",),
+        notes = log.damage or (
+            f"the log ends in flight after {log.duration_s:.1f} s; the landing is missing",
         )
+        action = "Copy the log again. If this does not help, replace the SD card."
+        if not log.damage:
+            action = "Log until after the landing. If the file was cut off, copy it again."
+        elif log.format.startswith("MAVLink"):
+            action = "Record on a link that loses no bytes: by cable, or on the companion computer."
         yield finding(
             "warning" if log.damage else "info",
             "log_damaged",
+            "".join(f"{_sentence(note)}. " for note in notes).rstrip(),
+            action,
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
-            headline=first,
-            others="".join(f". {other}" for other in others),
-            case="ends" if not log.damage else log.format.partition(" ")[0],
         )
     for topic, count in list(log.dropped.items())[:1]:
-        more = len(log.dropped) - 1
-        facts = {"topic": topic, "count": count, "others": more, "also": more > 0}
-        yield info("samples_dropped", {"notes": more + 1}, (), **facts)
+        others = len(log.dropped) - 1
+        also = f" (also in {others} other topic{'s' if others > 1 else ''})" if others else ""
+        yield info(
+            "samples_dropped",
+            f"{count} samples of {topic} were dropped: their timestamps are zero or go back{also}.",
+            "The file is complete: a clock was set back, or messages overtook each other. If this "
+            "is the position source, synchronise its clock before take-off (TIMESYNC).",
+            {"notes": others + 1},
+        )
 
 
 def clocks_set_back(flight: Flight) -> Found:
-    """The boot clock began again, or the recording computer's clock was set back."""
+    """Detect restarts of the boot clock, and receive times that go back."""
     log = flight.log
     if log.restarts:
         yield warning(
-            "autopilot_restarted", {"count": log.restarts}, often=format_count(log.restarts)
+            "autopilot_restarted",
+            f"The autopilot's boot clock restarted {format_count(log.restarts)}. px4fuse reads "
+            "only the longest part.",
+            "Record each flight in a separate file.",
+            {"count": log.restarts},
         )
     if back := log.receipt_went_back:
-        yield info("receipt_out_of_order", {"count": back}, often=format_count(back))
+        yield info(
+            "receipt_out_of_order",
+            f"The receive time went back {format_count(back)}: the recording computer's clock was "
+            "set, or recordings were joined. The senders' timestamps are not affected.",
+            "Switch off time synchronisation of the recording computer while recording.",
+            {"count": back},
+        )
 
 
 def estimators(analysis: Analysis) -> Found:
-    """What is called EKF2 is another estimator, a model, or lacks its innovations."""
+    """Detect EKF2 data of a model or of another estimator, or without innovations."""
     log, ekf2 = analysis.flight.log, analysis.flight.ekf2
     if MODEL_NOTE in log.notes:
-        yield info("ekf2_is_a_model", headline=MODEL_NOTE)
+        yield info(
+            "ekf2_is_a_model",
+            f"{MODEL_NOTE}.",
+            "Use a real flight to assess PX4's EKF2.",
+        )
     if not isinstance(ekf2, Ekf2):
         return
     if log.autopilot != "PX4":
-        yield info("not_px4", {"autopilot": log.autopilot})
+        yield info(
+            "not_px4",
+            f"This log is from {log.autopilot}. EKF2 in this report means the estimator of "
+            f"{log.autopilot}. The PX4 parameters named do not exist there.",
+            "Read EKF2 as the autopilot's own estimator.",
+            {"autopilot": log.autopilot},
+        )
     if log.format.startswith("MAVLink"):
-        has_variances = isinstance(ekf2.variance, pd.DataFrame)
-        yield info("innovations_need_ulog", case=log.has_ulog, variances=has_variances)
+        variances = " and variances" if isinstance(ekf2.variance, pd.DataFrame) else ""
+        yield info(
+            "innovations_need_ulog",
+            f"A MAVLink recording contains EKF2's states{variances}, but no innovations. The "
+            "consistency of EKF2 cannot be tested.",
+            "Give the ULog of the same flight as LOG and this recording with --mavlink."
+            if log.has_ulog
+            else "The innovations are in the autopilot's DataFlash log (.BIN), which px4fuse does "
+            "not read.",
+        )
 
 
 def _sentence(note: str) -> str:
-    """A note with a capital letter, unless it begins with a file's name."""
+    """Capitalise a note, unless it begins with a file name."""
     return note if "." in note.split(" ", 1)[0] else capitalise_first(note)

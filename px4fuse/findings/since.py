@@ -1,4 +1,4 @@
-"""A cause that a replay has shown, in words: what it is, what it does, and what puts it right."""
+"""Text of a cause that a re-run has shown: the change, its effect, and the action."""
 
 from collections.abc import Mapping
 
@@ -10,10 +10,10 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.heading import HeadingError
 from px4fuse.findings import causes as kinds
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capitalise_first, format_length, format_number
+from px4fuse.plain import capitalise_first, format_number
 from px4fuse.request import OPTIONS
 
-# Findings that say the same as the first sentence does, by what is changed
+# Findings that state the same fault as a re-run in the summary, by kind of cause
 FINDINGS_OF_CAUSE: Mapping[str, frozenset[str]] = {
     kinds.OUTLIERS: frozenset(("source_outliers",)),
     kinds.CLOCK: frozenset(("source_clock_offset", "ekf2_ev_delay_wrong")),
@@ -21,16 +21,16 @@ FINDINGS_OF_CAUSE: Mapping[str, frozenset[str]] = {
     kinds.GATE: frozenset(("ekf2_gate_small",)),
     kinds.ACCELEROMETER: frozenset(("accelerometer_bias",)),
 }
-# What a change of a kind is there for; else to bring the mean NIS nearer to 1
+# Test of a re-run by kind of cause; other kinds must bring the mean NIS nearer to 1
 REMEDY_TESTS = {kinds.CLOCK: remedy.delay_helps, kinds.GATE: remedy.rejects_less}
 
 
 def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
-    """What sort of cause it is, as findings name it: of the source where there are two."""
+    """Classify a cause; if it has several changes, that of the source is decisive."""
     if cause is None:
         return kinds.ELSEWHERE
     aid = remedy.aid_of(analysis)
-    of = {
+    kind_by_change = {
         changed.OUTLIERS: kinds.OUTLIERS,
         changed.CLOCK: kinds.CLOCK,
         aid.delay: kinds.CLOCK,
@@ -40,112 +40,109 @@ def kind_of(analysis: Analysis, cause: Intervention | None) -> str:
         aid.noise: kinds.NOISE,
         aid.gate: kinds.GATE,
     }
-    return next((kind for name, kind in of.items() if name in cause.change), kinds.PROCESS)
+    return next(
+        (kind for name, kind in kind_by_change.items() if name in cause.change), kinds.PROCESS
+    )
 
 
-def format_cause(analysis: Analysis, cause: Intervention | None) -> str:
-    """What stands behind a verdict: its cause, and the replay that shows it; or nothing."""
-    return "" if cause is None else f", since {format_reason(analysis, cause)}"
-
-
-def format_reason(analysis: Analysis, cause: Intervention) -> str:
-    """A cause as a clause, and the replay that shows it."""
-    return f"{format_change(analysis, cause)} ({format_effect(cause)})"
+def format_rerun(analysis: Analysis, cause: Intervention) -> str:
+    """Format a re-run: "re-run with SIGMA_Z 0.4 m instead of 0.1 m: mean NIS 16 → 1 ..."."""
+    return f"re-run with {format_change(analysis, cause)}: {format_effect(cause)}"
 
 
 def format_change(analysis: Analysis, cause: Intervention) -> str:
-    """What is wrong, as a clause: what was changed to see what it does."""
-    clauses = [
+    """Format the changes of a re-run as a noun phrase."""
+    changes = [
         _format_one_change(analysis, cause, name)
         for name in cause.change
         if name not in changed.ACCOMPANYING_CHANGES
     ]
-    return " and ".join(clauses)
+    return " and ".join(changes)
 
 
 def format_explained_share(cause: Intervention) -> str:
-    """How much of a discrepancy a change explains."""
+    """Format the share of a deviation that a change explains."""
     if cause.denied_by_truth:
-        return "denied by the truth"
+        return "contradicts ground truth"
     if cause.brings_into_band:
         return "all"
     if cause.explains > 1.0 and cause.of != "apart":
         return "too much"
-    return f"{cause.explains:.0%}" if cause.explains > 0.0 else "nothing"
+    return f"{100.0 * cause.explains:.0f} %" if cause.explains > 0.0 else "nothing"
 
 
 def format_remedy(analysis: Analysis, cause: Intervention) -> str:
-    """What to do about a cause."""
+    """Format the action against a cause, one sentence per change."""
     actions, change = [], dict(cause.change)
+    is_gnss = analysis.source.origin.is_gnss
     if change.pop(changed.OUTLIERS, None):
-        gnss = analysis.source.origin.is_gnss
-        where = "place of the antenna" if gnss else "line of sight, anchor survey"
-        actions.append(f"remove the outliers ({where}) rather than raise a noise for them")
+        check = "place of the antenna" if is_gnss else "line of sight, anchor survey"
+        actions.append(f"Remove the outliers ({check}). Do not increase a noise for outliers.")
     if change.pop(changed.FORWARD, None) is not None:
-        actions.append("calibrate the accelerometer and the level horizon")
+        actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(changed.RIGHT)
     if turn_deg := change.pop(changed.TURN, None):
-        # GNSS knows north
+        # GNSS positions refer to true north, so EKF2's heading is wrong
         actions.append(
-            f"calibrate the magnetometer, away from metal and motors ({turn_deg:+.0f}°)"
-            if analysis.source.origin.is_gnss
-            else f"turn the positions by {turn_deg:+.0f}° before they are sent"
+            f"Calibrate the magnetometer (heading error {turn_deg:+.0f}°), away from metal."
+            if is_gnss
+            else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
     settings = (changed.SIGMA_Z, changed.SIGMA_A, changed.CLOCK)
     options = [f"{OPTIONS[name].name} {change.pop(name):g}" for name in settings if name in change]
     if change:
-        actions.append(f"set {remedy.format_settings(change)}")
+        actions.append(f"Set {remedy.format_settings(change)}.")
     if options:
-        actions.append(f"type {remedy.COMMAND} {' '.join(options)}")
-    return f"{capitalise_first(', and '.join(actions))}."
+        actions.append(f"Re-run with {remedy.COMMAND} {' '.join(options)}.")
+    return " ".join(actions)
 
 
 def format_effect(cause: Intervention) -> str:
-    """What a change does to the number in question, by the replay."""
-    if cause.of == "nis":
-        before, after = (format_number(nis, 2) for nis in (cause.before, cause.after))
-        return f"replayed: mean NIS {before} → {after}"
+    """Format the statistic before and after a re-run."""
     if cause.of == "apart":
-        before, after = (format_length(metres) for metres in (cause.before, cause.after))
-        return f"replayed: {before} → {after} apart"
-    before, after = (format_number(nees**0.5, 2) for nees in (cause.before, cause.after))
-    return f"replayed: errors of {before} → {after} σ"
+        return f"difference KF - EKF2 {cause.before:.2f} → {cause.after:.2f} m RMS"
+    power = 1.0 if cause.of == "nis" else 0.5
+    before, after = (format_number(value**power, 2) for value in (cause.before, cause.after))
+    label = "mean NIS" if cause.of == "nis" else "RMS of error / reported σ"
+    return f"{label} {before} → {after} (expected 1)"
 
 
 def format_remedy_of_ekf2(analysis: Analysis, cause: Intervention) -> str:
-    """What to do about a cause of EKF2's, with what a parameter would do to all of the flight."""
+    """Format the action against a cause in EKF2, with its replayed effect on the whole flight."""
     if not cause.change.keys() <= PARAMETERS.keys():
         return format_remedy(analysis, cause)
     return remedy.format_ekf2_remedy(
         analysis.ekf2_model,
         cause.change,
         REMEDY_TESTS.get(kind_of(analysis, cause), remedy.noise_helps),
-        fallback_remedy=f"{capitalise_first(format_reason(analysis, cause))}.",
+        fallback_remedy=f"{capitalise_first(format_rerun(analysis, cause))}.",
     )
 
 
 def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> str:
-    """What is wrong, for one of the things that were changed."""
     value, settings = cause.change[name], analysis.settings
     match name:
         case changed.OUTLIERS:
-            return f"{value:.0f} position{'s are outliers' if value > 1 else ' is an outlier'}"
+            return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
         case changed.CLOCK:
-            missing_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
-            return f"the stamps are {abs(missing_s):.2g} s {'late' if missing_s < 0 else 'early'}"
+            offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
+            late = "late" if offset_s < 0 else "early"
+            return f"timestamps corrected ({abs(offset_s):.2g} s {late})"
         case changed.FORWARD:
             right = cause.change[changed.RIGHT]
-            return f"the accelerometer reads {value:+.2f} m/s² too much forward, {right:+.2f} right"
+            return f"accelerometer bias removed ({value:+.2f} m/s² forward, {right:+.2f} right)"
         case changed.TURN:
             drifts = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
-            what, turn_deg = "the positions are turned", -value
-            if analysis.source.origin.is_gnss:
-                what, turn_deg = "EKF2's heading is off", value
-            return f"{what} by {turn_deg:+.0f}°{' on average' * drifts}"
+            mean = " on average" if drifts else ""
+            return (
+                f"EKF2's heading corrected (error {value:+.0f}°{mean})"
+                if analysis.source.origin.is_gnss
+                else f"positions rotated by {value:+.0f}°{mean}"
+            )
         case changed.SIGMA_A | changed.SIGMA_Z:
             label, unit = name[:7].upper(), OPTIONS[name].unit
-            return f"{label} is {getattr(settings, name):g} instead of {value:.2g} {unit}"
+            return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
     flown, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit
     unit = unit.replace("^2", "²").replace("^3", "³")
-    return f"{name} is {flown:.4g} instead of {value:.3g} {unit}".rstrip()
+    return f"{name} {value:.3g} {unit} instead of {flown:.4g} {unit}".replace("  ", " ").rstrip()

@@ -1,24 +1,22 @@
-"""The source's frame is not north, or is turned against the vehicle's heading, or EKF2's drifts."""
-
-from collections.abc import Mapping
-from typing import Any
+"""Frame of the source: FRD instead of NED, misalignment, EKF2 heading errors, file alignment."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.heading import MAX_DRIFT_P, HeadingError
-from px4fuse.findings.ekf2_not_fusing import FUSING_SHARE_ERROR
+from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Finding, Found, Severity, finding, fraction_on, info, warning
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.plain import capitalise_first
 
-HEADING_SIGMAS = 4.0  # standard deviations; clean flights were seen up to 3.2
-HEADING_ERROR_DEG = 5.0  # EKF2's magnetic heading was off by 3 to 4° in flights seen
-HEADING_ERROR_LARGE_DEG = 15.0  # a quarter of each axis goes to the other
-# Published in EKF2's own frame, after it turned what was sent (EKF2.cpp)
+MIN_HEADING_SIGMAS = 4.0  # standard deviations; clean flights reach 3.2
+MIN_HEADING_ERROR_DEG = 5.0  # °; EKF2's magnetic heading was wrong by 3 to 4° on real flights
+LARGE_HEADING_ERROR_DEG = 15.0  # °; a quarter of each axis appears on the other
+# Published in EKF2's frame, after EKF2 rotated the received positions (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
+CALIBRATE = "Calibrate the magnetometer away from metal and motors."
 
 
 def detect(analysis: Analysis) -> Found:
-    """What its frame is called, and what the IMU makes of it."""
+    """Detect all faults of the source's frame and of EKF2's heading."""
     if analysis.source.frame == "FRD":
         yield frame_not_north(analysis)
     heading = analysis.heading
@@ -28,51 +26,110 @@ def detect(analysis: Analysis) -> Found:
 
 
 def frame_not_north(analysis: Analysis) -> Finding:
-    """The source's x axis is not north, and EKF2 may or may not have taken it so."""
+    """Make the finding of a source in FRD, depending on whether EKF2 fused its yaw."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
-    case, fusing = "apart", ekf2.fusing if isinstance(ekf2, Ekf2) else None
+    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
+    fault = (
+        "The position source is in FRD: its x axis is the vehicle's heading at start, not north."
+    )
+    read_as_x = "Read 'north' as the source's x axis."
     if isinstance(fusing, Unavailable):
-        case = "unknown"
-    elif fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > FUSING_SHARE_ERROR:
-        case = "fused"
-    make_finding = warning if case == "apart" else info
-    return make_finding("source_frame_not_north", case=case, in_ulog=log.has_ulog)
+        if log.has_ulog:
+            read_as_x += " The ULog shows whether EKF2 uses the same frame."
+        unknown = "The recording does not show whether EKF2 fused its yaw."
+        return info("source_frame_not_north", f"{fault} {unknown}", read_as_x)
+    if fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR:
+        same = "EKF2 fused its yaw, so EKF2 uses the same frame."
+        return info("source_frame_not_north", f"{fault} {same}", read_as_x)
+    return warning(
+        "source_frame_not_north",
+        f"{fault} The IMU is rotated into NED, so the axes of positions and IMU may differ.",
+        "Send the position in NED, or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3).",
+    )
 
 
 def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Found:
-    """The IMU measures as north what the positions show in another direction."""
+    """Detect a rotation between the motion measured by the IMU and by the positions."""
     name, turn, sigma = analysis.source.name, heading.turn_deg, heading.sigma_deg
-    gnss = analysis.source.origin.is_gnss
-    facts: dict[str, Any] = {"source": name, "gnss": gnss, "yaw": analysis.flight.log.has_ulog}
+    is_gnss = analysis.source.origin.is_gnss
     if heading.drifts:
-        yield _drift_finding(heading, facts)
-    elif abs(turn) >= max(HEADING_SIGMAS * sigma, HEADING_ERROR_DEG) and not _is_a_bias(analysis):
-        of_ekf2 = gnss or name == IN_EKF2_FRAME
-        yield finding(
-            "error" if abs(turn) >= HEADING_ERROR_LARGE_DEG else "warning",
-            "ekf2_heading_wrong" if of_ekf2 else "source_frame_turned",
-            {"turn_deg": turn, "sigma_deg": sigma},
-            within_deg=1.96 * sigma,
-            back_deg=-turn,
-            case="gnss" if gnss else "fused",
-            **facts,
+        yield _drift_finding(analysis, heading)
+        return
+    needed_deg = max(MIN_HEADING_SIGMAS * sigma, MIN_HEADING_ERROR_DEG)
+    if abs(turn) < needed_deg or _is_explained_by_bias(analysis):
+        return
+    rotation = f"rotated by {turn:+.0f}° ± {1.96 * sigma:.0f}° (clockwise from above)"
+    finding_id = "ekf2_heading_wrong"
+    if is_gnss:
+        message = (
+            f"GNSS positions are {rotation} relative to EKF2's heading, constant over the flight. "
+            "GNSS positions refer to true north, so the heading is wrong."
         )
+        action = f"{CALIBRATE} Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
+    elif name == IN_EKF2_FRAME:
+        message = (
+            f"The positions that EKF2 fused ({name}) are {rotation} relative to EKF2's heading, "
+            "constant over the flight. The IMU measures the same motion in another direction."
+        )
+        action = (
+            "Align the positioning frame with north, or calibrate the magnetometer away from metal "
+            f"and motors. {_fuse_yaw(analysis.flight.log.has_ulog)}"
+        )
+    else:
+        finding_id = "source_frame_turned"
+        message = (
+            f"The frame of {name} is {rotation} relative to the vehicle's heading. Either the "
+            "positioning frame is not aligned with north, or the heading is wrong (magnetometer)."
+        )
+        action = (
+            f"Rotate the positions by {-turn:+.0f}° before they are sent (a file: --position-yaw), "
+            "or calibrate the magnetometer."
+        )
+    yield finding(
+        "error" if abs(turn) >= LARGE_HEADING_ERROR_DEG else "warning",
+        finding_id,
+        message,
+        action,
+        {"turn_deg": turn, "sigma_deg": sigma},
+    )
 
 
-def _is_a_bias(analysis: Analysis) -> bool:
-    """Whether a bias of the accelerometer, which turns with the nose, explains it as well."""
+def _fuse_yaw(has_ulog: bool) -> str:
+    if not has_ulog:
+        return "Or let the autopilot fuse the source's yaw."
+    return (
+        "Or let EKF2 fuse the source's yaw (EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4 before v1.14)."
+    )
+
+
+def _is_explained_by_bias(analysis: Analysis) -> bool:
+    """Return True if an accelerometer bias explains the misalignment as well as a rotation."""
     found = analysis.bias_scale_jump_fit
     if isinstance(found, Unavailable) or analysis.source.orientation is not None:
         return False
-    return abs(found.rotation.value) < HEADING_SIGMAS * found.rotation.sigma
+    return abs(found.rotation.value) < MIN_HEADING_SIGMAS * found.rotation.sigma
 
 
-def _drift_finding(heading: HeadingError, facts: Mapping[str, Any]) -> Finding:
+def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     first, last = heading.ends
     change = last.heading_error_deg - first.heading_error_deg
+    basis = "the source's orientation"
+    if heading.by != "orientation":
+        basis = "the positions and the IMU"
+    possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
+    action = f"{CALIBRATE} {_fuse_yaw(analysis.flight.log.has_ulog)}"
+    if analysis.source.origin.is_gnss:
+        possible_cause = "a magnetometer near currents or steel"
+        action = f"{CALIBRATE} Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
     return finding(
-        "error" if abs(change) >= HEADING_ERROR_LARGE_DEG else "warning",
+        "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_wrong",
+        f"EKF2's heading drifts relative to {analysis.source.name}: "
+        f"{first.heading_error_deg:+.0f}° from {first.start_s:.0f} to {first.end_s:.0f} s, "
+        f"{last.heading_error_deg:+.0f}° from {last.start_s:.0f} to {last.end_s:.0f} s (clockwise "
+        f"from above, by {basis}). A constant rotation of the positions cannot correct this. "
+        f"Possible cause: {possible_cause}.",
+        action,
         {
             "from_deg": first.heading_error_deg,
             "to_deg": last.heading_error_deg,
@@ -81,17 +138,11 @@ def _drift_finding(heading: HeadingError, facts: Mapping[str, Any]) -> Finding:
             "p": max(heading.drift_p, 1e-300),
             "p_limit": MAX_DRIFT_P,
         },
-        headline="drifts",
-        more=heading.by,
-        remedy="gnss" if facts["gnss"] else "drifts",
-        first=first,
-        last=last,
-        **facts,
     )
 
 
 def placement(analysis: Analysis) -> Found:
-    """What is poorly determined about where a position file lies in the flight."""
+    """Detect an uncertain alignment (frame, yaw, time) of a position file."""
     found = analysis.source.alignment
     doubts: dict[Severity, tuple[str, ...]] = {}
     if found is not None:
@@ -101,6 +152,6 @@ def placement(analysis: Analysis) -> Found:
             yield finding(
                 severity,
                 "position_file_placement",
-                source=analysis.source.name,
-                doubt=capitalise_first(sentence.rstrip(".")),
+                f"{analysis.source.name}: {capitalise_first(sentence.rstrip('.'))}.",
+                "Give --clock-offset, --position-frame and --position-yaw if you know them.",
             )

@@ -1,7 +1,7 @@
-"""What the intervals between positions show: silence, single losses, and a thinned source.
+"""Gaps between positions, lost samples, and a downsampled source.
 
-Where exactly every second or third sample was kept, the intervals are as regular as those of a
-slower source, and no log can tell the two apart.
+If exactly every second or third sample is kept, the intervals equal those of a slower source; no
+log can distinguish the two.
 """
 
 import numpy as np
@@ -11,68 +11,75 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.events import longest_s, source_gaps
 from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
-from px4fuse.findings.model import Found, finding, format_count, info, warning
+from px4fuse.findings.model import Found, finding, format_percent, info, warning
 from px4fuse.origin import ALIGNED
 
-LOST_SHARE = 0.02  # of the source's samples; seen: 0 to 0.3 %, and 8 to 9 % in v1.13
+MIN_LOST_SHARE = 0.02  # of the source's samples; seen: 0 to 0.3 %, and 8 to 9 % in v1.13
 MIN_INTERVALS = 50
-THINNED_SHARE = 0.25  # of the source's samples: more than a link loses
-# What is thinned to a rate alternates between two neighbouring multiples; bursts have multiples
-# far apart
+MIN_DOWNSAMPLED_SHARE = 0.25  # of the source's samples; more than a link loses
+# Downsampling to a rate alternates between two neighbouring multiples; bursts of a link do not
 MIN_PAIR_SHARE = 0.85  # of the intervals
-MIN_SHARE = 0.1  # of the intervals; single losses pass
-# Root mean square distance from whole multiples, of the shorter interval: random ones have 0.29, a
-# source's own jitter is 0.03
+MIN_MULTIPLE_SHARE = 0.1  # of the intervals; lost samples alone stay below
+# RMS distance from whole multiples, in intervals: random ones have 0.29, jitter of a source 0.03
 MAX_MULTIPLE_RMS = 0.06
 MAX_DIVISOR = 4
 
 
 def detect(analysis: Analysis) -> Found:
-    """All three."""
+    """Detect gaps, lost samples and downsampling."""
     yield from gaps(analysis)
     yield from losses(analysis)
     yield from downsampling(analysis)
 
 
 def gaps(analysis: Analysis) -> Found:
-    """The source stopped for a while."""
+    """Detect gaps in the position source."""
     rate_hz = analysis.source.rate_hz
-    silent = source_gaps(analysis.lines[0].measurement_time_s, rate_hz)
-    if silent:
-        at, until = max(silent, key=lambda gap: gap[1] - gap[0])
+    found = source_gaps(analysis.lines[0].measurement_time_s, rate_hz)
+    if found:
+        at, until = max(found, key=lambda gap: gap[1] - gap[0])
+        check = "line of sight to the anchors and the link"
+        if analysis.source.origin.is_gnss:
+            check = "the antenna's view of the sky, its cable and radio interference"
+        limit_s, count = longest_s(1.0 / rate_hz), len(found)
+        number = "one gap" if count == 1 else f"{count} gaps"
+        longest = "" if count == 1 else "the longest "
         yield warning(
             "source_gap",
-            {"count": len(silent), "longest_s": until - at, "at_s": at},
-            silent,
-            often=format_count(len(silent)),
-            usual_s=longest_s(1.0 / rate_hz),
-            gnss=analysis.source.origin.is_gnss,
+            f"The position source has {number} of more than {limit_s:.1f} s: {longest}"
+            f"{until - at:.1f} s from {at:.1f} s. In a gap KF uses the IMU only, and its error "
+            "grows.",
+            f"Check {check}. Analyse one side of the gap (--start, --end).",
+            {"count": count, "longest_s": until - at, "at_s": at},
+            found,
         )
 
 
 def losses(analysis: Analysis) -> Found:
-    """The recording lacks single samples of a regular source."""
+    """Detect single samples of a regular source that the recording lacks."""
     source, clock = analysis.source, analysis.source.clock_map
     if clock is None or clock.method == "arrival time" or clock.distinct_stamps is not None:
         return
     intervals, typical = _intervals(analysis)
     lost = int(np.sum(np.rint(intervals / typical) - 1.0))
     sent = lost + len(intervals)
-    if len(intervals) > 1 and lost / sent > LOST_SHARE:
+    if len(intervals) > 1 and lost / sent > MIN_LOST_SHARE:
+        action = "Record on the companion computer or on a link without message loss."
+        if analysis.flight.log.has_ulog:
+            action += " The ULog contains the samples that PX4 received (SDLOG_PROFILE 129)."
         yield info(
             "source_samples_lost",
+            f"About {format_percent(lost / sent)} of {source.name} is missing from the recording "
+            f"({lost} of {sent} samples, one per {typical:.2f} s). EKF2 may have received them.",
+            action,
             {"lost": lost, "lost_share": lost / sent},
-            source=source.name,
-            sent=sent,
-            typical_s=typical,
-            in_ulog=analysis.flight.log.has_ulog,
         )
 
 
 def downsampling(analysis: Analysis) -> Found:
-    """Intervals are whole multiples of a shorter one: the source is faster than what arrived."""
+    """Detect intervals that are whole multiples of a shorter one: PX4 did not get all samples."""
     source = analysis.source
-    # stamps that were made, or a rate that is the logger's (source_not_logged says so)
+    # mapped timestamps, or the rate of the logger (see source_not_logged), show nothing
     if source.clock_map is not None or source.origin.preference >= ALIGNED.preference:
         return
     intervals, _ = _intervals(analysis)
@@ -84,38 +91,47 @@ def downsampling(analysis: Analysis) -> Found:
     shares = np.bincount(multiples.astype(np.intp)) / len(multiples)
     pairs = shares[:-1] + shares[1:]
     at = int(np.argmax(pairs))
-    alternating = pairs[at] >= MIN_PAIR_SHARE and shares[at : at + 2].min() >= MIN_SHARE
-    if lost < THINNED_SHARE or not alternating:
+    alternating = pairs[at] >= MIN_PAIR_SHARE and shares[at : at + 2].min() >= MIN_MULTIPLE_SHARE
+    if lost < MIN_DOWNSAMPLED_SHARE or not alternating:
         return
     interval_s = float(np.mean(intervals))
     slow = interval_s > EV_START_INTERVAL_S
+    message = (
+        f"{source.name} arrives at {1.0 / interval_s:.2g} Hz, at whole multiples of {base:.3g} s. "
+        f"Of a {1.0 / base:.2g} Hz source {format_percent(lost)} is missing."
+    )
+    if slow:
+        message += (
+            " EKF2 (v1.14 and later) starts fusion only below "
+            f"{EV_START_INTERVAL_S:g} s between samples."
+        )
     yield finding(
         "error" if slow else "warning",
         "source_thinned",
+        message,
+        "Increase the rate of the stream at the sender (MAVROS, bridge, link) and remove any rate "
+        "limit.",
         {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base, "lost_share": lost},
-        source=source.name,
-        base_s=base,
-        starts=slow,
-        least_s=EV_START_INTERVAL_S,
     )
 
 
 def _intervals(analysis: Analysis) -> tuple[Array, float]:
-    """Intervals (s) between positions in the segment but for silences, and their median."""
+    """Intervals (s) between positions in the segment without gaps, and their median (s)."""
     intervals = np.diff(within(analysis.source.samples, analysis.segment).index.to_numpy())
     typical = float(np.median(intervals)) if len(intervals) else np.nan
     return intervals[intervals <= longest_s(typical)], typical
 
 
 def _base_interval(intervals: Array) -> tuple[float, Array] | None:
-    """Longest interval of which all are whole multiples, and these; None where there is none."""
-    typical = float(np.sort(intervals)[len(intervals) // 2])  # one of them, no mean of two
+    """Longest interval (s) of which all are whole multiples, and these; None if there is none."""
+    # an actual interval, not the mean of two
+    typical = float(np.sort(intervals)[len(intervals) // 2])
     for divisor in range(1, MAX_DIVISOR + 1):
         multiples = np.rint(intervals * divisor / typical)
         if np.any(multiples < 1.0):
             continue
         base = float(np.sum(intervals) / np.sum(multiples))
-        # the first that fits is the longest: a single multiple says that nothing is missing
+        # divisors increase, so the first match is the longest interval
         if float(np.sqrt(np.mean((intervals / base - multiples) ** 2))) <= MAX_MULTIPLE_RMS:
             return base, multiples
     return None

@@ -1,4 +1,4 @@
-"""The sender's time stamps tell no time, or the time of arrival instead of the measurement."""
+"""Timestamps of the source that are constant, or arrival times instead of measurement times."""
 
 import numpy as np
 import pandas as pd
@@ -9,83 +9,113 @@ from px4fuse.findings.model import Found, error, warning
 from px4fuse.flight import ARRIVAL_METHODS, Ekf2, FusionRecord
 from px4fuse.recording import ClockMap
 
-RECEIPT_JITTER_S = 0.010  # 1 cm at 1 m/s, a tenth of a good UWB's noise
-ARRIVAL_AGE_S = 0.001  # from receiving a message to publishing it
-LATENCY_S = 0.02  # at 1 m/s a fifth of a good UWB's noise
-LATENCY_ERROR_S = 0.10  # at 1 m/s a good UWB's noise
+MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good UWB (0.1 m)
+MAX_ARRIVAL_AGE_S = 0.001  # s; from receiving a message to publishing it
+MIN_LATENCY_S = 0.02  # s; at 1 m/s a fifth of the noise of good UWB (0.1 m)
+MIN_LATENCY_ERROR_S = 0.10  # s; at 1 m/s the noise of good UWB (0.1 m)
 MIN_SAMPLES = 10
-MIN_PURE_SHARE = 0.95  # of the samples of each part; a late message now and then passes
+MIN_PURE_SHARE = 0.95  # of the samples of each part; allows a few late messages
+ANSWER_TIMESYNC = (
+    "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
+    "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
+)
 
 
 def detect(analysis: Analysis) -> Found:
-    """By how a recording's stamps were mapped, or by their age in a log of the autopilot."""
-    clock = analysis.source.clock_map
+    """Detect wrong timestamps, by the clock map of a recording or the ages in a ULog."""
+    clock, name = analysis.source.clock_map, analysis.source.name
     if clock is None:
         yield from arrivals(analysis)
     elif clock.distinct_stamps is not None:
-        yield from constant(analysis.source.name, clock, clock.distinct_stamps)
+        yield from constant(name, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
+        kf_times = f"the sender's timestamps, mapped by the {clock.method}"
+        if clock.method == "arrival time":
+            kf_times = "arrival times too, so its track is late by the age of the positions"
         yield warning(
             "companion_not_synchronised",
+            f"The sender of {name} was never synchronised with the autopilot (TIMESYNC). EKF2 "
+            f"used arrival times as times of measurement. KF uses {kf_times}.",
+            ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
-            source=analysis.source.name,
-            method=clock.method,
-            own=clock.method != "arrival time",
         )
 
 
 def constant(name: str, clock: ClockMap, distinct: int) -> Found:
-    """They take too few values, and the receipt that stands in for them may jitter."""
-    evidence = {"stamps": clock.pairs, "distinct": distinct}
-    yield error("source_stamps_constant", evidence, source=name, values=distinct > 1)
-    if (jitter_s := clock.jitter_s) > RECEIPT_JITTER_S:
-        jitter_ms = jitter_s * 1e3
+    """Make the findings of constant timestamps and of the jitter of the receive times."""
+    yield error(
+        "source_stamps_constant",
+        f"The {clock.pairs} timestamps of {name} have only {distinct} distinct "
+        f"value{'s' if distinct > 1 else ''}. The time of measurement is unknown; px4fuse uses the "
+        "receive time instead.",
+        "Send the time of measurement in the message (usec, time_usec), in microseconds and as an "
+        "integer. A 32-bit float cannot hold it.",
+        {"stamps": clock.pairs, "distinct": distinct},
+    )
+    if (jitter_s := clock.jitter_s) > MAX_RECEIPT_JITTER_S:
         yield warning(
-            "source_receipt_jitter", {"jitter_s": jitter_s}, source=name, jitter_ms=jitter_ms
+            "source_receipt_jitter",
+            f"The receive times of {name}, used instead of its timestamps, jitter by "
+            f"{jitter_s * 1e3:.0f} ms (1 σ). At 1 m/s this is a position error of "
+            f"{jitter_s:.3f} m.",
+            "Send the time of measurement in the message, and record close to the sender.",
+            {"jitter_s": jitter_s},
         )
 
 
 def arrivals(analysis: Analysis) -> Found:
-    """Stamps are times of arrival, throughout or at first: TIMESYNC had not converged.
+    """Detect timestamps that are arrival times, in the whole flight or until TIMESYNC converged.
 
-    PX4 then stamps a position when it comes (Timesync.cpp). The log shows it without any estimate:
-    the age of what is published, time of publication less stamp, is nothing at first and the
-    latency later.
+    PX4 then uses the time of arrival as timestamp (Timesync.cpp). The log shows it directly: the
+    age of the published positions, publication minus timestamp, is zero instead of the latency.
     """
     age, name = _age_s(analysis), analysis.source.name
     if age is None:
         return
-    cut = until_synchronised(analysis)
-    if cut is not None:
-        until, latency = cut
-        make_finding = error if latency >= LATENCY_ERROR_S else warning
-        evidence, spans = {"until_s": until, "latency_s": latency}, ((float(age.index[0]), until),)
-        yield make_finding("source_stamps_of_arrival", evidence, spans, source=name, case=True)
-    elif np.mean(age.abs() < ARRIVAL_AGE_S) >= MIN_PURE_SHARE:
-        evidence = {"until_s": float(age.index[-1])}
-        yield warning("source_stamps_of_arrival", evidence, source=name, case=False)
+    synchronised = until_synchronised(analysis)
+    if synchronised is not None:
+        until, latency = synchronised
+        make_finding = error if latency >= MIN_LATENCY_ERROR_S else warning
+        yield make_finding(
+            "source_stamps_of_arrival",
+            f"The timestamps of {name} are arrival times until {until:.1f} s. From then on they "
+            f"are times of measurement, {latency:.3f} s before arrival: TIMESYNC had not converged "
+            "before (PX4 needs 500 answers). One time offset cannot correct both parts.",
+            f"Analyse the second part: px4fuse compare LOG --start {until:.0f}. Let the clocks "
+            "synchronise for one minute before take-off.",
+            {"until_s": until, "latency_s": latency},
+            ((float(age.index[0]), until),),
+        )
+    elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_PURE_SHARE:
+        yield warning(
+            "source_stamps_of_arrival",
+            f"The timestamps of {name} are arrival times. The sender was never synchronised with "
+            "the autopilot (TIMESYNC), so every position is late by its latency.",
+            ANSWER_TIMESYNC,
+            {"until_s": float(age.index[-1])},
+        )
 
 
 def until_synchronised(analysis: Analysis) -> tuple[float, float] | None:
-    """When stamps of arrival end, and the latency after that (s); None where there is no such time.
+    """End of the arrival times and the latency after it (s); None if there is no such change.
 
-    The cut leaves as few samples as possible on the wrong side.
+    The end is chosen so that the fewest samples are on the wrong side.
     """
     age = _age_s(analysis)
     if age is None:
         return None
-    arrival = (age.abs() < ARRIVAL_AGE_S).to_numpy()
+    arrival = (age.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
     wrong: Array = np.cumsum(~arrival) + np.sum(arrival) - np.cumsum(arrival)
     cut = int(np.argmin(wrong)) + 1
     if np.mean(arrival) >= MIN_PURE_SHARE or min(cut, len(age) - cut) < MIN_SAMPLES:
         return None
     latency = float(age.iloc[cut:].median())
     pure = min(np.mean(arrival[:cut]), np.mean(~arrival[cut:])) >= MIN_PURE_SHARE
-    return (float(age.index[cut]), latency) if pure and latency >= LATENCY_S else None
+    return (float(age.index[cut]), latency) if pure and latency >= MIN_LATENCY_S else None
 
 
 def _age_s(analysis: Analysis) -> pd.Series | None:
-    """Age of each position as it was published; None where the log does not show it."""
+    """Age (s) of each position at publication; None if the log does not contain it."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if not isinstance(record, FusionRecord) or source.origin.reconstructed or source.clock_map:

@@ -1,7 +1,7 @@
-"""What happened on a flight, in up to three sentences made from its numbers and findings.
+"""Summary of a flight: up to three paragraphs made from its numbers and findings.
 
-How well both filters did along the axis of the lab, then what weighs most: the worst findings, and
-why EKF2 differs.
+The first one states the errors and the consistency of KF and EKF2 along the main axis. Then follow
+the most severe findings, and the explanation of the difference KF - EKF2.
 """
 
 from collections.abc import Iterator, Mapping
@@ -12,23 +12,23 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import interventions
 from px4fuse.comparison.interventions import Intervention, Of, cause_of, interventions_on
-from px4fuse.comparison.model import FILTERS, AgainstTruth, AxisComparison, Difference, FilterName
+from px4fuse.comparison.model import FILTERS, AgainstTruth, Difference, FilterName
 from px4fuse.ekf2.walk import Why
 from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.causes import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
-from px4fuse.findings.model import Finding
-from px4fuse.findings.since import FINDINGS_OF_CAUSE, format_cause, format_effect, kind_of
+from px4fuse.findings.model import Finding, format_percent
+from px4fuse.findings.since import FINDINGS_OF_CAUSE, format_rerun, kind_of
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.plain import capitalise_first, format_excess, format_length
+from px4fuse.plain import capitalise_first, format_factor
 from px4fuse.readers.px4_ekf2 import OTHER_AIDING
 
-MAX_SENTENCES = 3
-# What the first sentence tells already
-IN_FIRST_SENTENCE = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
-# What a source can have that no setting and no outlier stands for
+MAX_PARAGRAPHS = 3  # paragraphs of the summary
+# Findings whose content is in the first paragraph
+IN_FIRST_PARAGRAPH = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
+# Faults of the source that no noise setting and no outlier removal corrects
 NOISE_SHAPE_FINDINGS = frozenset(
     (
         "source_axes_unequal",
@@ -41,14 +41,15 @@ NOISE_SHAPE_FINDINGS = frozenset(
         "source_smoothed",
     )
 )
-# What looks like noise of the acceleration, which it turns
+# Faults that rotate the acceleration, which looks like process noise
 MISALIGNMENT_FINDINGS = frozenset(("ekf2_heading_wrong", "source_frame_turned"))
-# What weighs less than why EKF2 differs
+# Findings listed after the explanation of the difference KF - EKF2
 EFFECT_FINDINGS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
+NAMES: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
 
 
 def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
-    """What happened, the most important first.
+    """Summarise a flight, the most important first.
 
     Parameters
     ----------
@@ -59,7 +60,7 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        One to three sentences.
+        One to three paragraphs of short sentences.
     """
     axis = analysis.main.axis.name
     cause_by_filter = {
@@ -69,14 +70,16 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     shapes = {
         one.id for one in findings if one.id in NOISE_SHAPE_FINDINGS and one.severity != "info"
     }
-    # what smooths makes positions late, which is no clock
-    own = (FRAME,) if "source_smoothed" in shapes else (CLOCK, FRAME)
-    turned = any(one.id in MISALIGNMENT_FINDINGS and one.severity != "info" for one in findings)
+    # a low pass also delays the positions, so a time offset is then not the cause
+    allowed_kinds = (FRAME,) if "source_smoothed" in shapes else (CLOCK, FRAME)
+    is_misaligned = any(
+        one.id in MISALIGNMENT_FINDINGS and one.severity != "info" for one in findings
+    )
     for owner, cause in cause_by_filter.items():
         kind = kind_of(analysis, cause)
-        if (shapes and kind not in own) or (turned and kind == PROCESS):
+        if (shapes and kind not in allowed_kinds) or (is_misaligned and kind == PROCESS):
             cause_by_filter[owner] = None
-    known = IN_FIRST_SENTENCE
+    known = IN_FIRST_PARAGRAPH
     for cause in filter(None, cause_by_filter.values()):
         known |= FINDINGS_OF_CAUSE.get(kind_of(analysis, cause), frozenset())
     if cause_by_filter["kf"] is not None and not interventions.SETTING_CHANGES.isdisjoint(
@@ -92,141 +95,144 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
         one.id == "errors_larger_than_claimed" and one.caused_by for one in findings
     )
     sentences = [
-        _verdict_sentence(
-            analysis,
-            _filter_verdict(analysis, "kf", cause_by_filter, has_explanation),
-            _filter_verdict(analysis, "ekf2", cause_by_filter, has_explanation),
-        ),
-        *(reduction_sentences := tuple(_difference_after_change(analysis, cause_by_filter))),
+        _verdict_paragraph(analysis, cause_by_filter, has_explanation),
+        *(reduction_texts := tuple(_difference_after_change(analysis, cause_by_filter))),
         *(_finding_sentence(analysis, one) for one in causes if one.id not in EFFECT_FINDINGS),
-        *_differences(analysis, has_difference_sentence=bool(reduction_sentences)),
+        *_differences(analysis, has_difference_text=bool(reduction_texts)),
         *(_finding_sentence(analysis, one) for one in causes if one.id in EFFECT_FINDINGS),
     ]
-    return tuple(sentences[:MAX_SENTENCES])
+    return tuple(sentences[:MAX_PARAGRAPHS])
 
 
 def _failed_statistic(analysis: Analysis, owner: FilterName) -> Of:
-    """What of a filter asks for a cause: an error larger than it claims, or its variance."""
+    """Statistic that a cause has to explain: mean NEES if the error exceeds σ, else mean NIS."""
     return (
         "nees" if interventions.error_beyond_reported_sigma(analysis.main.filters[owner]) else "nis"
     )
 
 
-def _verdict_sentence(analysis: Analysis, kf_verdict: str, ekf2_verdict: str) -> str:
-    """How far off both filters were, and whether they knew it."""
-    result, source = analysis.main, analysis.source
-    along = capitalise_first(f"{_flown(analysis)}along {result.axis.called}")
-    ours_off, ekf2_off = (_error(result, owner) for owner in FILTERS)
-    our_filter = f"our filter was {ours_off}{kf_verdict}"
-    if isinstance(result.ekf2_state, Unavailable):
-        return f"{along} {our_filter}; there is no EKF2 beside it: {result.ekf2_state.reason}."
-    if ours_off and ekf2_off:
-        return f"{along} EKF2 was {ekf2_off}{ekf2_verdict}; {our_filter}."
-    difference_text = "both were flown"
-    if isinstance(result.difference, Difference):
-        difference_text = (
-            f"ours and EKF2 are {format_length(result.difference.position_rmse_m)} apart (RMS)"
-        )
-    if source.origin.may_drift:
-        verdict_text = f"both follow {source.name}, which may drift"
-    elif kf_verdict == ekf2_verdict:
-        verdict_text = f"by their own innovations both {_verb(result, 'kf', 'are ')}{kf_verdict}"
-    else:
-        verdict_text = (
-            f"by its own innovations EKF2 {_verb(result, 'ekf2')}{ekf2_verdict}, our filter "
-            f"{_verb(result, 'kf')}{kf_verdict}"
-        )
-    return f"{along} {difference_text}, and the log has no truth: {verdict_text}."
+def format_metres(metres: float) -> str:
+    """Format a length with two decimals, three below 0.1 m.
+
+    >>> format_metres(0.0612), format_metres(0.3), format_metres(2.24)
+    ('0.061 m', '0.30 m', '2.24 m')
+    """
+    return f"{metres:.{3 if metres < 0.0995 else 2}f} m"
 
 
-def _flown(analysis: Analysis) -> str:
-    """What was not much of a flight, before a sentence about it."""
-    if analysis.flight.airborne == ():
-        return "the vehicle never took off: "
-    return "the vehicle hovered: " if hardly_moved(analysis) else ""
-
-
-def _verb(result: AxisComparison, owner: FilterName, verb: str = "is ") -> str:
-    """What stands before words of :func:`_filter_verdict`; "cannot be judged" has a verb of its own."""
-    return "" if isinstance(result.filters[owner], Unavailable) else verb
-
-
-def _error(result: AxisComparison, owner: FilterName) -> str:
-    """Error of one filter, with what joins it to the next phrase; empty without truth."""
-    truth = result.filters[owner].truth
-    if not isinstance(truth, AgainstTruth):
-        return ""
-    return f"{format_length(truth.position_rmse_m)} from the truth (RMS) and "
-
-
-def _filter_verdict(
-    analysis: Analysis,
-    owner: FilterName,
-    causes: Mapping[FilterName, Intervention | None],
-    has_explanation: bool,
+def _verdict_paragraph(
+    analysis: Analysis, causes: Mapping[FilterName, Intervention | None], has_explanation: bool
 ) -> str:
-    """Whether a filter's variance is what its innovations, and the truth, show; and why not."""
-    statement, cause = analysis.main.filters[owner], causes[owner]
-    since = format_cause(analysis, cause)
-    if owner == "kf" and cause and causes["ekf2"] and cause.change == causes["ekf2"].change:
-        since = f", for the same reason ({format_effect(cause)})"
-    # a drift, and what no setting stands for, are told by themselves
-    is_explained_elsewhere = has_explanation or analysis.source.origin.may_drift
-    axis = analysis.main.axis.name
-    tried = interventions_on(analysis.causes, owner, axis, _failed_statistic(analysis, owner))
-    unexplained = (
-        ", which nothing that was tried explains" if tried and not is_explained_elsewhere else ""
-    )
-    if any(each.denied_by_truth for each in tried):
-        unexplained = ", as its errors against the truth ask for"
-    if hidden := interventions.error_beyond_reported_sigma(statement):
-        return f"claimed {format_length(hidden.reported_sigma_m)}{since or unexplained}"
+    """Error and consistency of EKF2 and KF along the main axis, each with its re-run."""
+    result, source = analysis.main, analysis.source
+    along = f"Along {result.axis.called}"
+    sentences = [_limited_flight(analysis)]
+    filters: tuple[FilterName, ...] = ("ekf2", "kf")
+    if isinstance(result.ekf2_state, Unavailable):
+        filters = ("kf",)
+    elif not all(isinstance(result.filters[owner].truth, AgainstTruth) for owner in filters):
+        difference_text = f"{along} KF and EKF2 are compared"
+        if isinstance(result.difference, Difference):
+            difference_m = format_metres(result.difference.position_rmse_m)
+            difference_text = f"{along} KF and EKF2 differ by {difference_m} RMS"
+        sentences.append(f"{difference_text}. The log contains no ground truth.")
+        if source.origin.may_drift:
+            sentences.append(f"Both filters follow {source.name}, which may drift.")
+            filters = ()
+    for owner in filters:
+        sentences.append(_filter_sentence(analysis, owner))
+        sentences.append(_explanation(analysis, owner, causes[owner], has_explanation))
+    if isinstance(result.ekf2_state, Unavailable):
+        sentences.append(f"The log contains no EKF2 state: {result.ekf2_state.reason}.")
+    return " ".join(filter(None, sentences))
+
+
+def _limited_flight(analysis: Analysis) -> str:
+    """Sentence about a flight with little motion, else ""."""
+    if analysis.flight.airborne == ():
+        return "The vehicle never took off."
+    return "The vehicle hovered." if hardly_moved(analysis) else ""
+
+
+def _filter_sentence(analysis: Analysis, owner: FilterName) -> str:
+    """Position RMSE and consistency of one filter, without its causes."""
+    name, statement, along = NAMES[owner], analysis.main.filters[owner], analysis.main.axis.called
     if isinstance(statement, Unavailable):
-        return "cannot be judged, since the log has no innovations or too few"
-    if statement.verdict == "consistent":
-        return "honest about it"
-    how = "too modest" if statement.sigma_factor > 1.0 else "too sure of itself"
-    return f"{format_excess(statement.sigma_error_factor)} {how}{since or unexplained}"
+        verdict = "is not tested for consistency: the log has no innovations or too few"
+    elif statement.verdict == "consistent":
+        verdict = "is consistent"
+    else:
+        confidence, size = (
+            ("underconfident", "large")
+            if statement.sigma_factor > 1.0
+            else ("overconfident", "small")
+        )
+        factor = format_factor(statement.sigma_error_factor)
+        verdict = f"is {confidence}: σ is {factor} times too {size}"
+    if not isinstance(statement.truth, AgainstTruth):
+        return f"By its innovations along {along} {name} {verdict}."
+    rmse = format_metres(statement.truth.position_rmse_m)
+    if hidden := interventions.error_beyond_reported_sigma(statement):
+        verdict = f"reports σ {format_metres(hidden.reported_sigma_m)}"
+        return f"Along {along} {name} has a position RMSE of {rmse}, but {verdict}."
+    return f"Along {along} {name} has a position RMSE of {rmse} and {verdict}."
+
+
+def _explanation(
+    analysis: Analysis, owner: FilterName, cause: Intervention | None, has_explanation: bool
+) -> str:
+    """Re-run that explains an inconsistent filter, or a note that no change does, else ""."""
+    statement, axis = analysis.main.filters[owner], analysis.main.axis.name
+    is_hidden = interventions.error_beyond_reported_sigma(statement)
+    if isinstance(statement, Unavailable) or (statement.verdict == "consistent" and not is_hidden):
+        return ""
+    if cause is not None:
+        return f"{capitalise_first(format_rerun(analysis, cause))}."
+    tested = interventions_on(analysis.causes, owner, axis, _failed_statistic(analysis, owner))
+    if any(each.denied_by_truth for each in tested):
+        return "The errors against ground truth need this σ."
+    # drift and faults of the source are listed as findings
+    is_explained_elsewhere = has_explanation or analysis.source.origin.may_drift
+    return "No tested change explains this." if tested and not is_explained_elsewhere else ""
 
 
 def _finding_sentence(analysis: Analysis, finding: Finding) -> str:
-    """What a finding says is wrong, with when."""
+    """Headline of a finding with its time."""
     if finding.id == "source_gap":
         return _gap_sentence(analysis, finding)
-    when = f" ({finding.when})" if finding.when and not finding.says_when else ""
-    return f"{finding.headline}{when}."
+    when = finding.when if finding.when and not finding.has_time_in_message else ""
+    return f"{finding.headline}{f' ({when})' if when else ''}."
 
 
 def _gap_sentence(analysis: Analysis, finding: Finding) -> str:
-    """The longest silence of the source, and where it left both filters."""
+    """Longest gap in the source, with the position error of KF and EKF2 at its end."""
     start, end = max(finding.spans_s, key=lambda span: span[1] - span[0])
     just_before, result = end - 1e-6, analysis.main
     axis, ekf2 = result.axis, result.ekf2_state
     kf_position_m = float(state_at(result.replay, np.array([start, just_before]))[0][1])
     after = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, just_before)])
-    true_position_m, against = after, "from the next position"
+    true_position_m, quantity = after, "distance to the next position"
     if isinstance(result.truth, pd.DataFrame):
         true = result.truth["position_m"]
-        true_position_m, against = float(np.interp(end, true.index, true)), "from the truth"
-    filters_text, error_text = (
-        "the filter coasted on the IMU",
-        f"ours was {format_length(abs(kf_position_m - true_position_m))}",
-    )
+        true_position_m, quantity = float(np.interp(end, true.index, true)), "position error"
+    filters_text = "KF relied on the IMU"
+    errors_text = f"{format_metres(abs(kf_position_m - true_position_m))} (KF)"
     if isinstance(ekf2, pd.DataFrame) and len(before := ekf2["position_m"].loc[:end]):
-        filters_text = "both filters coasted on the IMU"
+        filters_text = "KF and EKF2 relied on the IMU"
         if others := _fused(analysis.flight.ekf2, start, end):
-            filters_text = f"ours coasted on the IMU, EKF2 went on by {' and '.join(others)}"
-        error_text += f" and EKF2 {format_length(abs(float(before.iloc[-1]) - true_position_m))}"
+            filters_text = f"KF relied on the IMU, EKF2 also on {' and '.join(others)}"
+        ekf2_error_m = abs(float(before.iloc[-1]) - true_position_m)
+        errors_text += f" and {format_metres(ekf2_error_m)} (EKF2)"
     count = len(finding.spans_s)
-    more = f" (the longest of {count} times)" if count > 1 else ""
+    longest = f" (the longest of {count})" if count > 1 else ""
     return (
-        f"From {start:.0f} s to {end:.0f} s the source was silent{more}: {filters_text}; at the end {error_text} "
-        f"{against}."
+        f"Gap in the position source from {start:.0f} s to {end:.0f} s{longest}. In it "
+        f"{filters_text}. At its end the {quantity} was {errors_text}."
     )
 
 
 def _fused(ekf2: Ekf2 | Unavailable, start_s: float, end_s: float) -> list[str]:
-    """What EKF2 fused through a span, without a break of half of it, of what tells of motion."""
+    """Labels of aids that measure motion and that EKF2 fused without a break of half the span."""
     found = []
     for name in (EV_POS.name, *OTHER_AIDING):
         log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
@@ -241,7 +247,7 @@ def _fused(ekf2: Ekf2 | Unavailable, start_s: float, end_s: float) -> list[str]:
 def _difference_after_change(
     analysis: Analysis, causes: Mapping[FilterName, Intervention | None]
 ) -> Iterator[str]:
-    """What putting the cause right does to how far both filters are apart."""
+    """Difference KF - EKF2 before and after the re-run with the cause corrected."""
     reductions = [
         intervention
         for owner, cause in causes.items()
@@ -252,21 +258,20 @@ def _difference_after_change(
     ]
     if reductions:
         most = max(reductions, key=lambda intervention: intervention.explains)
-        owner = "our filter" if most.filter == "kf" else "EKF2"
         yield (
-            f"Put right in {owner}, that brings both from {format_length(most.before)} to "
-            f"{format_length(most.after)} apart (RMS, replayed)."
+            f"Re-run of {NAMES[most.filter]} with this correction: difference KF - EKF2 "
+            f"{most.before:.2f} → {most.after:.2f} m RMS."
         )
 
 
-def _differences(analysis: Analysis, *, has_difference_sentence: bool) -> Iterator[str]:
-    """Why EKF2 differs, and what a loop shows."""
+def _differences(analysis: Analysis, *, has_difference_text: bool) -> Iterator[str]:
+    """Loop closure error, and the explanation of the difference KF - EKF2."""
     loop, why = analysis.loop, analysis.why.get(analysis.main.axis.name)
     if isinstance(loop, Loop) and (gap := loop.closure_error_m) is not None:
         length = loop.path_length_m
         yield (
-            f"The odometry fails to close its loop by {format_length(gap)} after "
-            f"{format_length(length)} ({gap / length:.1%})."
+            f"The odometry has a loop closure error of {format_metres(gap)} after {length:.0f} m "
+            f"({format_percent(gap / length, 1)})."
         )
-    if isinstance(why, Why) and not has_difference_sentence:
-        yield why.cause  # wrong stamps are a finding of their own
+    if isinstance(why, Why) and not has_difference_text:
+        yield why.cause

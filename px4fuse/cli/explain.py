@@ -1,0 +1,79 @@
+"""``px4fuse explain``: the page of a finding in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import click
+
+from px4fuse.cli.outputs import write_and_print
+from px4fuse.errors import SettingsError, suggest_name
+
+if TYPE_CHECKING:
+    from px4fuse.report.page import Page
+
+
+@click.command()
+@click.argument("finding", required=False)
+def explain(finding: str | None) -> None:
+    """Explain a finding: meaning, example, action, false alarms. Without FINDING, list all.
+
+    FINDING is an id that px4fuse compare prints, such as source_outliers.
+    """
+    write_and_print({}, _list_page() if finding is None else _finding_page(finding))
+
+
+def _list_page() -> Page:
+    from px4fuse.findings.model import CATALOGUE, GROUPS
+    from px4fuse.report.page import Page
+
+    page = Page()
+    for group in GROUPS:
+        page.heading(group[0].upper() + group[1:])
+        rows = [(name, entry.title) for name, entry in CATALOGUE.items() if entry.group == group]
+        page.table(("id", "finding"), rows)
+    return page
+
+
+def _finding_page(typed: str) -> Page:
+    from px4fuse.findings.causes import CONSEQUENCES
+    from px4fuse.findings.model import CATALOGUE, load_examples
+    from px4fuse.report.page import Page
+
+    name = typed.lower().replace("-", "_")
+    if name not in CATALOGUE:
+        raise SettingsError(
+            f"{typed!r} is not a finding",
+            f"{suggest_name(name, CATALOGUE)}For a list, run px4fuse explain.",
+        )
+    entry, example = CATALOGUE[name], load_examples()[name]
+    causes = [cause for cause, effects in CONSEQUENCES.items() if _has_id(effects, name)]
+    effects = dict.fromkeys(effect.partition(":")[0] for effect in CONSEQUENCES.get(name, ()))
+    page = Page()
+    page.write(f"{entry.title}  [{name}]", bold=True)
+    page.labelled("Meaning", entry.meaning)
+    page.labelled("Example", example.message)
+    page.labelled("Action", example.remedy)
+    for label, names in {"Causes": causes, "Effects": effects}.items():
+        if names:
+            page.labelled(label, ", ".join(names))
+    page.labelled("Rates", *_rates(example.clean_flights, example.false_alarms, example.detection))
+    return page
+
+
+def _has_id(effects: tuple[str, ...], name: str) -> bool:
+    return any(effect.partition(":")[0] == name for effect in effects)
+
+
+def _rates(clean_flights: int, false_alarms: int, detection: Mapping[str, float]) -> list[str]:
+    """Format the false alarm rate and the detection rates on simulated flights."""
+    if not clean_flights:
+        return ["Not measured: this finding states a fact of the log or of a setting."]
+    detected = "; ".join(
+        f"{mistake}: {100.0 * share:.0f} %" for mistake, share in detection.items()
+    )
+    return [
+        f"False alarms on {false_alarms} of {clean_flights} simulated flights without a mistake.",
+        f"Found on simulated flights with {detected}.",
+    ]
