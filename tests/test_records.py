@@ -12,8 +12,8 @@ import pytest
 
 import px4fuse
 
-# Buffers that are filled while something is read, written or replayed
-FILLED = {"Packer", "_Fusion"}
+# Buffers that are filled while something is read, written, replayed or compared
+FILLED = {"Packer", "_Fusion", "_Walk"}
 
 
 def classes() -> Iterator[type]:
