@@ -25,7 +25,7 @@ RUNS = [
     ("compare l.ulg --position pos.csv", "l.ulg pos.csv", "--json -o.pdf", None),
     ("compare l.ulg --notes notes.md --answers form.toml", "notes.md form.toml", "--json", None),
     ("diff r.pdf q.json", "r.pdf q.json", "--json", None),
-    ("explore l.ulg k.ulg", "l.ulg k.ulg", "-o.html", None),
+    ("explore l.ulg", "l.ulg", "-o.html", None),
     ("info l.ulg", "l.ulg", "--json", None),
     ("tune l.ulg --position pos.csv", "l.ulg pos.csv", "--json", None),
     ("sync l.ulg", "l.ulg", "--json", None),

@@ -104,8 +104,6 @@ REFUSED = {
     "log and answer": ("simulate -o x.ulg --answer x.ulg", "name the same file"),
     "page of nothing": ("explore missing.ulg", "missing.ulg"),
     "page as PDF": ("explore a.ulg -o page.pdf", "ends in .html"),
-    "page of three": ("explore a.ulg a.ulg a.ulg", "give one, or two"),
-    "page of two and more": ("explore a.ulg a.ulg --mavlink a.tlog", "only one LOG"),
     "too long a name": (f"info a.ulg --json {'x' * 300}.json", "File name too long"),
     "no name": ("extract a.ulg -o ''", "the name is empty"),
     "no name of a log": ("batch '' -o out", "the name of a log is empty"),
