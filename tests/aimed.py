@@ -25,7 +25,7 @@ RUNS = [
     ("compare l.ulg --position pos.csv", "l.ulg pos.csv", "--json -o.pdf", None),
     ("compare l.ulg --notes notes.md --answers form.toml", "notes.md form.toml", "--json", None),
     ("diff r.pdf q.json", "r.pdf q.json", "--json", None),
-    ("explore l.ulg", "l.ulg", "-o.html", None),
+    ("explore l.ulg --position pos.csv", "l.ulg pos.csv", "-o.html", None),
     ("info l.ulg", "l.ulg", "--json", None),
     ("tune l.ulg --position pos.csv", "l.ulg pos.csv", "--json", None),
     ("sync l.ulg", "l.ulg", "--json", None),
@@ -60,7 +60,7 @@ def made_desk(folder: Path) -> Path:
     log = make_log("v1.16", 20.0).encode()
     report = report_of("Ada", "1")
     for name, content in {
-        "l.ulg": log, "logs/x.ulg": log, "k.ulg": make_log("v1.14", 20.0).encode(),
+        "l.ulg": log, "logs/x.ulg": log,
         "m.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes()[:200_000],
         "pos.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
         "notes.md": b"words", "form.toml": form_text("l.ulg", "0" * 64).encode(),
