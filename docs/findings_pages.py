@@ -274,7 +274,7 @@ def picture(name: str, example: Example, folder: Path) -> str:
     figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
     for axes, panel in zip(panels, (error, INNOVATIONS, SIGMA_P), strict=True):
         panel.draw(axes, shown)
-        axes.set_ylabel(fill(panel.named(shown), LABEL_WIDTH))
+        axes.set_ylabel(fill(panel.full_title(shown), LABEL_WIDTH))
     panels[0].set_title(shown.axis.name)
     panels[-1].set_xlabel("time (s)")
     figure.savefig(folder / f"{name}.png", dpi=70)
