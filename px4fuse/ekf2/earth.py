@@ -1,9 +1,11 @@
 """Earth rotation rate and curvature radii as used by EKF2.
 
 From v1.16 on EKF2 stores latitude and longitude and converts with curvature radii, while positions
-in metres are published on a sphere. Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp``
-(computeRadiiOfCurvature; its meridian radius uses q to the power 2.5, an ellipsoid has 1.5),
-``EKF/ekf_helper.cpp`` (calcEarthRateNED), ``EKF/ekf.cpp`` (predictState).
+in metres are published on a sphere.
+
+Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature; its meridian
+radius uses q to the power 2.5, an ellipsoid has 1.5), ``EKF/ekf_helper.cpp`` (calcEarthRateNED),
+``EKF/ekf.cpp`` (predictState).
 """
 
 import numpy as np

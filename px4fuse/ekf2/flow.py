@@ -2,9 +2,10 @@
 
 The log contains a low-pass filtered velocity; it is converted to means between two rows. Each mean
 is fused at the next event, after adding the velocity change measured by the IMU. The range to the
-ground is the logged one. Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow``
-(``optical_flow_control.cpp``: velocity and low-pass filter; ``optical_flow_fusion.cpp``: R and
-gate).
+ground is the logged one.
+
+Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity and
+low-pass filter; ``optical_flow_fusion.cpp``: R and gate).
 """
 
 from dataclasses import replace

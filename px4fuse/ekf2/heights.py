@@ -2,7 +2,9 @@
 
 EKF2 estimates a bias for the sensor that is not the height reference. Barometer samples between two
 events are fused at the later event; the vertical motion in between follows from the state and the
-IMU. Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
+IMU.
+
+Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
 ``gnss/gnss_height_control.cpp``), before v1.16 ``EKF/baro_height_control.cpp`` and
 ``EKF/gnss_height_control.cpp``.
 """

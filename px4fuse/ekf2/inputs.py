@@ -134,7 +134,8 @@ class FusionRules:
     bias_floor : float or None
         Lower limit of the accelerometer bias variance (m²/s⁴), if the release has one.
     horizon_by_delay : bool
-        True if the largest delay parameter sets the fusion horizon; else EKF2_DELAY_MAX (from v1.15).
+        True if the largest delay parameter sets the fusion horizon; else EKF2_DELAY_MAX (from
+        v1.15).
     """
 
     start_interval_s: float
@@ -204,8 +205,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     ----------
     flight : Flight
     doubtful : mapping from PX4's name of an aid to str
-        Aids whose replay disagrees with the log, with the reason. For a height sensor the logged EKF2
-        height is used; optical flow does not bridge gaps; vision besides GNSS is not fused.
+        Aids whose replay disagrees with the log, with the reason. For a height sensor the logged
+        EKF2 height is used; optical flow does not bridge gaps; vision besides GNSS is not fused.
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):

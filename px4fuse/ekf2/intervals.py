@@ -2,11 +2,12 @@
 
 The attitude and biases of a replay with changed parameters hardly differ from the logged ones. The
 transition about the nominal attitude is therefore used for all settings. All intervals are
-integrated together, one prediction step at a time. Error state: attitude error δθ (earth frame,
-estimate = exp(δθ) · nominal), velocity, position, errors of gyro bias b_g and accelerometer bias
-b_a. Equations as in PX4-Autopilot ``EKF/python/ekf_derivation/derivation.py`` (predict_covariance),
-``EKF/covariance.cpp`` and ``EKF/ekf.cpp`` (predictState); Δt is the step, a = R f the specific
-force in NED:
+integrated together, one prediction step at a time.
+
+Error state: attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity, position,
+errors of gyro bias b_g and accelerometer bias b_a. Equations as in PX4-Autopilot
+``EKF/python/ekf_derivation/derivation.py`` (predict_covariance), ``EKF/covariance.cpp`` and
+``EKF/ekf.cpp`` (predictState); Δt is the step, a = R f the specific force in NED:
 
     δθ ← δθ - R Δt δb_g            v ← v - [a]× Δt δθ - R Δt δb_a + (a + g) Δt
     p ← p + (v_before + v_after) Δt / 2

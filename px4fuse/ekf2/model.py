@@ -87,8 +87,8 @@ class Model:
     agreement : Agreement
         Agreement of ``flown`` with the log.
     runs : list of StretchRun
-        One run per stretch with the variants already computed: as flown, with logged rejections, and
-        those of ``besides``.
+        One run per stretch with the variants already computed: as flown, with logged rejections,
+        and those of ``besides``.
     """
 
     flight: Flight

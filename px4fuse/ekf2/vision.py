@@ -1,12 +1,11 @@
-"""Positions of external vision as EKF2 fuses them besides GNSS: about a frame of their own.
+"""Fusion of external vision besides GNSS in the EKF2 replay, with a bias of the vision frame.
 
-How far that frame is from EKF2's is a bias, which follows within seconds, so that vision tells how
-the vehicle moves, and GNSS where it is. Without GNSS there is no bias: EKF2 then resets its
-position to vision's. Samples between two events are fused at the later one, as measurements of
-position and velocity then: where the vehicle was before is known from both and the IMU.
+The bias adapts within seconds, so vision determines the relative motion and GNSS the position.
+Without GNSS there is no bias: EKF2 then resets its position to that of vision. Samples between two
+events are fused at the later event; the motion in between follows from the state and the IMU.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp``; before v1.16
-``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision comes after GNSS and heights).
+``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,8 +22,8 @@ from px4fuse.ekf2.stretches import Stretch, pad_samples, samples_by_event
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 
 SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
-# After so long without a sample fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp); after so long
-# outside the gate the bias, or the position, begins anew (no_aid_timeout_max, common.h)
+# s without a sample after which fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp); s outside the
+# gate after which EKF2 resets the bias or the position (no_aid_timeout_max, common.h)
 STOP_S, FAILING_S = 0.4, 1.0
 COLUMNS = [
     "innovation_north_m",
@@ -40,10 +39,10 @@ COLUMNS = [
 def vision_samples(
     inputs: Inputs, stretch: Stretch, end: IntArray, settings: Mapping[str, float], horizon_s: float
 ) -> Array:
-    """Samples by the event at which they are fused, shape (8, k, E).
+    """Return vision samples by the event at which they are fused, shape (8, k, E).
 
-    North and east at the event as :func:`~px4fuse.ekf2.stretches.samples_by_event` has them, age then, time
-    of measurement, time of fusion, the variances that the sender states, and 1.
+    Rows: north and east as in :func:`~px4fuse.ekf2.stretches.samples_by_event`, age, measurement
+    time, fusion time, reported variances north and east, and 1.
     """
     vision, time_s = inputs.vision, stretch.time_s
     assert vision is not None
@@ -52,7 +51,7 @@ def vision_samples(
     step = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
     is_usable = (step > 0) & (step < len(time_s)) & (due_s < taken_s + MAX_LATE_S)
     is_usable &= np.isfinite(vision.position_m[:, 0])
-    is_usable[:-1] &= step[1:] > step[:-1]  # of two samples in one step the newer one is fused
+    is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses the newer of two samples in one step
     step = step[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.place]) - inputs.imu_offset_m
     position_m = (vision.position_m[is_usable] - stretch.rotation[step] @ lever_arm_m)[:, :2]
@@ -61,28 +60,28 @@ def vision_samples(
 
 
 class VisionFilter:
-    """The positions of vision in S variants through one stretch, event by event.
+    """Vision fusion of S variants through one stretch, event by event.
 
     Parameters
     ----------
     stretch : Stretch
     sent : sequence of S ndarrays, shape (8, k, E)
-        As :func:`vision_samples` has them.
+        From :func:`vision_samples`.
     on : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
-        Whether it is still there.
-    knob : mapping from PX4's name to ndarray, shape (S,)
+        True while the aid is fused.
+    parameters : mapping from PX4's name to ndarray, shape (S,)
     gated, reported : ndarray of bool, shape (S,)
-        Whether there is a gate, and whether the sender's variances are used.
+        True if the gate is applied; True if reported variances are used.
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k, 7, S)
-        Of each sample innovation (m, measurement minus state) and its variance, north and east, and
-        whether it was rejected, fused, and the position reset to it; NaN where EKF2 did not try.
+        For each sample the innovation (m, measurement minus state) and its variance, north and
+        east; 1 if rejected, fused, reset; NaN if EKF2 did not evaluate it.
     moved_m : ndarray, shape (E, S, 2)
-        By how much the position was reset at each event.
+        Position reset at each event.
     fused_s : ndarray, shape (S,)
-        When the position was last fused or reset.
+        Time of the last position fusion or reset.
     """
 
     def __init__(
@@ -101,7 +100,7 @@ class VisionFilter:
         self.update_log = np.full((events, count, 7, size), np.nan)
         self.moved_m = np.zeros((events, size, 2))
         has_sample = (samples[7] > 0.0) & on[EV_POS.name]
-        # those of the event's own step come after GNSS
+        # samples of the event's step are fused after GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.gated, self.alone = gated, ~on[GNSS_POS.name]
         self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
@@ -120,7 +119,7 @@ class VisionFilter:
         self.fused_s, self.was_alone = np.full(size, start_s), self.alone[0]
 
     def updates(self, variant: int, end_s: Array) -> pd.DataFrame:
-        """What one variant did with each sample, by the time of measurement as EKF2 takes it.
+        """Return the updates of one variant at EKF2's measurement times.
 
         ``end_s`` is the time of each event.
         """
@@ -131,16 +130,16 @@ class VisionFilter:
         return frame.assign(fused_at_s=end_s[event])
 
     def fuse(self, e: int, x: Array, P: Array, own_step: bool, fix_s: Array) -> tuple[Array, Array]:
-        """State and covariance after the samples of one event.
+        """Return state and covariance after the samples of one event.
 
         Parameters
         ----------
         e : int
         x, P : ndarray
         own_step : bool
-            Of the event's own step, or those before.
+            True: samples of the event's step; False: earlier ones.
         fix_s : ndarray, shape (S,)
-            When a position was last fused otherwise.
+            Time of the last position fusion from GNSS.
         """
         for place, has_sample in enumerate(self.has_sample[own_step][:, e]):
             if has_sample.any():
@@ -154,7 +153,7 @@ class VisionFilter:
         alone, noise_m2 = self.alone[e], self.noise_m2[place, e]
         HP = P[:, HORIZONTAL] - age_s[:, None] * P[:, SPEED]
         S = HP[:, :, HORIZONTAL] - age_s[:, None] * HP[:, :, SPEED]
-        diagonal = S.reshape(len(S), -1)[:, ::3]  # a view
+        diagonal = S.reshape(len(S), -1)[:, ::3]  # a view of the diagonal of S
         distance_m = self.position_m[place, e] - x[:, HORIZONTAL] + age_s * x[:, SPEED]
         sample_state = now_s[:, None], has_sample[:, None], ~alone[:, None]
         nu, R = self.bias.remove_bias(distance_m, diagonal.copy(), noise_m2, *sample_state)
@@ -168,7 +167,7 @@ class VisionFilter:
         )
         reset = restart & (alone | (is_failing & (now_s - fix_s > FAILING_S)))
         is_evaluated = has_sample & ~has_restarted | reset
-        # a reset leaves nothing of the innovation
+        # the innovation after a reset is 0
         update_log = *np.where(reset, 0.0, nu.T), *diagonal.T, outside & ~reset, is_fused, reset
         self.update_log[e, place] = np.where(is_evaluated, np.stack(update_log), np.nan)
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
@@ -194,7 +193,7 @@ class VisionFilter:
 def set_states(
     x: Array, P: Array, which: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
-    """Set some states of some variants to what was measured, with its variance."""
+    """Set states of selected variants to measured values, with their variance."""
     x[which, rows] = value[which]
     P[which, :, rows] = 0.0
     P[which, rows, :] = 0.0
