@@ -1,4 +1,4 @@
-"""What a flight of EKF2's model looks like in the topics of PX4 v1.16."""
+"""Conversion of a run of the EKF2 model to topics of PX4 v1.16."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic, topic
 
-# Rates (Hz) of v1.16 (logged_topics.cpp). PX4's own simulation logs estimator_aid_src_ev_pos at
-# full rate, a vehicle only at this one
+# Hz; logging rates of v1.16 (logged_topics.cpp). PX4's simulation logs estimator_aid_src_ev_pos at
+# full rate, a vehicle at 2 Hz
 VEHICLE_AID_SOURCE_HZ = 2.0
 STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
 MAGNETOMETER_HZ, OTHER_AIDS_HZ = 2.0, 2.0
@@ -26,23 +26,23 @@ PUBLICATION_DELAY_US = 100
 
 @dataclass(frozen=True)
 class TopicTrack:
-    """What the model did, at the end of each prediction step, shape (n + 1, ...).
+    """Output of the model at the end of each prediction step, shape (n + 1, ...).
 
     Attributes
     ----------
     time_us : ndarray of int
         Since the first data.
     lag : int
-        Steps from the fusion horizon to what is published.
+        Steps from the fusion horizon to the publication.
     delayed_attitude, delayed : ndarray
-        Quaternions, and velocity, position and both biases at the horizon, by the time that they
-        are of.
+        Quaternions; velocity, position and both biases at the fusion horizon, by their time of
+        validity.
     velocity_m_s, position_m, attitude : ndarray
-        Published.
+        Published state.
     resets : tuple of (int, ndarray)
-        Step in which the published position jumped, and by how much (m, north and east).
+        Step and size (m, north and east) of each reset of the published position.
     aided : ndarray of bool
-        Whether vision was fused lately enough for a position.
+        True while positions were fused recently enough for a valid position.
     """
 
     time_us: IntArray
@@ -56,7 +56,7 @@ class TopicTrack:
     aided: BoolArray
 
     def stamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, Any]:
-        """The stamps of what the filter did in some steps, with samples that were taken then."""
+        """Return the timestamps of messages about some steps; ``taken_s``: measurement times."""
         sampled_us = self.time_us[rows]
         if taken_s is not None:
             sampled_us = np.rint(taken_s * 1e6).astype(np.int64)
@@ -70,16 +70,16 @@ def ekf2_topics(
     attitude_hz: float,
     aid_source_hz: float,
 ) -> tuple[Topic, ...]:
-    """The topics that EKF2 had anything to say in.
+    """Return the topics of EKF2, without empty ones.
 
     Parameters
     ----------
-    model_run : Run
-        The model's run, of one variant in one stretch.
+    model_run : StretchRun
+        Run of one variant in one stretch.
     attitude_hz : float
-        Of vehicle_attitude, which is EKF2's where it fuses a magnetometer.
+        Rate of vehicle_attitude, which EKF2 estimates if it fuses a magnetometer.
     aid_source_hz : float
-        To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
+        Logging rate of estimator_aid_src_ev_pos; 0: all messages.
     """
     topics = (
         _local_position_topic(track, gnss=inputs.aid == GNSS_POS),
@@ -112,7 +112,7 @@ def _local_position_topic(track: TopicTrack, *, gnss: bool) -> Topic:
 
 
 def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> Topic:
-    """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
+    """Return estimator_states of v1.16: 25 states and 24 variances, horizontal positions as 0."""
     end = model_run.events[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
     events = events[end[events] < len(track.time_us) - track.lag]
@@ -121,9 +121,10 @@ def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> To
     states = np.zeros((len(rows), 25), np.float32)
     states[:, 0:4] = track.delayed_attitude[rows]
     states[:, 4 : 4 + track.delayed.shape[1]] = track.delayed[rows]
-    states[:, 7:9] = 0.0  # horizontally kept as latitude and longitude
+    states[:, 7:9] = 0.0  # v1.16 stores horizontal positions as latitude and longitude
     if gnss:
-        states[:, 9] -= sensors.HOME[2]  # and downwards as altitude, where there is an origin
+        # the vertical position is an altitude if there is an origin
+        states[:, 9] -= sensors.HOME[2]
     covariances = np.zeros((len(rows), 24), np.float32)
     covariances[:, : model_run.variance.shape[2]] = model_run.variance[events + 1, 0]
     fields = track.stamps(rows) | {"states": states, "covariances": covariances}
@@ -133,7 +134,7 @@ def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> To
 def _aid_sources(
     inputs: Inputs, model_run: StretchRun, track: TopicTrack, rate_hz: float
 ) -> tuple[Topic, ...]:
-    """estimator_aid_src_*: a message for every sample that came in time."""
+    """Return estimator_aid_src_*: one message per sample that arrived in time."""
     events, run, aid = model_run.events[0], model_run, inputs.aid
     event_rows = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
     event_rows = event_rows[
@@ -148,7 +149,7 @@ def _aid_sources(
         each[event_rows, 0, POSITION_COLUMNS] for each in innovation_arrays
     )
     idle = np.isnan(innovation[:, :1])
-    # while it is not fused, against the state that there is
+    # while not fused, the innovation refers to the current state
     innovation = np.where(idle, measured - track.delayed[rows][:, POSITION][:, :2], innovation)
     variance = np.where(idle, run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise, variance)
     used = np.where(run.fused[event_rows, 0] | run.reset[event_rows, 0], track.time_us[rows], -1)
@@ -179,7 +180,7 @@ def _aid_sources(
 
 
 def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> list[Topic]:
-    """What a barometer has EKF2 say: its innovations."""
+    """Return estimator_aid_src_baro_hgt, or nothing without a barometer."""
     heights, end = model_run.stretch.heights, model_run.events[0].end
     if heights is None or model_run.heights is None:
         return []
@@ -205,7 +206,7 @@ def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) 
 def _magnetometer_topics(
     inputs: Inputs, model_run: StretchRun, track: TopicTrack, attitude_hz: float
 ) -> list[Topic]:
-    """What a magnetometer has EKF2 say: vehicle_attitude, its innovations, and that it is fused."""
+    """Return the topics that exist with a magnetometer: attitude, innovations and status."""
     field, settings, end = model_run.stretch.field, inputs.settings, model_run.events[0].end
     assert field is not None
     event_rows = np.flatnonzero(
@@ -254,7 +255,10 @@ def _aid_source(
     innovation_parts: tuple[Array, Array, Array],
     decisions: tuple[BoolArray, BoolArray],
 ) -> Topic:
-    """An aid's message; ``innovation_parts`` are innovation, S and R, ``decisions`` rejected and fused."""
+    """Return the message of an aid.
+
+    ``innovation_parts``: innovation, S and R; ``decisions``: rejected and fused.
+    """
     innovation, variance, noise = innovation_parts
     ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
     fields = {
@@ -272,7 +276,7 @@ def _aid_source(
 
 
 def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> Topic:
-    """estimator_status_flags: once a second, and when fusion of vision starts or stops."""
+    """Return estimator_status_flags: once a second and at each start or stop of fusion."""
     events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
     attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
     is_fusing = np.zeros(len(time), np.bool_)
