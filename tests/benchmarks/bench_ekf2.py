@@ -21,7 +21,7 @@ import numpy as np
 
 from px4fuse.ekf2.model import Model, open_model, replay_settings
 from px4fuse.ekf2.replay import Agreement
-from px4fuse.ekf2.walk import FIELD, FLOWING, SPEED, STEPS, walk
+from px4fuse.ekf2.walk import FIELD, FLOWING, SPEED, STEPS, explain_by_steps
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.readers import read_log
@@ -93,7 +93,7 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     steps = (*STEPS[:-2], FIELD, SPEED, FLOWING, *STEPS[-2:])
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(steps) + " | left")
     for name, model in models.items():
-        found = walk(model)
+        found = explain_by_steps(model)
         assert isinstance(found, dict), found
         axes, bars = found.values(), dict.fromkeys(steps, 0.0)
         total = sum(axis.position_mean_square_m2 for axis in axes)
