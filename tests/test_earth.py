@@ -7,7 +7,7 @@ from ekf2_tools import opened
 from exchange import replace
 from findings_tools import made
 
-from px4fuse.ekf2.earth import earth_rate_rad_s, metres_of
+from px4fuse.ekf2.earth import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.flight import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
@@ -32,17 +32,17 @@ def test_metres_of_latitude_uses_ekf2_curvature_radii(latitude_deg: float) -> No
     latitude = np.radians(latitude_deg)
     of_degree = np.radians(1.0) * EARTH_RADIUS_M
     too_long = 1.0 / (1.0 - ECCENTRICITY2 * np.sin(latitude) ** 2)
-    north, east, down = metres_of(record(latitude_deg))
+    north, east, down = ekf2_metres_per_metre(record(latitude_deg))
     assert north * of_degree == pytest.approx(north_m * too_long, rel=2e-5)
     assert east * of_degree * np.cos(latitude) == pytest.approx(east_m, rel=2e-5)
     assert down == 1.0
-    higher = metres_of(record(latitude_deg, 637.1))
+    higher = ekf2_metres_per_metre(record(latitude_deg, 637.1))
     assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
 
 
 def test_metres_of_record_in_metres_is_one() -> None:
-    assert metres_of(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
-    assert metres_of(record(np.nan)) == (1.0, 1.0, 1.0)
+    assert ekf2_metres_per_metre(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
+    assert ekf2_metres_per_metre(record(np.nan)) == (1.0, 1.0, 1.0)
 
 
 def test_earth_rate_matches_sidereal_day() -> None:
@@ -60,7 +60,7 @@ def test_model_gnss_flight_includes_earth_rotation() -> None:
     assert MODEL_NOTE in flight.log.notes
     flat, round_ = opened(flight), opened(replace(flight, log=replace(flight.log, notes=())))
     known = flight.ekf2.record
-    metres = metres_of(known)
+    metres = ekf2_metres_per_metre(known)
     assert metres == pytest.approx((1.00357, 1.00302, 1.0), abs=1e-5)
     flat_m, round_m = (found.inputs.received.position_m for found in (flat, round_))
     np.testing.assert_allclose(round_m, flat_m * metres)

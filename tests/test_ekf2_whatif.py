@@ -20,12 +20,12 @@ from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
 from px4fuse.ekf2.stretches import SensorSamples, Stretch
 from px4fuse.ekf2.walk import (
     ATTITUDE,
-    FIELD,
-    FLOWING,
+    FIELD_STEP,
+    FLOW_STEP,
     GATE,
     OUTPUT,
-    SPEED,
     STEPS,
+    VELOCITY_STEP,
     Why,
     _longest_rejection,
     explain_by_steps,
@@ -137,7 +137,7 @@ def test_step_variants_change_one_property_each():
     flow = (made(Stretch, flow=made(SensorSamples), heights=None),)
     more = {"stretches": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
     variants = step_variants(made(Inputs, **{**vars(gnss), **more}), kf_settings)
-    assert list(variants)[-5:] == [ATTITUDE, FIELD, SPEED, FLOWING, GATE]
+    assert list(variants)[-5:] == [ATTITUDE, FIELD_STEP, VELOCITY_STEP, FLOW_STEP, GATE]
     assert ["mag" in each.without for each in variants.values()] == [True] * 6 + [False] * 4
     assert ["optical_flow" in each.without for each in variants.values()] == [True] * 8 + [
         False

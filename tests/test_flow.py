@@ -111,7 +111,7 @@ def test_flow_samples_give_velocity_at_next_event(every):
     (stretch,) = model().inputs.stretches
     with_flow = add_flow_samples(stretch, flow_of(every=every), 3.0)
     end = next(iter(model().intervals.values()))[0].events.end
-    found = mean_by_event(with_flow.flow, end, stretch.gained_m_s)
+    found = mean_by_event(with_flow.flow, end, stretch.imu_velocity_m_s)
     seen = found.number > 0.0
     assert found.number.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
     speed = true_velocity(stretch.time_s[end[seen]])

@@ -46,12 +46,12 @@ def climbing(heights: HeightSamples, count: int = 400, up_m_s2: float = 0.0) -> 
 
 def sampled(
     steps: list[int], down_m: list[float], *, fused: tuple[str, ...] = BOTH,
-    reference: str = "gnss_hgt", dead_m: float = 0.0, weight: float = 1.0,
+    reference: str = "gnss_hgt", dead_zone_m: float = 0.0, weight: float = 1.0,
 ) -> HeightSamples:  # fmt: skip
     step = np.array(steps)
     return HeightSamples(
         fused, reference, (0.0, 1.0), step, STEP_S * step, np.array(down_m),
-        np.full(len(step), dead_m), weight,
+        np.full(len(step), dead_zone_m), weight,
     )  # fmt: skip
 
 
@@ -164,7 +164,7 @@ def test_height_sample_weight_equals_repeated_samples() -> None:
 )
 def test_heights_ground_effect_ignores_low_barometer(innovation, expected) -> None:
     """Dead zone EKF2_GND_EFF_DZ of baro_height_control.cpp."""
-    _, found = standing(of_baro([10], [innovation], dead_m=4.0))
+    _, found = standing(of_baro([10], [innovation], dead_zone_m=4.0))
     assert found["innovation_down_m"].item() == pytest.approx(expected)
 
 
@@ -290,7 +290,7 @@ def test_recursion_bad_acceleration_noise_is_4_9() -> None:
     """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
     inputs = opened_once().inputs
     (stretch,) = inputs.stretches
-    spoilt = replace(stretch, distrusted_share=np.ones(len(stretch.time_s), bool))
+    spoilt = replace(stretch, bad_acceleration_share=np.ones(len(stretch.time_s), bool))
 
     def ran(one: Stretch, **changed: float) -> StretchRun:
         settings = inputs.settings | changed
@@ -299,7 +299,7 @@ def test_recursion_bad_acceleration_noise_is_4_9() -> None:
     np.testing.assert_array_equal(ran(spoilt).state, ran(stretch, EKF2_ACC_NOISE=4.9).state)
     # one clipped axis of three equals a third of the steps
     third = np.sqrt((2.0 * inputs.settings["EKF2_ACC_NOISE"] ** 2 + 4.9**2) / 3.0)
-    clipped = replace(stretch, distrusted_share=np.full(len(stretch.time_s), 1.0 / 3.0))
+    clipped = replace(stretch, bad_acceleration_share=np.full(len(stretch.time_s), 1.0 / 3.0))
     expected = ran(stretch, EKF2_ACC_NOISE=float(third)).variance
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
@@ -311,9 +311,9 @@ def test_stretch_clipped_axes_increase_noise_share() -> None:
     at = plain.time_s[[100, 200]] - 1e-4
     clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
     (update_log,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.stretches
-    assert not plain.distrusted_share.any()
-    assert update_log.distrusted_share[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
-    assert np.flatnonzero(update_log.distrusted_share).tolist() == [100, 200]
+    assert not plain.bad_acceleration_share.any()
+    assert update_log.bad_acceleration_share[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
+    assert np.flatnonzero(update_log.bad_acceleration_share).tolist() == [100, 200]
 
 
 # ------------------------------------------------------------------ flights of PX4's EKF2

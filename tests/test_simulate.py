@@ -47,7 +47,7 @@ def test_scenario_and_mistakes_numbers_have_bounds(record) -> None:
 
 
 def motion_of(scenario, mistakes=NO_MISTAKES):
-    return plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
+    return plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
 
 
 def stamps_s(simulation):

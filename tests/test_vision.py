@@ -185,7 +185,8 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
         whole, time_s=whole.time_s[:count], step_s=whole.step_s[: count - 1],
         rotation=whole.rotation[:count], correction_rad=whole.correction_rad[: count - 1],
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
-        heights=None, state=whole.state[:15], variance=whole.variance[:15], distrusted_share=None,
+        heights=None, state=whole.state[:15], variance=whole.variance[:15],
+        bad_acceleration_share=None,
         correlation=np.eye(15), attitude_variance_rad2=unknown, down_variance_m2=unknown[:, 0],
         attitude_error_rad=whole.attitude_error_rad[:count],
     )  # fmt: skip
@@ -539,10 +540,12 @@ def test_steps_contain_vision_and_causes_only_kf() -> None:
     found = walk.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]
-        assert names.index(walk.SPEED) < names.index(walk.VISION) < names.index(walk.GATE)
+        assert (
+            names.index(walk.VELOCITY_STEP) < names.index(walk.VISION_STEP) < names.index(walk.GATE)
+        )
         assert why.position_left_share < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
-        assert min(moved_m[walk.SPEED], moved_m[walk.VISION]) > 0.05
+        assert min(moved_m[walk.VELOCITY_STEP], moved_m[walk.VISION_STEP]) > 0.05
     analysis = explain(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"

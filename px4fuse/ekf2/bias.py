@@ -13,7 +13,7 @@ from px4fuse.arrays import Array, BoolArray
 BIAS_DENSITY, MIN_VARIANCE_M2, MIN_NOISE_M2, BIAS_GATE = 0.13, 1e-8, 1e-4, 3.0
 # Mean signed test ratio above which the random walk is increased (isOffsetDetected), the factor on
 # its variance, and the averaging time (s)
-MAX_ONE_SIDED, NOISE_FACTOR, FILTER_S = 0.2, 1e3, 10.0
+MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, FILTER_S = 0.2, 1e3, 10.0
 
 
 class BiasEstimator:
@@ -30,13 +30,13 @@ class BiasEstimator:
 
     def __init__(self, value_m: Array, variance_m2: Array, start_s: float, step_s: float) -> None:
         self.value_m, self.variance_m2 = value_m, variance_m2
-        self.one_sided, self.last_s = np.zeros_like(value_m), np.full_like(value_m, start_s)
-        self.share = step_s / (FILTER_S + step_s)
+        self.mean_signed_ratio, self.last_s = np.zeros_like(value_m), np.full_like(value_m, start_s)
+        self.filter_weight = step_s / (FILTER_S + step_s)
 
     def remove_bias(
         self,
         nu: Array,
-        spread: Array,
+        predicted_variance: Array,
         noise_m2: Array,
         time_s: Array,
         has_sample: BoolArray,
@@ -47,7 +47,7 @@ class BiasEstimator:
 
         Parameters
         ----------
-        nu, spread, noise_m2 : ndarray
+        nu, predicted_variance, noise_m2 : ndarray
             Innovation without bias, HPH' and R.
         time_s, has_sample, learning : ndarray
             Sample time, True for variants with a sample, True for variants that update the bias.
@@ -55,18 +55,19 @@ class BiasEstimator:
             Number of samples of EKF2 that the logged sample represents.
         """
         is_learning, bounded_noise = has_sample & learning, np.maximum(noise_m2, MIN_NOISE_M2)
-        raised = np.where(np.abs(self.one_sided) > MAX_ONE_SIDED, NOISE_FACTOR, 1.0)
+        raised = np.where(np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, 1.0)
         variance_growth = BIAS_DENSITY**2 * (time_s - self.last_s) * raised * is_learning
         variance = np.minimum(self.variance_m2 + variance_growth, bounded_noise)
         nu, R = nu + self.value_m, noise_m2 + variance
-        S = variance + np.maximum((noise_m2 + spread) / weight, MIN_NOISE_M2)
+        S = variance + np.maximum((noise_m2 + predicted_variance) / weight, MIN_NOISE_M2)
         ratio = nu * nu / (BIAS_GATE**2 * S)
         K = variance / S * (is_learning & (ratio < 1.0))
         self.value_m = self.value_m - K * nu
         self.variance_m2 = np.maximum(variance * (1.0 - K), MIN_VARIANCE_M2)
         signed = np.minimum(ratio, 1.0) * np.sign(-nu)
-        self.one_sided = self.one_sided + self.share * weight * is_learning * (
-            signed - self.one_sided
+        self.mean_signed_ratio = (
+            self.mean_signed_ratio
+            + self.filter_weight * weight * is_learning * (signed - self.mean_signed_ratio)
         )
         self.last_s = np.where(has_sample, time_s, self.last_s)
         return nu, R

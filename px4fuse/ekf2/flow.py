@@ -35,7 +35,7 @@ def add_flow_samples(stretch: Stretch, flow: pd.DataFrame, gate: float) -> Stret
     count, interval_s = flow["samples"].to_numpy(), flow["interval_s"].to_numpy()
     step, weight = low_passed(stretch, flow.index.to_numpy(), count, interval_s, FLOW_SHARE)
     turn = stretch.rotation[step].swapaxes(2, 3)[:, :, :2]
-    imu_gain = np.einsum("ki,kiab,kib->ka", weight, turn, stretch.gained_m_s[step])
+    imu_gain = np.einsum("ki,kiab,kib->ka", weight, turn, stretch.imu_velocity_m_s[step])
     velocity, mean = flow[["forward_m_s", "right_m_s"]], np.einsum("ki,kiab->kab", weight, turn)
     sample_fields = (
         step[:, 0],

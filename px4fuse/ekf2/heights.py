@@ -64,8 +64,8 @@ def add_heights(
     if BAROMETER.name in fused and flight.barometer is not None:
         taken_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
         down_m = flight.barometer["down_m"].to_numpy() + record.altitude_m
-    dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
-    dead_m = np.where(record.was_in_state(GROUND_EFFECT, taken_s), dead_zone_m, 0.0)
+    effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
+    dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, taken_s), effect_height_m, 0.0)
     ekf2_rate_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
     new_stretches, delayed = [], record.delayed["down_m"]
     for stretch in stretches:
@@ -81,7 +81,7 @@ def add_heights(
                 np.interp(start_s, logged_bias.index, logged_bias[name]) for name in logged_bias
             )
             bias = float(value), float(variance)
-        samples = samples_inside(stretch, taken_s, down_m, dead_m)
+        samples = barometer_samples_inside(stretch, taken_s, down_m, dead_zone_m)
         rate_hz = len(samples[0]) / float(stretch.time_s[-1] - start_s)
         if BAROMETER.name in fused and rate_hz < LEAST_HZ:
             return f"the barometer is logged at {rate_hz:.1f} Hz"
@@ -93,12 +93,12 @@ def add_heights(
     return tuple(new_stretches)
 
 
-def samples_inside(
-    stretch: Stretch, taken_s: Array, down_m: Array, dead_m: Array
+def barometer_samples_inside(
+    stretch: Stretch, taken_s: Array, down_m: Array, dead_zone_m: Array
 ) -> tuple[IntArray, Array, Array, Array]:
     """Return the barometer samples inside a stretch, preceded by the prediction step of each."""
     step, is_inside = sample_steps(stretch, taken_s)
-    return step, taken_s[is_inside], down_m[is_inside], dead_m[is_inside]
+    return step, taken_s[is_inside], down_m[is_inside], dead_zone_m[is_inside]
 
 
 def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]:
@@ -110,7 +110,7 @@ def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]
     """
     heights = stretch.heights
     assert heights is not None
-    sample_columns = heights.down_m[:, None], slice(2, 3), heights.taken_s, heights.dead_m
+    sample_columns = heights.down_m[:, None], slice(2, 3), heights.taken_s, heights.dead_zone_m
     return pad_samples(
         [
             samples_by_event(stretch, event_steps, heights.step, *sample_columns)
@@ -127,9 +127,9 @@ class HeightFilter:
     stretch : Stretch
     barometer : ndarray, shape (5, k, E, S) or (5, k, E, 1)
         From :func:`barometer_samples`.
-    fix_s, fixed : ndarray, shape (E, S) or (E, 1)
+    fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
         Measurement time of the GNSS fix of each event; True if there is a fix.
-    on : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
+    enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
         True while the aid is fused.
     parameters : mapping from PX4's name to ndarray, shape (S,)
     gated : ndarray of bool, shape (S,)
@@ -147,26 +147,26 @@ class HeightFilter:
         stretch: Stretch,
         barometer: Array,
         fix_s: Array,
-        fixed: BoolArray,
-        on: Mapping[str, BoolArray],
+        has_fix: BoolArray,
+        enabled: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         gated: BoolArray,
     ) -> None:
         heights, size = stretch.heights, len(gated)
         assert heights is not None
         self.fused = heights.fused
-        self.down_m, self.age_s, taken_s, self.dead_m, there = barometer
+        self.down_m, self.age_s, taken_s, self.dead_zone_m, is_sample = barometer
         self.time_s = [*taken_s, fix_s]
         self.update_log = np.full((len(fix_s), len(self.time_s), 3, size), np.nan)
-        fixed = fixed & on[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
-        self.has_sample = [*((there > 0.0) & on[BAROMETER.name]), fixed]
+        has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
+        self.has_sample = [*((is_sample > 0.0) & enabled[BAROMETER.name]), has_fix]
         self.any = [np.any(each, axis=1).tolist() for each in self.has_sample]
-        self.near = self.dead_m.any(axis=2)
+        self.in_ground_effect = self.dead_zone_m.any(axis=2)
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
         self.gate2 = [np.where(gated, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SD), MIN_SD) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
-        self.weight, self.learning = (heights.weight, 1.0), on[heights.reference]
+        self.weight, self.learning = (heights.weight, 1.0), enabled[heights.reference]
         value_m, variance_m2 = (np.full(size, part) for part in heights.bias)
         start_s, step_s = float(stretch.time_s[0]), float(np.median(stretch.step_s))
         self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)
@@ -177,14 +177,14 @@ class HeightFilter:
         The index is the measurement time in EKF2.
         """
         rows, slots = [], len(self.down_m)
-        for place in [slots] if sensor == GNSS_HGT.name else range(slots):
-            times, has_sample = self.time_s[place], self.has_sample[place][:, variant]
+        for slot in [slots] if sensor == GNSS_HGT.name else range(slots):
+            times, has_sample = self.time_s[slot], self.has_sample[slot][:, variant]
             measured_s = times[has_sample, min(variant, times.shape[1] - 1)]
             rows.append(
                 np.vstack(
                     [
                         measured_s,
-                        self.update_log[has_sample, place, :, variant].T,
+                        self.update_log[has_sample, slot, :, variant].T,
                         end_s[has_sample],
                     ]
                 )
@@ -201,13 +201,13 @@ class HeightFilter:
 
         ``gnss_m`` and ``gnss_m2`` are the GNSS height (m, down) and its R.
         """
-        for place in range(len(self.down_m)):
-            if self.any[place][e]:
-                age_s = self.age_s[place, e]
+        for slot in range(len(self.down_m)):
+            if self.any[slot][e]:
+                age_s = self.age_s[slot, e]
                 column = P[:, :, DOWN] - age_s[:, None] * P[:, :, SPEED_DOWN]
                 spread = column[:, DOWN] - age_s * column[:, SPEED_DOWN]
-                nu = self.down_m[place, e] - x[:, DOWN] + age_s * x[:, SPEED_DOWN]
-                x, P = self._fuse_innovation(e, place, 0, x, P, column, spread, nu, self.noise_m2)
+                nu = self.down_m[slot, e] - x[:, DOWN] + age_s * x[:, SPEED_DOWN]
+                x, P = self._fuse_innovation(e, slot, 0, x, P, column, spread, nu, self.noise_m2)
         if self.any[-1][e]:
             column, nu = P[:, :, DOWN], gnss_m - x[:, DOWN]
             x, P = self._fuse_innovation(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
@@ -216,8 +216,8 @@ class HeightFilter:
     def _fuse_innovation(
         self,
         e: int,
-        place: int,
-        at: int,
+        slot: int,
+        sensor_index: int,
         x: Array,
         P: Array,
         column: Array,
@@ -226,15 +226,15 @@ class HeightFilter:
         R: Array,
     ) -> tuple[Array, Array]:
         """Fuse one innovation with the gain ``column`` (PH') and its variance ``spread`` (HPH')."""
-        if self.biased[at]:
-            has_sample, time_s = self.has_sample[place][e], self.time_s[place][e]
+        if self.biased[sensor_index]:
+            has_sample, time_s = self.has_sample[slot][e], self.time_s[slot][e]
             nu, R = self.bias.remove_bias(
-                nu, spread, R, time_s, has_sample, self.learning[e], self.weight[at]
+                nu, spread, R, time_s, has_sample, self.learning[e], self.weight[sensor_index]
             )
-        if at == 0 and self.near[place, e]:
-            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_m[place, e], 0.0), nu)
+        if sensor_index == 0 and self.in_ground_effect[slot, e]:
+            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
         S = spread + R
-        is_fused = self.has_sample[place][e] & (nu * nu <= self.gate2[at] * S)
-        self.update_log[e, place] = nu, S, is_fused
-        K = column * (is_fused / (spread + R / self.weight[at]))[:, None]
+        is_fused = self.has_sample[slot][e] & (nu * nu <= self.gate2[sensor_index] * S)
+        self.update_log[e, slot] = nu, S, is_fused
+        K = column * (is_fused / (spread + R / self.weight[sensor_index]))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]

@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import one_line_repr
-from px4fuse.ekf2.earth import metres_of
+from px4fuse.ekf2.earth import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.output_predictor import corrections
@@ -175,7 +175,7 @@ class Inputs:
         Largest interval between height and heading measurements in a gap of the source.
     vision : ReceivedPositions or None
         External vision fused besides GNSS; NaN while disabled.
-    imposed : str
+    height_reason : str
         Reason why the logged EKF2 height is used on GNSS; empty if heights are fused.
     """
 
@@ -190,7 +190,7 @@ class Inputs:
     imu_offset_m: Array
     aid: Aid = EV_POS
     max_interval_s: float = MAX_INTERVAL_S
-    imposed: str = ""
+    height_reason: str = ""
     vision: ReceivedPositions | None = None
 
     __repr__ = one_line_repr
@@ -278,14 +278,14 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if len(flow):
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
         stretches = tuple(add_flow_samples(stretch, flow, gate) for stretch in stretches)
-    imposed = "; ".join(
+    height_reason = "; ".join(
         f"{AIDS[name].label}: {why}"
         for name, why in doubtful.items()
         if name not in (FLOW.name, EV_POS.name)
     )
-    if gnss and not imposed:
+    if gnss and not height_reason:
         new_stretches = add_heights(flight, ekf2, record, stretches)
-        stretches, imposed = (
+        stretches, height_reason = (
             (stretches, new_stretches) if isinstance(new_stretches, str) else (new_stretches, "")
         )
     other_aids = [EV_POS] if vision else []
@@ -305,7 +305,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
-        imposed=imposed,
+        height_reason=height_reason,
         vision=vision,
     )
 
@@ -402,7 +402,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     return ReceivedPositions(
         stamp,
         stamp,
-        samples[Columns.POSITION].to_numpy() * metres_of(record),
+        samples[Columns.POSITION].to_numpy() * ekf2_metres_per_metre(record),
         reported_variance.to_numpy(),
         *decisions,
         track.name,
@@ -498,7 +498,7 @@ def _read_vision_besides_gnss(
     if isinstance(received, Unavailable):
         return received
     is_disabled = step_values_at(enabled, received.stamp_s) == 0.0
-    position_m = received.position_m * metres_of(record)
+    position_m = received.position_m * ekf2_metres_per_metre(record)
     return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
 
 

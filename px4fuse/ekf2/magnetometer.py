@@ -34,11 +34,11 @@ class EventSamples(NamedTuple):
 
 
 def mean_by_event(
-    sensed: SensorSamples, end: IntArray, gained_m_s: Array | None = None
+    sensed: SensorSamples, end: IntArray, imu_velocity_m_s: Array | None = None
 ) -> EventSamples:
     """Return means of the samples fused at each event; ``end`` is the step of each event.
 
-    Pass ``gained_m_s`` of :class:`~px4fuse.ekf2.stretches.Stretch` for velocity samples.
+    Pass ``imu_velocity_m_s`` of :class:`~px4fuse.ekf2.stretches.Stretch` for velocity samples.
     """
     event = np.searchsorted(end, sensed.step)
     is_inside, size = event < len(end), len(end)
@@ -51,8 +51,8 @@ def mean_by_event(
         return np.asarray((total.T / count).T)
 
     value, turn, noise = map(mean, (sensed.value, sensed.turn, sensed.noise))
-    if gained_m_s is not None:
-        value = value + np.einsum("eab,eb->ea", turn, gained_m_s[end])
+    if imu_velocity_m_s is not None:
+        value = value + np.einsum("eab,eb->ea", turn, imu_velocity_m_s[end])
     number = np.bincount(event, sensed.samples[is_inside], size)
     return EventSamples(value, turn, np.asarray(number, float), noise)
 

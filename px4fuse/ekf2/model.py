@@ -197,7 +197,7 @@ def replay_settings(
     changes, inputs = [check_parameters(change) for change in settings], model.inputs
     unmodelled = PARAMETERS.keys() - inputs.settings.keys()
     unused_parameters = dict.fromkeys(unmodelled, f"EKF2 fused {inputs.aid.label} in this log")
-    height = f"the replay uses the logged EKF2 height ({inputs.imposed})"
+    height = f"the replay uses the logged EKF2 height ({inputs.height_reason})"
     if inputs.aid == GNSS_POS:
         no_field = "the log does not contain all fused magnetometer samples"
         unused_parameters |= dict.fromkeys(
@@ -205,7 +205,7 @@ def replay_settings(
         )
         unused_parameters |= dict.fromkeys(
             unmodelled & BAROMETER.own_parameters,
-            height if inputs.imposed else "EKF2 fused no barometer height",
+            height if inputs.height_reason else "EKF2 fused no barometer height",
         )
     if inputs.rules.horizon_by_delay:
         firmware = model.flight.log.firmware
@@ -219,7 +219,7 @@ def replay_settings(
     without = without or {}
     for name in without:
         if name not in (known := modelled_aids(inputs)):
-            why = f"; {height}" if inputs.imposed else ""
+            why = f"; {height}" if inputs.height_reason else ""
             raise SettingsError(
                 f"{name}: in this log the replay fuses only {', '.join(known)}{why}."
             )

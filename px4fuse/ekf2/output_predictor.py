@@ -40,7 +40,7 @@ def publish(
     stretch: Stretch,
     state: Array,
     reset_m: Array,
-    turned_rad: Array,
+    attitude_difference_rad: Array,
     lag: int,
     settings: Mapping[str, float],
 ) -> tuple[Array, Array]:
@@ -53,7 +53,7 @@ def publish(
         State at the fusion horizon, by its time of validity.
     reset_m : ndarray, shape (n + 1, 3)
         Sum of position resets up to each state.
-    turned_rad : ndarray, shape (n + 1, 3)
+    attitude_difference_rad : ndarray, shape (n + 1, 3)
         Published minus nominal attitude.
     lag : int
         Steps between fusion horizon and present.
@@ -69,7 +69,7 @@ def publish(
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     force = stretch.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
     force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
-    gain = (force + np.cross(turned_rad[1:], force) + GRAVITY_M_S2) * step_s
+    gain = (force + np.cross(attitude_difference_rad[1:], force) + GRAVITY_M_S2) * step_s
     dead_reckoned = np.cumsum(np.concatenate([state[:1, VELOCITY], gain]), axis=0)
     velocity_correction = _follow_offset(
         state[:, VELOCITY] - dead_reckoned, lag, mean_step, settings["EKF2_TAU_VEL"]

@@ -199,11 +199,11 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
     end, active = event["end"], action > IDLE
     event_s, sampled = stretch.time_s[end], np.any(active, axis=1).tolist()
-    on = {
+    enabled = {
         aid.name: event_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
         for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)
     }
-    with_velocity = (action == FUSE) & on[GNSS_VEL.name] & fuses_velocity
+    with_velocity = (action == FUSE) & enabled[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, parameters, reported)
     is_sequential, has_speed = inputs.aid == GNSS_POS, inputs.received.velocity_m_s is not None
@@ -223,20 +223,24 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             for part in zip(*samples_per_interval, strict=True)
         )
         mean_samples = EventSamples(*stacked_fields)
-        return mean_samples._replace(number=np.where(on[source_aid.name], mean_samples.number, 0.0))
+        return mean_samples._replace(
+            number=np.where(enabled[source_aid.name], mean_samples.number, 0.0)
+        )
 
     ends = [one.events.end for one in distinct]
     if (field := stretch.field) is not None:
         field_samples = means(MAG, [mean_by_event(field, one) for one in ends])
         has_field = np.asarray(field_samples.number.any(axis=1))
     if (flow := stretch.flow) is not None:
-        flow_samples = means(FLOW, [mean_by_event(flow, one, stretch.gained_m_s) for one in ends])
+        flow_samples = means(
+            FLOW, [mean_by_event(flow, one, stretch.imu_velocity_m_s) for one in ends]
+        )
         has_flow = np.asarray(flow_samples.number.any(axis=1))
     if stretch.heights is not None:
         samples = barometer_samples(stretch, ends)
         barometer_arrays = np.stack(samples, axis=-1)[..., variant_intervals]
         heights = HeightFilter(
-            stretch, barometer_arrays, event["time_s"], active, on, parameters, gated
+            stretch, barometer_arrays, event["time_s"], active, enabled, parameters, gated
         )
     if inputs.vision is not None:
         timings = [variant.timing(inputs) for variant in variants]
@@ -244,21 +248,23 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             vision_samples(inputs, stretch, each.events.end, variant.settings, at.horizon_s)
             for each, variant, at in zip(intervals, variants, timings, strict=True)
         ]
-        vision = VisionFilter(stretch, vision_by_variant, on, parameters, gated, reported)
+        vision = VisionFilter(stretch, vision_by_variant, enabled, parameters, gated, reported)
     gyro2 = np.where(attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     drift, drift_limit = _variance_growth(inputs, stretch, parameters, biases, attitude)
     steps = np.diff(end, axis=0, prepend=0)[:, :, None]
     force2 = np.broadcast_to(parameters["EKF2_ACC_NOISE"] ** 2, active.shape)[:, :, None, None]
-    if stretch.distrusted_share is not None:  # share of each interval with a bad acceleration
+    if stretch.bad_acceleration_share is not None:  # share of each interval with a bad acceleration
         sums = np.diff(
-            np.cumsum(stretch.distrusted_share)[end], axis=0, prepend=stretch.distrusted_share[0]
+            np.cumsum(stretch.bad_acceleration_share)[end],
+            axis=0,
+            prepend=stretch.bad_acceleration_share[0],
         )
         share = (sums[:, :, None] / np.maximum(steps, 1))[..., None]
         force2 = (1.0 - share) * force2 + share * BAD_ACCELERATION_NOISE**2
     floor = inputs.rules.bias_floor
     x, P = _start_state(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]
-    used = on[inputs.aid.name]
+    used = enabled[inputs.aid.name]
     moved = inputs.received.moved_m if as_logged.any() else None
     usable = np.where(used, action, IDLE), event["startable"] & used, event_s, gated, as_logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable, *logged)
@@ -483,7 +489,7 @@ class _Fusion:
         self.last_s, self.velocity_s = np.full((2, size), self.began_s)
         self.stopped, self.left = np.zeros(size, bool), np.full(size, self.rules.resets)
         # shortcut if all variants fuse unless their gate rejects the sample
-        self.usual = (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
+        self.all_fuse = (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
 
     def decide(
         self, e: int, outside: BoolArray, is_velocity_fused: BoolArray
@@ -497,7 +503,7 @@ class _Fusion:
         gated, follows_log = self.gated, self.as_logged
         fusing, is_decision_logged = action == FUSE, math.isfinite(self.rejected[e])
         self.velocity_s = np.where(is_velocity_fused, now_s, self.velocity_s)
-        if self.usual[e] and not (outside.any() or self.stopped.any()):
+        if self.all_fuse[e] and not (outside.any() or self.stopped.any()):
             self.last_s = now_s
             return outside, fusing, outside, is_velocity_fused
         is_rejected = (

@@ -42,7 +42,7 @@ VELOCITY_UPDATE_COLUMNS = [
     *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
 ]
 MIN_SAMPLES = 20
-CONSTANT = "the logged or replayed innovations are constant"
+CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
 # s; the older topics repeat a sample until the next fusion, with later timestamps
 MAX_REPEAT_S = 0.5
 # Measured on simulated flights of v1.13 to main: for complete logs the correlation is above 0.997
@@ -272,7 +272,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     other_agreements, doubtful = _other_agreements(ekf2, replay)
     velocity, constant = _velocity_agreement(ekf2, replay, own=own)
     if constant:
-        doubtful[GNSS_VEL.name] = CONSTANT
+        doubtful[GNSS_VEL.name] = CONSTANT_INNOVATIONS
     position = {GNSS_POS.name if on_gnss else EV_POS.name: axes}
     distance_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     carried_m = _flow_only_error_m(ekf2, replay)
@@ -373,7 +373,7 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
             doubtful[name] = f"only {len(logged)} logged innovations to compare with"
             continue
         if _constant(logged, model, axes_of(updates)):
-            doubtful[name] = CONSTANT
+            doubtful[name] = CONSTANT_INNOVATIONS
             continue
         agreements[name] = {
             axis: _axis_agreement(axis, logged, model, ekf2, replay) for axis in axes_of(updates)

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import one_line_repr
-from px4fuse.ekf2.earth import earth_rate_rad_s, metres_of
+from px4fuse.ekf2.earth import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.readers.px4_ekf2 import rows_of_stamps, samples_per_step
 from px4fuse.trajectory.rotation import (
@@ -111,7 +111,7 @@ class HeightSamples:
         Prediction step after which EKF2 fuses each barometer sample.
     taken_s, down_m : ndarray, shape (m,)
         EKF2's measurement time, and the height.
-    dead_m : ndarray, shape (m,)
+    dead_zone_m : ndarray, shape (m,)
         Dead zone: in ground effect a height this far below the state is ignored.
     weight : float
         Number of EKF2 samples per logged sample.
@@ -123,7 +123,7 @@ class HeightSamples:
     step: IntArray
     taken_s: Array
     down_m: Array
-    dead_m: Array
+    dead_zone_m: Array
     weight: float
 
     __repr__ = one_line_repr
@@ -169,7 +169,7 @@ class Stretch:
         Magnetometer samples, then 21 states; None: the logged EKF2 heading is used.
     heights : HeightSamples or None
         None: the logged EKF2 height, or that of vision, is used.
-    distrusted_share : ndarray, shape (n + 1,), or None
+    bad_acceleration_share : ndarray, shape (n + 1,), or None
         Share of accelerometer axes to which EKF2 gave a larger noise in the step before: all during
         a bad vertical acceleration, else the clipped ones; None: never.
     flow : SensorSamples or None
@@ -196,7 +196,7 @@ class Stretch:
     fusing: bool = True
     field: SensorSamples | None = None
     heights: HeightSamples | None = None
-    distrusted_share: Array | None = None
+    bad_acceleration_share: Array | None = None
     flow: SensorSamples | None = None
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     history: "Stretch | None" = None
@@ -204,16 +204,16 @@ class Stretch:
     __repr__ = one_line_repr
 
     @cached_property
-    def gained_m_s(self) -> Array:
+    def imu_velocity_m_s(self) -> Array:
         """Velocity change from the IMU since the start (m/s, NED), shape (n + 1, 3)."""
         force = np.einsum("nij,nj->ni", self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
         gained = np.cumsum(force * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), gained])
 
     @cached_property
-    def path_m(self) -> Array:
+    def imu_displacement_m(self) -> Array:
         """Displacement from the IMU since the start, from rest (m, NED), shape (n + 1, 3)."""
-        speed = self.gained_m_s
+        speed = self.imu_velocity_m_s
         path = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), path])
 
@@ -247,7 +247,7 @@ def samples_by_event(
     count = len(event)
     step, event_step = step[:count], end[event]
     age_s = stretch.time_s[event_step] - stretch.time_s[step]
-    path, speed = stretch.path_m[:, axes], stretch.gained_m_s[:, axes]
+    path, speed = stretch.imu_displacement_m[:, axes], stretch.imu_velocity_m_s[:, axes]
     position_m = (
         position_m[:count] + path[event_step] - path[step] - speed[event_step] * age_s[:, None]
     )
@@ -348,12 +348,14 @@ def _gnss_stretch(
 ) -> Stretch:
     """Return a stretch with earth rotation and a larger noise of bad accelerations."""
     stretch = _on_rotating_earth(_stretch(imu, attitude, ekf2, record, start_row, end_s), record)
-    return replace(stretch, distrusted_share=_distrusted_share(imu, record, stretch.time_s))
+    return replace(
+        stretch, bad_acceleration_share=_bad_acceleration_share(imu, record, stretch.time_s)
+    )
 
 
 def _on_rotating_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
     """Add earth rotation, and convert the position to metres of EKF2's state."""
-    metres, state = metres_of(record), stretch.state.copy()
+    metres, state = ekf2_metres_per_metre(record), stretch.state.copy()
     state[POSITION] *= metres
     turned = earth_rate_rad_s(record) * stretch.step_s[:, None]
     return replace(
@@ -384,7 +386,7 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     return breaks
 
 
-def _distrusted_share(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
+def _bad_acceleration_share(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
     """Return the share of accelerometer axes with a larger noise, at the end of each step."""
     share_by_step = record.was_in_state(BAD_ACCELERATION, time_s).astype(float)
     if "clipped" in imu:  # one bit per axis

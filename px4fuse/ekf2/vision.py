@@ -65,9 +65,9 @@ class VisionFilter:
     Parameters
     ----------
     stretch : Stretch
-    sent : sequence of S ndarrays, shape (8, k, E)
+    sample_arrays : sequence of S ndarrays, shape (8, k, E)
         From :func:`vision_samples`.
-    on : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
+    enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
         True while the aid is fused.
     parameters : mapping from PX4's name to ndarray, shape (S,)
     gated, reported : ndarray of bool, shape (S,)
@@ -87,26 +87,26 @@ class VisionFilter:
     def __init__(
         self,
         stretch: Stretch,
-        sent: Sequence[Array],
-        on: Mapping[str, BoolArray],
+        sample_arrays: Sequence[Array],
+        enabled: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         gated: BoolArray,
         reported: BoolArray,
     ) -> None:
-        samples = np.stack(pad_samples(sent), axis=-1)
+        samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.taken_s, self.now_s = samples[2:5]
         _, count, events, size = samples.shape
         self.update_log = np.full((events, count, 7, size), np.nan)
         self.moved_m = np.zeros((events, size, 2))
-        has_sample = (samples[7] > 0.0) & on[EV_POS.name]
+        has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
         # samples of the event's step are fused after GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
-        self.gated, self.alone = gated, ~on[GNSS_POS.name]
+        self.gated, self.without_gnss = gated, ~enabled[GNSS_POS.name]
         self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (reported & (parameters[EV_POS.noise_mode] != 1.0))
         min_variance = np.maximum(parameters[EV_POS.noise], MIN_SD) ** 2
-        with_gnss_innovations = np.where(self.alone, 0.0, parameters[GNSS_POS.noise] ** 2)
+        with_gnss_innovations = np.where(self.without_gnss, 0.0, parameters[GNSS_POS.noise] ** 2)
         self.noise_m2 = np.moveaxis(
             np.maximum(reported_variance, np.maximum(min_variance, with_gnss_innovations)), 0, -1
         )
@@ -116,7 +116,7 @@ class VisionFilter:
             np.zeros((size, 2)), unknown_variance, start_s, float(np.median(stretch.step_s))
         )
         self.last_sample_s, self.last_attempt_s = np.full((2, size), -np.inf)
-        self.fused_s, self.was_alone = np.full(size, start_s), self.alone[0]
+        self.fused_s, self.was_without_gnss = np.full(size, start_s), self.without_gnss[0]
 
     def updates(self, variant: int, end_s: Array) -> pd.DataFrame:
         """Return the updates of one variant at EKF2's measurement times.
@@ -129,43 +129,47 @@ class VisionFilter:
         frame = pd.DataFrame(update_log[event, place], index, COLUMNS)
         return frame.assign(fused_at_s=end_s[event])
 
-    def fuse(self, e: int, x: Array, P: Array, own_step: bool, fix_s: Array) -> tuple[Array, Array]:
+    def fuse(
+        self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array
+    ) -> tuple[Array, Array]:
         """Return state and covariance after the samples of one event.
 
         Parameters
         ----------
         e : int
         x, P : ndarray
-        own_step : bool
+        at_event : bool
             True: samples of the event's step; False: earlier ones.
-        fix_s : ndarray, shape (S,)
+        gnss_fused_s : ndarray, shape (S,)
             Time of the last position fusion from GNSS.
         """
-        for place, has_sample in enumerate(self.has_sample[own_step][:, e]):
+        for place, has_sample in enumerate(self.has_sample[at_event][:, e]):
             if has_sample.any():
-                x, P = self._fuse_sample(e, place, has_sample, x, P, fix_s)
+                x, P = self._fuse_sample(e, place, has_sample, x, P, gnss_fused_s)
         return x, P
 
     def _fuse_sample(
-        self, e: int, place: int, has_sample: BoolArray, x: Array, P: Array, fix_s: Array
+        self, e: int, place: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
     ) -> tuple[Array, Array]:
         age_s, now_s = self.age_s[place, e][:, None], self.now_s[place, e]
-        alone, noise_m2 = self.alone[e], self.noise_m2[place, e]
+        without_gnss, noise_m2 = self.without_gnss[e], self.noise_m2[place, e]
         HP = P[:, HORIZONTAL] - age_s[:, None] * P[:, SPEED]
         S = HP[:, :, HORIZONTAL] - age_s[:, None] * HP[:, :, SPEED]
         diagonal = S.reshape(len(S), -1)[:, ::3]  # a view of the diagonal of S
         distance_m = self.position_m[place, e] - x[:, HORIZONTAL] + age_s * x[:, SPEED]
-        sample_state = now_s[:, None], has_sample[:, None], ~alone[:, None]
+        sample_state = now_s[:, None], has_sample[:, None], ~without_gnss[:, None]
         nu, R = self.bias.remove_bias(distance_m, diagonal.copy(), noise_m2, *sample_state)
         diagonal += R
-        has_restarted = (now_s - self.last_sample_s > STOP_S) | (alone != self.was_alone)
+        has_restarted = (now_s - self.last_sample_s > STOP_S) | (
+            without_gnss != self.was_without_gnss
+        )
         outside = (nu * nu > self.gate2 * diagonal).any(axis=1) & self.gated & ~has_restarted
         is_failing = outside & (now_s - self.last_attempt_s > FAILING_S)
         restart, is_fused = (
             has_sample & (has_restarted | is_failing),
             has_sample & ~outside & ~has_restarted,
         )
-        reset = restart & (alone | (is_failing & (now_s - fix_s > FAILING_S)))
+        reset = restart & (without_gnss | (is_failing & (now_s - gnss_fused_s > FAILING_S)))
         is_evaluated = has_sample & ~has_restarted | reset
         # the innovation after a reset is 0
         update_log = *np.where(reset, 0.0, nu.T), *diagonal.T, outside & ~reset, is_fused, reset
@@ -173,12 +177,12 @@ class VisionFilter:
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
         x, P = x + (K @ nu[:, :, None])[:, :, 0], P - K @ HP
         if reset.any():
-            moved_m = np.where(alone[:, None], distance_m, nu) * reset[:, None]
-            variance = np.where(alone[:, None], noise_m2, R)
+            moved_m = np.where(without_gnss[:, None], distance_m, nu) * reset[:, None]
+            variance = np.where(without_gnss[:, None], noise_m2, R)
             set_states(x, P, reset, HORIZONTAL, x[:, HORIZONTAL] + moved_m, variance)
             self.moved_m[e] += moved_m
         if restart.any():
-            new_bias, no_bias = (restart & ~reset)[:, None], (reset & alone)[:, None]
+            new_bias, no_bias = (restart & ~reset)[:, None], (reset & without_gnss)[:, None]
             self.bias.value_m = np.where(
                 new_bias, -distance_m, np.where(no_bias, 0.0, self.bias.value_m)
             )
@@ -186,7 +190,7 @@ class VisionFilter:
         self.last_sample_s = np.where(has_sample, now_s, self.last_sample_s)
         self.last_attempt_s = np.where(is_fused | restart, now_s, self.last_attempt_s)
         self.fused_s = np.where(is_fused | reset, now_s, self.fused_s)
-        self.was_alone = np.where(has_sample, alone, self.was_alone)
+        self.was_without_gnss = np.where(has_sample, without_gnss, self.was_without_gnss)
         return x, P
 
 

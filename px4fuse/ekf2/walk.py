@@ -45,13 +45,13 @@ NOISE = "measurement noise"
 BIASES = "accelerometer bias as a state"
 PROCESS = "process noise"
 ATTITUDE = "attitude and gyro bias as states"
-FIELD = "magnetometer"
-SPEED = "GNSS velocity"
-FLOWING = "optical flow"
-VISION = "external vision"
+FIELD_STEP = "magnetometer"
+VELOCITY_STEP = "GNSS velocity"
+FLOW_STEP = "optical flow"
+VISION_STEP = "external vision"
 GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
-# FIELD, SPEED, FLOWING and VISION precede GATE if EKF2 fuses them
+# The other four precede GATE if EKF2 fuses these aids
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (Columns.POSITION, Columns.VELOCITY)
@@ -63,7 +63,8 @@ class Step(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     name : str
-        One of :data:`STEPS`, :data:`FIELD`, :data:`SPEED`, :data:`FLOWING` or :data:`VISION`.
+        One of :data:`STEPS`, :data:`FIELD_STEP`, :data:`VELOCITY_STEP`, :data:`FLOW_STEP` or
+        :data:`VISION_STEP`.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Reduction of the mean square difference to the logged EKF2; below 0: increase.
     position_moved_m : float
@@ -231,7 +232,13 @@ def explain_by_steps(
                 for direction in directions.values()
             ]
         )
-        if stage in (ATTITUDE, FIELD, SPEED, FLOWING, VISION):  # the last step without a gate
+        if stage in (
+            ATTITUDE,
+            FIELD_STEP,
+            VELOCITY_STEP,
+            FLOW_STEP,
+            VISION_STEP,
+        ):  # the last step without a gate
             ungated = track
     spans = Segment(*span, "").cut(evaluated_spans)
     coast = _longest_rejection(flown, ungated, span, evaluated_spans)
@@ -312,11 +319,11 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
         ATTITUDE: (variant := replace(noise, settings=flown, biases=True, attitude=True)),
     }
     if MAG.name in aids:
-        variants[FIELD] = variant = replace(variant, without=dict.fromkeys(others, 0.0))
+        variants[FIELD_STEP] = variant = replace(variant, without=dict.fromkeys(others, 0.0))
     if received.velocity_m_s is not None:
-        variants[SPEED] = variant = replace(variant, velocity=True)
+        variants[VELOCITY_STEP] = variant = replace(variant, velocity=True)
     for position, name in enumerate(others, start=1):
-        step = FLOWING if name == FLOW.name else VISION
+        step = FLOW_STEP if name == FLOW.name else VISION_STEP
         variants[step] = variant = replace(variant, without=dict.fromkeys(others[position:], 0.0))
     return variants | {GATE: Variant(flown, as_logged=True)}
 

@@ -278,7 +278,7 @@ def what_if(
 def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     off_deg = model.agreement.heading_rms_difference_deg
     heading = HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
-    return heading, HEIGHT_STAYS if model.inputs.imposed else HEIGHT_FOLLOWS
+    return heading, HEIGHT_STAYS if model.inputs.height_reason else HEIGHT_FOLLOWS
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.heights import samples_inside
+from px4fuse.ekf2.heights import barometer_samples_inside
 from px4fuse.ekf2.inputs import UNLIMITED_RESETS, FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import delay_by, follow_attitude, publish
@@ -103,7 +103,7 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
     )
 
 
-def fly(
+def simulate_ekf2(
     scenario: Scenario,
     mistakes: Mistakes,
     motion: Motion,
@@ -218,7 +218,7 @@ def _barometer_heights(stretch: Stretch, barometer: Topic) -> HeightSamples:
     """Return the barometer heights; the barometer is EKF2's only height sensor here."""
     taken_s = sensors.time_s(barometer) - 0.5 * float(np.median(stretch.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    samples = samples_inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
+    samples = barometer_samples_inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
     return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
 
 

@@ -55,12 +55,12 @@ class TopicTrack:
     resets: tuple[tuple[int, Array], ...]
     aided: BoolArray
 
-    def stamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, Any]:
+    def timestamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, Any]:
         """Return the timestamps of messages about some steps; ``taken_s``: measurement times."""
         sampled_us = self.time_us[rows]
         if taken_s is not None:
             sampled_us = np.rint(taken_s * 1e6).astype(np.int64)
-        return sensors.stamps(sampled_us, self.time_us[rows + self.lag] - sampled_us)
+        return sensors.timestamps(sampled_us, self.time_us[rows + self.lag] - sampled_us)
 
 
 def ekf2_topics(
@@ -101,7 +101,7 @@ def _local_position_topic(track: TopicTrack, *, gnss: bool) -> Topic:
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
     count = np.searchsorted(steps, rows, side="right")
-    fields = sensors.stamps(track.time_us[rows], PUBLICATION_DELAY_US)
+    fields = sensors.timestamps(track.time_us[rows], PUBLICATION_DELAY_US)
     fields |= sensors.vectors({"": track.position_m[rows], "v": track.velocity_m_s[rows]})
     aided = track.aided[np.maximum(rows - track.lag, 0)]
     fields |= {"delta_xy": jumps[count], "xy_reset_counter": count % 256}
@@ -127,7 +127,7 @@ def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> To
         states[:, 9] -= sensors.HOME[2]
     covariances = np.zeros((len(rows), 24), np.float32)
     covariances[:, : model_run.variance.shape[2]] = model_run.variance[events + 1, 0]
-    fields = track.stamps(rows) | {"states": states, "covariances": covariances}
+    fields = track.timestamps(rows) | {"states": states, "covariances": covariances}
     return topic("estimator_states", fields)
 
 
@@ -141,7 +141,7 @@ def _aid_sources(
         sensors.keep_at_rate(sensors.seconds(track.time_us[events.end[event_rows]]), rate_hz)
     ]
     rows, sample, received = events.end[event_rows], events.sample[event_rows], inputs.received
-    aid_stamps = track.stamps(rows, events.time_s[event_rows])
+    aid_stamps = track.timestamps(rows, events.time_s[event_rows])
     measured = received.position_m[sample, :2]
     north, east = measured.T
     innovation_arrays = (run.innovation, run.innovation_variance, run.noise)
@@ -195,7 +195,7 @@ def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) 
         _aid_source(
             BAROMETER,
             inputs.settings,
-            track.stamps(step, taken_s),
+            track.timestamps(step, taken_s),
             measured,
             (innovation, variance, noise),
             (rejected > 0, fused > 0),
@@ -236,13 +236,14 @@ def _magnetometer_topics(
         _aid_source(
             MAG,
             settings,
-            track.stamps(rows),
+            track.timestamps(rows),
             last,
             (innovation, variance, noise),
             (~taken, taken),
         ),
         topic(
-            "estimator_status", track.stamps(status_rows) | {"control_mode_flags": 1 << MAG_3D_BIT}
+            "estimator_status",
+            track.timestamps(status_rows) | {"control_mode_flags": 1 << MAG_3D_BIT},
         ),
     ]
 
@@ -250,7 +251,7 @@ def _magnetometer_topics(
 def _aid_source(
     aid: Aid,
     settings: Mapping[str, float],
-    stamps: Mapping[str, Any],
+    timestamps: Mapping[str, Any],
     observation: Array,
     innovation_parts: tuple[Array, Array, Array],
     decisions: tuple[BoolArray, BoolArray],
@@ -262,7 +263,7 @@ def _aid_source(
     innovation, variance, noise = innovation_parts
     ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
     fields = {
-        **stamps,
+        **timestamps,
         "observation": observation,
         "observation_variance": noise,
         "innovation": -innovation,
@@ -288,7 +289,7 @@ def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> To
     is_logged = changed | sensors.keep_at_rate(time, FLAGS_HZ)
     rows = np.flatnonzero(is_logged[: len(time) - track.lag])
     gnss = inputs.aid == GNSS_POS
-    fields = track.stamps(rows) | {
+    fields = track.timestamps(rows) | {
         "control_status_changes": np.cumsum(changed)[rows],
         "cs_gnss_pos": is_fusing[rows] & gnss,
         "cs_ev_pos": is_fusing[rows] & (not gnss),

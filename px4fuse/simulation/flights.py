@@ -75,7 +75,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
             f"EKF2 uses the larger of {GNSS_POS.noise} and the receiver's accuracy ({stated_m:g} "
             "m). Use a larger value."
         )
-    motion = plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
+    motion = plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
     positions = sensors.positions(scenario, mistakes, motion)
     imu = sensors.imu(scenario, mistakes, motion)
     parameters = _parameters(scenario, mistakes)
@@ -97,7 +97,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
         if len(topic.fields["timestamp"]) < 2:
             raise SettingsError(f"These mistakes leave no data in {topic.name}. Reduce them.")
     if scenario.ekf2:
-        own = ekf2.fly(scenario, mistakes, motion, imu, positions, others, parameters)
+        own = ekf2.simulate_ekf2(scenario, mistakes, motion, imu, positions, others, parameters)
         names = {topic.name for topic in own}
         topics = [*(topic for topic in topics if topic.name not in names), *own]
     if scenario.truth:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
-from px4fuse.simulation.scenario import KINDS, Kind, number, quantities
+from px4fuse.simulation.scenario import KINDS, Kind, bounded_number, quantities
 from px4fuse.units import NAMES, in_unit
 
 
@@ -24,37 +24,37 @@ class Mistakes:
     mean.
     """
 
-    clock_offset_s: float = number(0.0, -5.0, 5.0, "s", "SECONDS")
-    clock_drift_ppm: float = number(0.0, -20_000.0, 20_000.0, "ppm", "PPM")
-    clock_jump_s: float = number(0.0, 0.0, 5.0, "s", "SECONDS")
-    nlos_percent: float = number(0.0, 0.0, 50.0, "%", "PERCENT")
-    nlos_size_m: float = number(2.0, 0.0, 100.0, "m", "SIZE")
-    dropout_s: float = number(0.0, 0.0, 600.0, "s", "SECONDS")
-    dropout_at_s: float | None = number(None, 0.0, 1e4, "s", "AT")
-    imu_dropout_s: float = number(0.0, 0.0, 600.0, "s", "SECONDS")
-    imu_dropout_at_s: float | None = number(None, 0.0, 1e4, "s", "AT")
-    decimate_hz: float = number(0.0, 0.1, 100.0, "Hz", "HZ")
-    r_scale: float = number(1.0, 1e-4, 1e4, "", "FACTOR")
-    yaw_deg: float = number(0.0, -180.0, 180.0, "°", "DEG")
-    scale_percent: float = number(0.0, -50.0, 50.0, "%", "PERCENT")
-    jump_m: float = number(0.0, -100.0, 100.0, "m", "METRES")
-    jump_at_s: float | None = number(None, 0.0, 1e4, "s", "AT")
-    smoothed_s: float = number(0.0, 0.0, 10.0, "s", "SECONDS")
-    slow_error_m: float = number(0.0, 0.0, 100.0, "m", "METRES")
-    slow_error_s: float = number(30.0, 0.1, 1e4, "s", "TIME")
-    heading_deg: float = number(0.0, -180.0, 180.0, "°", "DEG")
-    heading_at_s: float | None = number(None, 0.0, 1e4, "s", "AT")
-    mag_gauss: float = number(0.0, -1.0, 1.0, "gauss", "GAUSS")
-    mag_at_s: float | None = number(None, 0.0, 1e4, "s", "AT")
-    accel_bias_m_s2: float = number(0.0, -5.0, 5.0, "m/s²", "M/S2")
-    vibration_m_s2: float = number(0.0, 0.0, 20.0, "m/s²", "M/S2")
-    imu_rate_hz: float = number(0.0, 1.0, 1000.0, "Hz", "HZ")
+    clock_offset_s: float = bounded_number(0.0, -5.0, 5.0, "s", "SECONDS")
+    clock_drift_ppm: float = bounded_number(0.0, -20_000.0, 20_000.0, "ppm", "PPM")
+    clock_jump_s: float = bounded_number(0.0, 0.0, 5.0, "s", "SECONDS")
+    nlos_percent: float = bounded_number(0.0, 0.0, 50.0, "%", "PERCENT")
+    nlos_size_m: float = bounded_number(2.0, 0.0, 100.0, "m", "SIZE")
+    dropout_s: float = bounded_number(0.0, 0.0, 600.0, "s", "SECONDS")
+    dropout_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    imu_dropout_s: float = bounded_number(0.0, 0.0, 600.0, "s", "SECONDS")
+    imu_dropout_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    decimate_hz: float = bounded_number(0.0, 0.1, 100.0, "Hz", "HZ")
+    r_scale: float = bounded_number(1.0, 1e-4, 1e4, "", "FACTOR")
+    yaw_deg: float = bounded_number(0.0, -180.0, 180.0, "°", "DEG")
+    scale_percent: float = bounded_number(0.0, -50.0, 50.0, "%", "PERCENT")
+    jump_m: float = bounded_number(0.0, -100.0, 100.0, "m", "METRES")
+    jump_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    smoothed_s: float = bounded_number(0.0, 0.0, 10.0, "s", "SECONDS")
+    slow_error_m: float = bounded_number(0.0, 0.0, 100.0, "m", "METRES")
+    slow_error_s: float = bounded_number(30.0, 0.1, 1e4, "s", "TIME")
+    heading_deg: float = bounded_number(0.0, -180.0, 180.0, "°", "DEG")
+    heading_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    mag_gauss: float = bounded_number(0.0, -1.0, 1.0, "gauss", "GAUSS")
+    mag_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    accel_bias_m_s2: float = bounded_number(0.0, -5.0, 5.0, "m/s²", "M/S2")
+    vibration_m_s2: float = bounded_number(0.0, 0.0, 20.0, "m/s²", "M/S2")
+    imu_rate_hz: float = bounded_number(0.0, 1.0, 1000.0, "Hz", "HZ")
     no_motion: bool = False
-    open_end_m: float = number(0.0, 0.0, 100.0, "m", "METRES")
+    open_end_m: float = bounded_number(0.0, 0.0, 100.0, "m", "METRES")
     no_vvo: bool = False
-    ekf2_noise_m: float = number(0.0, 0.01, 100.0, "m", "METRES")
-    ekf2_delay_s: float | None = number(None, 0.0, 0.3, "s", "SECONDS")
-    ekf2_gate: float = number(5.0, 1.0, 1000.0, "", "SD")
+    ekf2_noise_m: float = bounded_number(0.0, 0.01, 100.0, "m", "METRES")
+    ekf2_delay_s: float | None = bounded_number(None, 0.0, 0.3, "s", "SECONDS")
+    ekf2_gate: float = bounded_number(5.0, 1.0, 1000.0, "", "SD")
     ekf2_off: bool = False
 
 

@@ -322,15 +322,15 @@ def direction(heading_deg: float) -> Array:
 
 def _fly_aisle(ramps: _Plan, scenario: Scenario, speed_m_s: float) -> None:
     velocity = speed_m_s * direction(scenario.heading_deg)
-    follows = scenario.follows and speed_m_s > 0.0
-    pause_s = max(scenario.pause_s, TURN_ROUND_S) if follows else scenario.pause_s
+    nose_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
+    pause_s = max(scenario.pause_s, TURN_ROUND_S) if nose_follows_path else scenario.pause_s
     ramps.centre_s += START_STOP_S / 2.0
     for number in range(scenario.passes):
         way = velocity if number % 2 == 0 else -velocity
         ramps.change(way, START_STOP_S, scenario.length_m / scenario.speed_m_s)
         stopped_s = ramps.centre_s + START_STOP_S / 2.0
         ramps.change(-way, START_STOP_S, START_STOP_S + pause_s)
-        if follows and number < scenario.passes - 1:
+        if nose_follows_path and number < scenario.passes - 1:
             ramps.turn(np.pi, stopped_s, TURN_ROUND_S)
 
 
@@ -348,7 +348,7 @@ def _fly_loop(ramps: _Plan, scenario: Scenario, mistakes: Mistakes) -> None:
     for side in range(sides):
         velocity = speed * direction(scenario.heading_deg + 90.0 * side)
         length_s = CORNER_S if side else START_STOP_S
-        if side and scenario.follows and speed > 0.0:
+        if side and scenario.nose_follows_path and speed > 0.0:
             ramps.turn(np.pi / 2.0, ramps.centre_s - CORNER_S / 2.0, CORNER_S)
         metres = last_m if side == sides - 1 else scenario.length_m
         ramps.change(velocity - before, length_s, metres / scenario.speed_m_s)

@@ -54,13 +54,13 @@ class Bounds:
             raise SettingsError(f"{name} {value:g} is out of range: {allowed}.")
 
 
-def number(default: Any, *bounds: Any) -> Any:
+def bounded_number(default: Any, *bounds: Any) -> Any:
     """Return a numeric dataclass field with default and :class:`Bounds`."""
     return field(default=default, metadata={"quantity": Bounds(*bounds)})
 
 
 def quantities(record: type) -> dict[str, Bounds]:
-    """Return the bounds of all fields that :func:`number` made."""
+    """Return the bounds of all fields that :func:`bounded_number` made."""
     return {item.name: item.metadata["quantity"] for item in fields(record) if item.metadata}
 
 
@@ -123,12 +123,14 @@ class Scenario:
     """
 
     kind: Kind = "aisle"
-    passes: int = number(6, 1, 100, "", "--passes")
-    length_m: float = number(
+    passes: int = bounded_number(6, 1, 100, "", "--passes")
+    length_m: float = bounded_number(
         12.0, 2.0, 1000.0, "m", "--length", "Length of the aisle, or of one side of the square."
     )
-    speed_m_s: float = number(1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight parts.")
-    heading_deg: float = number(
+    speed_m_s: float = bounded_number(
+        1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight parts."
+    )
+    heading_deg: float = bounded_number(
         30.0,
         -360.0,
         360.0,
@@ -136,26 +138,26 @@ class Scenario:
         "--heading",
         "Heading of the aisle or of the first side, clockwise from north.",
     )
-    altitude_m: float = number(1.5, 0.5, 50.0, "m")
+    altitude_m: float = bounded_number(1.5, 0.5, 50.0, "m")
     yaw: Yaw | None = None
-    pause_s: float = number(3.0, 0.0, 600.0, "s")
-    wander_m: float = number(0.03, 0.0, 1.0, "m")
-    uwb_rate_hz: float = number(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "UWB rate.")
-    sigma_uwb_m: float = number(
+    pause_s: float = bounded_number(3.0, 0.0, 600.0, "s")
+    wander_m: float = bounded_number(0.03, 0.0, 1.0, "m")
+    uwb_rate_hz: float = bounded_number(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "UWB rate.")
+    sigma_uwb_m: float = bounded_number(
         0.10, 0.0, 10.0, "m", "--sigma-uwb", "White UWB position noise (1 σ): the true SIGMA_Z."
     )
-    vio_rate_hz: float = number(30.0, 1.0, 200.0, "Hz")
-    sigma_vio_m: float = number(0.01, 0.0, 10.0, "m")
-    vio_drift: float = number(
+    vio_rate_hz: float = bounded_number(30.0, 1.0, 200.0, "Hz")
+    sigma_vio_m: float = bounded_number(0.01, 0.0, 10.0, "m")
+    vio_drift: float = bounded_number(
         0.015, 0.0, 0.5, "", "--vio-drift", "VIO drift, as a fraction of the distance."
     )
-    vio_walk_m: float = number(0.01, 0.0, 1.0)
-    gnss_rate_hz: float = number(5.0, 1.0, 10.0, "Hz")
-    sigma_gnss_m: float = number(
+    vio_walk_m: float = bounded_number(0.01, 0.0, 1.0)
+    gnss_rate_hz: float = bounded_number(5.0, 1.0, 10.0, "Hz")
+    sigma_gnss_m: float = bounded_number(
         0.4, 0.0, 10.0, "m", "--sigma-gnss", "White GNSS position noise, north and east (1 σ)."
     )
-    sigma_gnss_m_s: float = number(0.3, 0.0, 5.0, "m/s")
-    sigma_a_m_s2: float = number(
+    sigma_gnss_m_s: float = bounded_number(0.3, 0.0, 5.0, "m/s")
+    sigma_a_m_s2: float = bounded_number(
         0.2,
         0.0,
         20.0,
@@ -163,7 +165,7 @@ class Scenario:
         "--sigma-a",
         "White accelerometer noise averaged over 0.1 s (1 σ): the true SIGMA_A.",
     )
-    accel_bias_sigma_m_s2: float = number(
+    accel_bias_sigma_m_s2: float = bounded_number(
         0.03,
         0.0,
         2.0,
@@ -171,16 +173,16 @@ class Scenario:
         "--accel-bias-sigma",
         "Standard deviation of the random constant accelerometer bias.",
     )
-    gyro_bias_sigma_rad_s: float = number(0.002, 0.0, 0.5)
-    gyro_noise_rad_s: float = number(0.01, 0.0, 1.0)
-    tilt_error_deg: float = number(0.1, 0.0, 10.0, "°")
-    yaw_error_deg: float = number(1.0, 0.0, 45.0, "°")
-    imu_rate_hz: float = number(250.0, 50.0, 1000.0, "Hz")
-    attitude_rate_hz: float = number(50.0, 5.0, 250.0, "Hz")
-    truth_rate_hz: float = number(50.0, 1.0, 250.0, "Hz")
+    gyro_bias_sigma_rad_s: float = bounded_number(0.002, 0.0, 0.5)
+    gyro_noise_rad_s: float = bounded_number(0.01, 0.0, 1.0)
+    tilt_error_deg: float = bounded_number(0.1, 0.0, 10.0, "°")
+    yaw_error_deg: float = bounded_number(1.0, 0.0, 45.0, "°")
+    imu_rate_hz: float = bounded_number(250.0, 50.0, 1000.0, "Hz")
+    attitude_rate_hz: float = bounded_number(50.0, 5.0, 250.0, "Hz")
+    truth_rate_hz: float = bounded_number(50.0, 1.0, 250.0, "Hz")
     truth: bool = True
     ekf2: bool = True
-    seed: int = number(1, 0, 2**32 - 1, "", "--seed")
+    seed: int = bounded_number(1, 0, 2**32 - 1, "", "--seed")
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -198,7 +200,7 @@ class Scenario:
             )
 
     @property
-    def follows(self) -> bool:
+    def nose_follows_path(self) -> bool:
         """Return True if the nose points along the direction of flight."""
         return self.yaw == "follow" or (self.yaw is None and self.kind != "aisle")
 

@@ -58,7 +58,7 @@ Stream = IntEnum(
 )
 
 
-def stream(scenario: Scenario, name: Stream) -> np.random.Generator:
+def random_stream(scenario: Scenario, name: Stream) -> np.random.Generator:
     """Return the generator of one random number stream."""
     return np.random.default_rng([scenario.seed, name])
 
@@ -96,7 +96,7 @@ class SensedPositions:
 
 def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
     """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
-    rng = stream(scenario, Stream.BIAS)
+    rng = random_stream(scenario, Stream.BIAS)
     accelerometer = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
     accelerometer[0] += mistakes.accel_bias_m_s2
     return accelerometer, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
@@ -107,7 +107,7 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
     truth = attitude(motion.at(seconds(time_us)))
     bias_a, bias_g = biases(scenario, mistakes)
-    rng = stream(scenario, Stream.IMU)
+    rng = random_stream(scenario, Stream.IMU)
     shape = (len(time_us), 3)
     force = truth.specific_force_m_s2 + bias_a
     force += scenario.accelerometer_noise_m_s2 * rng.standard_normal(shape)
@@ -115,7 +115,7 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     rate += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
     if mistakes.vibration_m_s2:
         sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
-        force += sigma * stream(scenario, Stream.VIBRATION).standard_normal(shape)
+        force += sigma * random_stream(scenario, Stream.VIBRATION).standard_normal(shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
     sample_fields: dict[str, Any] = {
@@ -133,10 +133,10 @@ def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topi
     if mistakes.heading_deg:  # EKF2's heading error is caused by this rotation
         rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ rotation
     field = np.einsum("nji,j->ni", rotation, EARTH_FIELD_GAUSS)
-    field += SIGMA_FIELD_GAUSS * stream(scenario, Stream.FIELD).standard_normal(field.shape)
+    field += SIGMA_FIELD_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(field.shape)
     at_s = motion.duration_s / 2.0 if mistakes.mag_at_s is None else mistakes.mag_at_s
     field[seconds(time_us) >= at_s, 1] += mistakes.mag_gauss
-    return topic("vehicle_magnetometer", stamps(time_us) | {"magnetometer_ga": field})
+    return topic("vehicle_magnetometer", timestamps(time_us) | {"magnetometer_ga": field})
 
 
 def barometer(scenario: Scenario, motion: Motion) -> Topic:
@@ -144,14 +144,14 @@ def barometer(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
     height_m = HOME[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
-    noise = stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
+    noise = random_stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
     height_m += SIGMA_BAROMETER_M * noise
-    return topic("vehicle_air_data", stamps(time_us) | {"baro_alt_meter": height_m})
+    return topic("vehicle_air_data", timestamps(time_us) | {"baro_alt_meter": height_m})
 
 
 def height_error(scenario: Scenario, time_s: Array) -> Array:
     """Return the slow height error, positive downward (m)."""
-    rng, rms = stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
+    rng, rms = random_stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
     return Sines.draw(rng, rms, ATTITUDE_PERIODS_S, ATTITUDE_SINES).at(time_s)[0][:, 0]
 
 
@@ -184,7 +184,7 @@ def mean_imu_at_rest(
     """Return mean accelerometer (m/s²) and gyro (rad/s) at rest before the log."""
     truth = attitude(motion.at(np.zeros(1)))
     bias_a, bias_g = biases(scenario, mistakes)
-    rng = stream(scenario, Stream.REST)
+    rng = random_stream(scenario, Stream.REST)
     share = 1.0 / np.sqrt(time_s * scenario.imu_rate_hz)
     force = truth.specific_force_m_s2[0] + bias_a
     force += share * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
@@ -215,13 +215,13 @@ def quaternions(body_to_ned: Array) -> Array:
 
 def attitude_topic(name: str, time_us: NDArray[np.int64], late_us: int, quaternion: Array) -> Topic:
     """Return an attitude topic, published ``late_us`` after the measurement."""
-    return topic(name, stamps(time_us, late_us) | {"q": quaternion})
+    return topic(name, timestamps(time_us, late_us) | {"q": quaternion})
 
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
     """Return the error of the logged attitude, a rotation about north, east and down."""
     tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
-    rng = stream(scenario, Stream.ATTITUDE)
+    rng = random_stream(scenario, Stream.ATTITUDE)
     rms = np.array([tilt, tilt, yaw])
     sines = Sines.draw(rng, rms, ATTITUDE_PERIODS_S, ATTITUDE_SINES)
     error = sines.at(time_s)[0]
@@ -246,7 +246,7 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
     """Return vehicle_local_position_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     state = motion.at(seconds(time_us))
-    fields = stamps(time_us) | vectors(
+    fields = timestamps(time_us) | vectors(
         {"": state.position_m, "v": state.velocity_m_s, "a": state.acceleration_m_s2}
     )
     fields["heading"] = np.angle(np.exp(1j * state.yaw_rad))
@@ -255,7 +255,7 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
 
 def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedPositions:
     """Return vehicle_visual_odometry (UWB in the aisle, VIO on the loop), or GNSS outdoors."""
-    timing = stream(scenario, Stream.TIMING)
+    timing = random_stream(scenario, Stream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
     count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
     nominal_s = FIRST_POSITION_S + interval_s * np.arange(count)
@@ -272,7 +272,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
     position += drift
     outdoor = scenario.kind == "outdoor"
     sigma = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if outdoor else 1.0)
-    position += sigma * stream(scenario, Stream.SOURCE).standard_normal(position.shape)
+    position += sigma * random_stream(scenario, Stream.SOURCE).standard_normal(position.shape)
     airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
     shift, outlier = outliers(scenario, mistakes, airborne)
     position += shift
@@ -289,11 +289,11 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
     keep = _is_outside_gap(
         time_s, mistakes.dropout_s, mistakes.dropout_at_s, motion.duration_s
     ) & keep_at_rate(time_s, mistakes.decimate_hz)
-    arrival_us, stamp_us = _stamps(mistakes, time_s, timing)
+    arrival_us, stamp_us = _source_times_us(mistakes, time_s, timing)
     reported_m = reported_sigma_m(scenario, mistakes)
     velocity = None
     if outdoor:
-        noise = stream(scenario, Stream.FIX_VELOCITY).standard_normal(position.shape)
+        noise = random_stream(scenario, Stream.FIX_VELOCITY).standard_normal(position.shape)
         velocity = (state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * noise)[keep]
         fix_us = stamp_us + round(1e6 * FIX_AGE_S)
         topic = _gnss_topic(fix_us[keep], position[keep], velocity, reported_m, scenario)
@@ -321,7 +321,7 @@ def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
 
 def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float) -> Array:
     """Return a first-order Gauss-Markov process on each axis, shape (n, 3)."""
-    noise = stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
+    noise = random_stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
     keep = np.exp(-interval_s / mistakes.slow_error_s)
     noise[1:] *= np.sqrt(1.0 - keep**2)
     return np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
@@ -329,7 +329,7 @@ def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: f
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
     """Return the VIO drift (m, NED), shape (n, 3): proportional to distance, plus a random walk."""
-    rng = stream(scenario, Stream.DRIFT)
+    rng = random_stream(scenario, Stream.DRIFT)
     straight = scenario.vio_drift * direction(rng.uniform(0.0, 360.0))
     steps = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
     walk = np.cumsum(steps * rng.standard_normal((len(distance_m), 3)), axis=0)
@@ -350,7 +350,7 @@ def outliers(
     count = round(len(flying) * mistakes.nlos_percent / 100.0)
     if count == 0:
         return shift, chosen
-    rng = stream(scenario, Stream.NLOS)
+    rng = random_stream(scenario, Stream.NLOS)
     bursts = -(-count // NLOS_BURST)
     lengths = 1 + rng.multinomial(count - bursts, np.full(bursts, 1.0 / bursts))
     gaps = rng.multinomial(len(flying) - count, np.full(bursts + 1, 1.0 / (bursts + 1)))
@@ -373,7 +373,7 @@ def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
     return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
 
 
-def _stamps(
+def _source_times_us(
     mistakes: Mistakes, time_s: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return arrival times and measurement timestamps, µs from the first data."""
@@ -395,7 +395,7 @@ def _odometry_topic(
     body_to_ned: Array | None,
 ) -> Topic:
     variance = np.full(position_m.shape, sigma_m**2)
-    fields = stamps(stamp_us, arrival_us - stamp_us)
+    fields = timestamps(stamp_us, arrival_us - stamp_us)
     fields |= {"position": position_m, "position_variance": variance}
     if body_to_ned is not None:
         fields["q"] = quaternions(body_to_ned)
@@ -422,7 +422,7 @@ def _gnss_topic(
         "altitude_msl_m": HOME[2] - position_m[:, 2],
     }
     velocity = {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
-    return topic(GPS_POSITION, stamps(stamp_us) | place | accuracies | velocity)
+    return topic(GPS_POSITION, timestamps(stamp_us) | place | accuracies | velocity)
 
 
 def _low_pass(position_m: Array, interval_s: float, constant_s: float) -> Array:
@@ -450,7 +450,7 @@ def seconds(time_us: NDArray[np.int64]) -> Array:
     return np.asarray(time_us * 1e-6, dtype=np.float64)
 
 
-def stamps(time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0) -> dict[str, Any]:
+def timestamps(time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0) -> dict[str, Any]:
     """Return ``timestamp`` and ``timestamp_sample``, published ``later_us`` after measurement."""
     return {
         "timestamp": _boot_stamps(time_us + later_us),
