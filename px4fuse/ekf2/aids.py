@@ -38,14 +38,14 @@ WINDOW_S, IN_WINDOW, WINDOWS_BEFORE, MIN_CHANGE_IN_SIGMA, MIN_CHANGE_SCATTER_RAT
     0.5,
     6.0,
 )
-# s without a fused sample while the aid is enabled. EKF2 resets to an aid after 7 s
-# (reset_timeout_max). The default logging profile records at least 2 Hz
+# s; limit of the time without a fused sample while the aid is enabled. EKF2 resets to an aid after
+# 7 s (reset_timeout_max). The default logging profile records at least 2 Hz
 NOT_FUSED_LIMIT_S = 5.0
-NOT_FUSED_INTERVALS = 10.0  # in intervals between logged fused samples
-# relative difference below which √R equals a noise parameter
+NOT_FUSED_INTERVALS = 10.0  # the same limit in intervals between logged fused samples
+# relative difference below which √R counts as equal to a noise parameter
 NOISE_TOLERANCE = 0.02
-# m above ground; for low flights half of the maximum height. Below, rotor downwash disturbs the
-# barometer, and the land detector may report flight on the ground
+# m above ground from which aids are evaluated; for low flights half of the maximum height. Below,
+# rotor downwash disturbs the barometer, and the land detector may report flight on the ground
 MIN_HEIGHT_M = 2.0
 
 

@@ -37,7 +37,7 @@ BIAS_LATE_S = 1.0
 # Hz; barometer rate in EKF2 from v1.15 and before, and the lowest logged rate that can be replayed.
 # One logged sample represents several if the log has fewer
 BAROMETER_HZ, OLD_BAROMETER_HZ, LEAST_HZ = 10.0, 15.0, 4.0
-# in √S; m or m/s, lower limit of the noise of position, height and velocity
+# lower limits of gates (√S) and of the noise of position (m) and velocity (m/s)
 MIN_GATE, MIN_SD = 1.0, 0.01
 
 

@@ -63,7 +63,7 @@ GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
 RESET_SHOWS_S = 0.2
 # s; longer steps lose rotation and vibration, EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
-# fraction of IMU samples missing from the log, gaps excluded; EKF2 received them
+# maximum fraction of IMU samples missing from the log outside gaps; EKF2 received them
 MAX_LOST_SHARE = 0.1
 # first release whose estimator_states have the timestamp of the fusion horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"

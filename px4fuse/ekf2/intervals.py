@@ -33,10 +33,10 @@ from px4fuse.ekf2.stretches import (
 )
 from px4fuse.trajectory.rotation import skew
 
-# s behind the fusion horizon at arrival; EKF2 never fuses an older sample (RingBuffer.h,
+# s; EKF2 never fuses a sample that arrives this long behind the fusion horizon (RingBuffer.h,
 # pop_first_older_than)
 MAX_LATE_S = 0.1
-# s behind the fusion horizon from which a sample counts as late (3 cm at 1 m/s)
+# s; a sample this long behind the fusion horizon counts as late (3 cm at 1 m/s)
 LATE_S = 0.03
 # Action of a sample: none, update of the state, or start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2

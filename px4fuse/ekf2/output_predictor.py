@@ -26,11 +26,11 @@ from px4fuse.ekf2.stretches import (
 )
 
 INTEGRAL_SHARE = 0.1
-# in time constants; later effects of a correction are neglected
+# time constants after which the effect of a correction is neglected
 FOLLOWED_TIME_CONSTANTS = 5.0
-# weight of a correction of 0; separates two corrections between the same rows
+# weight of a prior of 0, which separates two corrections between the same rows
 NO_CORRECTION = 1e-3
-# in median row intervals; a longer one has missing rows. Fraction of a correction that the
+# Median row intervals after which rows count as missing; fraction of a correction that the
 # remaining rows must show
 MISSING_ROWS, MIN_SHOWN_SHARE = 3.0, 0.5
 ATTITUDE_SHARE = 0.5

@@ -36,10 +36,10 @@ from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 # s; length of the first pass, which estimates the initial correlations
 CORRELATION_PASS_S = 8.0
 MIN_VARIANCE = 1e-30  # lower limit of a variance before division
-# range of NIS over gate² (1/2 to 2) in which an unlogged rejection is inferred from the published
+# Range of NIS / gate² (1/2 to 2) in which an unlogged rejection is inferred from the published
 # position
 GATE_EDGE_RATIO = 2.0
-# events whose intervals are stacked together, to limit memory
+# number of events whose intervals are stacked together, to limit memory
 EVENT_BATCH_SIZE = 64
 # m², variance of a measurement without effect
 IGNORED_VARIANCE = 1e9

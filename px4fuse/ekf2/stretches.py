@@ -32,15 +32,15 @@ from px4fuse.trajectory.rotation import (
 RESTART_GAP_S = 2.0
 # s; PX4 limits a prediction step to 2 EKF2_PREDICT_US, so motion in a longer gap is lost
 IMU_GAP_S = 0.05
-# s of fusion before the replay starts
+# s; minimum time of fusion before the replay starts
 START_AFTER_S = 1.0
-# s in the air before the replay starts: on the ground EKF2 fuses zero velocity and gravity, and
-# take-off separates tilt from accelerometer bias
+# s; minimum time in the air before the replay starts: on the ground EKF2 fuses zero velocity and
+# gravity, and take-off separates tilt from accelerometer bias
 AIRBORNE_S = 4.0
-SETTLING_S = 5.0  # s of replay before it is evaluated
+SETTLING_S = 5.0  # s; time of the replay before it is evaluated
 # s; EKF2 resets heading and fields after take-off, and only later samples are logged
 FIELD_AFTER_S = 1.0
-# s before the start of the replay, used to estimate the initial correlations
+# s; flight time before the start of the replay, used to estimate the initial correlations
 HISTORY_S = 20.0
 # Hz; EKF2 fuses the field at 14 Hz (SENS_MAG_RATE 15), a logged sample represents several; and the
 # lowest logged rate that can be replayed
@@ -50,13 +50,13 @@ FILTER_S = 0.5
 MIN_STRETCH_S = 10.0
 # s; resets are published up to the largest delay plus one row of the log later
 MAX_RESET_DELAY_S = 0.5
-# of the samples within 1 s; with more clipped samples the motion is lost
+# fraction of clipped samples within 1 s above which the motion is lost
 MAX_CLIPPED_SHARE = 0.05
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 
 
-# Rows of Stretch.state
+# Row ranges in Stretch.state
 STATES = 15
 IMU_STATE_COUNT = 9  # states that the IMU propagates: all except the biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)

@@ -22,8 +22,8 @@ from px4fuse.ekf2.stretches import Stretch, pad_samples, samples_by_event
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 
 SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
-# s without a sample after which fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp); s outside the
-# gate after which EKF2 resets the bias or the position (no_aid_timeout_max, common.h)
+# s; time without a sample after which fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp); time
+# outside the gate after which EKF2 resets the bias or the position (no_aid_timeout_max, common.h)
 STOP_S, FAILING_S = 0.4, 1.0
 COLUMNS = [
     "innovation_north_m",

@@ -59,15 +59,17 @@ OWN_HEADING, OWN_HEIGHT = (
         "height error", "the replay uses the logged EKF2 height", "Read the height in the log."
     ),
 )
-# s that must remain to evaluate after an aid is disabled
+# s; minimum time to evaluate after an aid is disabled
 MIN_EVALUATED_S = 5.0
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
-# m, position noise of repeated runs. A result is predictable if this noise hardly changes it
+# Position noise (m) and number of repeated runs. A result is predictable if this noise hardly
+# changes it
 DISTURBED_M, DISTURBED_RUNS = 0.002, 4
 # Rejected share below which no repeated runs are needed, and above which nothing is predictable
 MIN_REJECTED_SHARE, MAX_REJECTED_SHARE = 0.02, 0.35
-# s without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max, common.h)
+# s; time without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
+# common.h)
 HEIGHT_TIMEOUT_S = 5.0
 # Limits of predictable results between repeated runs: ratio of mean NIS, difference of the rejected
 # share, ratio of the position RMSE
@@ -409,7 +411,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
         fused = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
         longest = _longest_between_fusions(np.concatenate([fused, resets]), judged)
-    assert isinstance(flight.attitude, pd.DataFrame)  # required by the replay
+    assert isinstance(flight.attitude, pd.DataFrame)  # a replay requires the attitude
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
         name: logged_aid_innovations(name, ekf2.aids[name]) for name in replay.other_aid_updates

@@ -68,7 +68,7 @@ REST_S = 10.0
 REST_SD = np.repeat([0.05, 0.0005, 0.06], 3)
 # rad and m; σ of heading and height as logged by v1.16 in flight
 HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.15
-# s; small enough to log variances between UWB samples
+# s; small enough that variances between UWB samples are logged
 MAX_INTERVAL_S = 0.1
 
 

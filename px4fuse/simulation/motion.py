@@ -19,15 +19,15 @@ from px4fuse.errors import SettingsError
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
 
-# s on the ground before take-off and after landing
+# s; time on the ground before take-off and after landing
 GROUND_S = 6.0
 CLIMB_M_S = 0.75
 CLIMB_RAMP_S = 1.5
-# s; the log has 70 MB
+# s; a log of this length has 70 MB
 MAX_FLIGHT_S = 3600.0
 # s; fade-in and fade-out of the slow deviation after take-off and before landing
 FADE_S = 3.0
-# s for a 180° turn at the end of the aisle with --yaw follow
+# s; time of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
 WANDER_PERIODS_S = (3.0, 20.0)
 WANDER_SINES = 4
@@ -198,7 +198,7 @@ class Motion:
         rise = np.clip((time_s - self.take_off_s) / FADE_S, 0.0, 1.0)
         fall = np.clip((time_s - self.touch_down_s) / FADE_S + 1.0, 0.0, 1.0)
         inside = np.flatnonzero((rise * (1.0 - rise) > 0.0) | (fall * (1.0 - fall) > 0.0))
-        # rise and fall do not overlap
+        # at most one of fade-in and fade-out is active
         down = fall[inside] > 0.0
         sign = np.where(down, -1.0, 1.0)
         _, *derivatives = _quintic(np.where(down, fall[inside], rise[inside]))

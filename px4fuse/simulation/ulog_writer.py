@@ -138,10 +138,10 @@ def _data(topic: Topic, number: int) -> list[bytes]:
         (name, values.dtype.newbyteorder("<"), values.shape[1:])
         for name, values in topic.fields.items()
     ]
-    # the prefix avoids name conflicts with PX4 fields
+    # the underscore avoids name conflicts with PX4 fields
     dtype = np.dtype([(f"_{name}", kind) for name, kind in head] + body)
     records = np.zeros(len(topic.fields["timestamp"]), dtype)
-    records["_size"] = dtype.itemsize - 3  # without the bytes of size and kind
+    records["_size"] = dtype.itemsize - 3  # excludes the header bytes of size and kind
     records["_kind"] = ord("D")
     records["_number"] = number
     for name, values in topic.fields.items():
