@@ -62,7 +62,7 @@ def with_aids(**aids: AidLog) -> Flight:
     return replace(flight, ekf2=replace(flight.ekf2, aids=aids))
 
 
-def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
+def evaluate(log: AidLog, name: str = "gnss_pos") -> AidResult:
     return evaluate_aids(with_aids(**{name: log}))[name]
 
 
@@ -71,7 +71,7 @@ def judged(log: AidLog, name: str = "gnss_pos") -> AidResult:
     (0.43, "consistent"), (0.37, "variance overstated"),
 ])  # fmt: skip
 def test_aid_verdict_sigma_ratio_has_tolerance(sigma, verdict) -> None:
-    aid = judged(aid_log(sigma=sigma))
+    aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
     assert aid.axes["north"].sigma_factor == pytest.approx(0.5 / sigma, rel=0.04)
@@ -80,21 +80,21 @@ def test_aid_verdict_sigma_ratio_has_tolerance(sigma, verdict) -> None:
 
 
 def test_aid_verdict_large_mean_innovation_is_biased() -> None:
-    assert judged(aid_log(mean=0.35)).verdict == "biased"
-    assert judged(aid_log(mean=0.2)).verdict == "consistent"
+    assert evaluate(aid_log(mean=0.35)).verdict == "biased"
+    assert evaluate(aid_log(mean=0.2)).verdict == "consistent"
     # small compared with √S: EKF2 hardly follows
-    assert judged(aid_log(sigma=0.05, mean=0.09)).verdict == "variance overstated"
-    assert judged(aid_log(sigma=0.05, mean=0.11)).verdict == "biased"
+    assert evaluate(aid_log(sigma=0.05, mean=0.09)).verdict == "variance overstated"
+    assert evaluate(aid_log(sigma=0.05, mean=0.11)).verdict == "biased"
 
 
 def test_aid_gap_counts_only_if_it_begins_while_enabled() -> None:
     log = aid_log(enabled=steps((0.0, 1.0), (26.0, 0.0), (40.0, 1.0)))
     before_gap = log.samples.loc[:20.0]
-    outage = judged(replace(log, samples=pd.concat([before_gap, log.samples.loc[40.0:]])))
+    outage = evaluate(replace(log, samples=pd.concat([before_gap, log.samples.loc[40.0:]])))
     assert (outage.verdict, outage.longest_without_s) == ("starved", (20.0, 40.0))
     # disabled at once: no gap
     enabled = steps((0.0, 1.0), (20.05, 0.0), (40.0, 1.0))
-    given_up = judged(replace(log, samples=outage_free(log, 20.0, 40.0), enabled=enabled))
+    given_up = evaluate(replace(log, samples=outage_free(log, 20.0, 40.0), enabled=enabled))
     assert given_up.verdict == "consistent"
     assert given_up.longest_without == pytest.approx(0.1, abs=0.01)
     assert given_up.intended_share == pytest.approx(40.0 / 60.0, abs=0.02)
@@ -107,11 +107,11 @@ def outage_free(log: AidLog, start_s: float, end_s: float) -> pd.DataFrame:
 
 def test_aid_verdict_never_enabled_is_idle() -> None:
     log = aid_log()
-    assert judged(replace(log, enabled=steps((0.0, 0.0)))).verdict == "idle"
-    few = judged(replace(log, samples=log.samples.iloc[::80], enabled=steps((0.0, 1.0))))
+    assert evaluate(replace(log, enabled=steps((0.0, 0.0)))).verdict == "idle"
+    few = evaluate(replace(log, samples=log.samples.iloc[::80], enabled=steps((0.0, 1.0))))
     assert (few.verdict, few.axes) == ("starved", {})
     three_hertz = pd.DataFrame(log.samples.iloc[:9])
-    assert judged(replace(log, samples=three_hertz, enabled=steps((0.0, 1.0), (0.9, 0.0)))
+    assert evaluate(replace(log, samples=three_hertz, enabled=steps((0.0, 1.0), (0.9, 0.0)))
                   ).verdict == "too few samples"  # fmt: skip
 
 
@@ -122,17 +122,17 @@ def test_aid_reset_rows_are_counted_and_excluded() -> None:
     for axis in log.axes:
         samples.loc[reset, f"innovation_{axis}"] = 0.0
         samples.loc[reset, f"variance_{axis}"] = samples[f"noise_{axis}"].iloc[0]
-    aid = judged(replace(log, samples=samples))
-    assert (aid.resets, aid.axes["north"].samples) == (2, judged(log).axes["north"].samples - 2)
+    aid = evaluate(replace(log, samples=samples))
+    assert (aid.resets, aid.axes["north"].samples) == (2, evaluate(log).axes["north"].samples - 2)
 
 
 def test_aid_gate_is_from_test_ratios_or_parameter() -> None:
-    assert judged(aid_log(gate=3.0)).gate == pytest.approx(3.0)
-    assert judged(aid_log(own=False, EKF2_GPS_P_GATE=4.0)).gate == 4.0
-    assert judged(aid_log(own=False, EKF2_GPS_P_GATE=0.0)).gate == 0.01
-    assert judged(aid_log(own=False)).gate == AIDS["gnss_pos"].default_gate
+    assert evaluate(aid_log(gate=3.0)).gate == pytest.approx(3.0)
+    assert evaluate(aid_log(own=False, EKF2_GPS_P_GATE=4.0)).gate == 4.0
+    assert evaluate(aid_log(own=False, EKF2_GPS_P_GATE=0.0)).gate == 0.01
+    assert evaluate(aid_log(own=False)).gate == AIDS["gnss_pos"].default_gate
     # without rejection flags the gate decides
-    aid = judged(aid_log(own=False, sigma=1.0, EKF2_GPS_P_GATE=2.0))
+    aid = evaluate(aid_log(own=False, sigma=1.0, EKF2_GPS_P_GATE=2.0))
     inside = 0.6827**2  # both axes within 1 σ
     assert aid.rejected_share == pytest.approx(1.0 - inside, abs=0.05)
     assert not aid.fused_logged
@@ -148,10 +148,10 @@ def test_aid_gate_is_from_test_ratios_or_parameter() -> None:
     ("gnss_pos", {}, "the accuracy reported by the receiver"),
 ])  # fmt: skip
 def test_aid_noise_names_its_origin(name: str, parameters: dict[str, float], set_by: str) -> None:
-    aid = judged(aid_log(**parameters), name)
+    aid = evaluate(aid_log(**parameters), name)
     assert aid.noise == pytest.approx(0.5 * 0.5**0.5)
     assert aid.noise_from == set_by
-    assert judged(aid_log(own=False, **parameters), name).noise_from == ""
+    assert evaluate(aid_log(own=False, **parameters), name).noise_from == ""
 
 
 def test_aid_verdict_slow_logging_is_consistent() -> None:
@@ -160,7 +160,7 @@ def test_aid_verdict_slow_logging_is_consistent() -> None:
     decimated = replace(log, samples=log.samples.iloc[::10])
     for gap_s, verdict in ((7.6, "consistent"), (12.0, "starved")):
         samples = outage_free(decimated, 20.0, 20.0 + gap_s)
-        assert judged(replace(decimated, samples=samples)).verdict == verdict
+        assert evaluate(replace(decimated, samples=samples)).verdict == verdict
 
 
 def test_aid_findings_contain_aid_numbers_and_times() -> None:
@@ -185,7 +185,7 @@ def test_aid_mean_change_is_reported_with_time() -> None:
     for from_s, expected_s in ((22.0, 20.0), (39.5, 40.0)):
         changed = log.samples.copy()
         changed.loc[from_s:, "innovation_east"] -= 0.7  # 1.4 √S
-        found = judged(replace(log, samples=changed))
+        found = evaluate(replace(log, samples=changed))
         assert found.axes["north"].change is None
         when_s, moved = found.axes["east"].change  # type: ignore[misc]
         assert when_s == pytest.approx(expected_s, abs=0.5)
@@ -205,7 +205,7 @@ def test_aid_mean_change_is_reported_with_time() -> None:
     assert next(find_in({"mag": rejected}, "gnss_pos")).evidence[CAUSE] == CHANGE
     little = log.samples.copy()
     little.loc[35.0:, "innovation_east"] -= 0.2
-    assert judged(replace(log, samples=little)).axes["east"].change is None
+    assert evaluate(replace(log, samples=little)).axes["east"].change is None
 
 
 # ------------------------------------------------------------------------------ reading

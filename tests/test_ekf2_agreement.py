@@ -49,14 +49,22 @@ def test_match_updates_uses_measurement_or_fusion_time():
 
 def test_evaluated_spans_exclude_first_5_s():
     replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
-    judged = replay.judged_s
-    assert judged == ((15.0, 30.0), (45.0, 60.0))
+    evaluated_spans = replay.judged_s
+    assert evaluated_spans == ((15.0, 30.0), (45.0, 60.0))
     # times with flow as the only aid, and the seconds after them, are excluded
     carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
                    flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
     assert carried.judged_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
-    assert inside_spans(times, judged).tolist() == [False, True, True, False, False, True, False]
+    assert inside_spans(times, evaluated_spans).tolist() == [
+        False,
+        True,
+        True,
+        False,
+        False,
+        True,
+        False,
+    ]
 
 
 def agreeing(

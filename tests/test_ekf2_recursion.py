@@ -407,11 +407,11 @@ def test_interval_unit_noise_matches_steps(n):
         for at, rows in enumerate((slice(0, 3), slice(3, 6))):
             sums[at] = F @ sums[at] @ F.T
             sums[at][rows, rows] += dt**2 * np.eye(3)
-    made_at_once = _noises(np.array([float(n)]), np.array([n * dt]), (n * tilt)[None])
+    closed_forms = _noises(np.array([float(n)]), np.array([n * dt]), (n * tilt)[None])
     # for the gyro, only leading terms of position with velocity and itself
-    sums[0][6:9, 3:9] = made_at_once[0][0, 6:9, 3:9] if n == 4 else sums[0][6:9, 3:9]
+    sums[0][6:9, 3:9] = closed_forms[0][0, 6:9, 3:9] if n == 4 else sums[0][6:9, 3:9]
     sums[0][3:6, 6:9] = sums[0][6:9, 3:6].T
-    for found, true in zip(made_at_once, sums, strict=True):
+    for found, true in zip(closed_forms, sums, strict=True):
         scale = np.sqrt(np.outer(np.diag(true), np.diag(true)))
         scale[scale == 0.0] = 1.0
         assert np.max(np.abs(found[0] - true) / scale) < (1e-9 if n == 4 else 0.03)
@@ -458,13 +458,13 @@ def events(
 def test_events_sample_is_fused_at_its_step_end():
     """Half a step and the delay before its timestamp; additional events in gaps of vision."""
     found = events([10.2, 10.305, 10.9])
-    seen = found.sample >= 0
+    has_sample = found.sample >= 0
     assert found.sample.tolist() == [0, 1, -1, -1, 2]
-    assert found.end[seen].tolist() == [20, 30, 90]
-    assert found.end[~seen].tolist() == [50, 70]
+    assert found.end[has_sample].tolist() == [20, 30, 90]
+    assert found.end[~has_sample].tolist() == [50, 70]
     assert found.time_s == pytest.approx([10.195, 10.3, 10.5, 10.7, 10.895])
-    assert found.usable[seen].all()
-    assert not found.usable[~seen].any()
+    assert found.usable[has_sample].all()
+    assert not found.usable[~has_sample].any()
     assert found.action.tolist() == [FUSE, FUSE, IDLE, IDLE, IDLE]
     assert events([10.2, 10.305], delay_s=0.05).end[:2].tolist() == [15, 25]
     assert events([10.505]).sample[:3].tolist() == [-1, -1, 0]

@@ -179,10 +179,10 @@ def test_rms_to_truth_uses_common_span():
 
 
 def test_longest_between_fusions_includes_both_ends():
-    judged = ((15.0, 30.0), (40.0, 60.0))
-    assert _longest_between_fusions(np.array([16.0, 29.0, 41.0, 59.0]), judged) == 18.0
-    assert _longest_between_fusions(np.array([40.0]), judged) == 25.0
-    assert _longest_between_fusions(np.array([16.0]), judged) == 44.0
+    evaluated_spans = ((15.0, 30.0), (40.0, 60.0))
+    assert _longest_between_fusions(np.array([16.0, 29.0, 41.0, 59.0]), evaluated_spans) == 18.0
+    assert _longest_between_fusions(np.array([40.0]), evaluated_spans) == 25.0
+    assert _longest_between_fusions(np.array([16.0]), evaluated_spans) == 44.0
 
 
 def test_summary_combines_north_and_east() -> None:
@@ -226,15 +226,17 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
 ])  # fmt: skip
 def test_what_if_rejecting_flight_predicts_remedy(tmp_path, mistake, seed, changes):
     """Only with the logged rejections does the replay agree with these logs."""
-    ill, well = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
-    assert ill.agreement.rejected_share_logged > 0.35
-    assert ill.agreement.good
-    (cured,) = what_if(ill, [changes]).whatif
-    truly = what_if(well, [{}]).logged
-    assert cured.steady
-    assert cured.nis_mean == pytest.approx(truly.nis_mean, rel=0.1)
-    assert cured.rejected_share == pytest.approx(truly.rejected_share, abs=0.03)
-    assert cured.position_rmse_to_truth_m == pytest.approx(truly.position_rmse_to_truth_m, rel=0.15)
+    faulty, correct = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
+    assert faulty.agreement.rejected_share_logged > 0.35
+    assert faulty.agreement.good
+    (predicted,) = what_if(faulty, [changes]).whatif
+    expected = what_if(correct, [{}]).logged
+    assert predicted.steady
+    assert predicted.nis_mean == pytest.approx(expected.nis_mean, rel=0.1)
+    assert predicted.rejected_share == pytest.approx(expected.rejected_share, abs=0.03)
+    assert predicted.position_rmse_to_truth_m == pytest.approx(
+        expected.position_rmse_to_truth_m, rel=0.15
+    )
 
 
 def test_what_if_most_rejected_is_unpredictable(model):
@@ -261,14 +263,14 @@ def test_what_if_noise_sensitive_result_is_unpredictable(model, monkeypatch):
         runs.append((sigma_m, seed))
         return model
 
-    def judged(changed: Summary) -> bool:
+    def is_predictable(changed: Summary) -> bool:
         monkeypatch.setattr(whatif, "with_position_noise", with_position_noise)
         monkeypatch.setattr(whatif, "replay_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_summarise_replay", lambda *_: changed)
         (found,) = whatif._mark_unpredictable(model, [base], ((0.0, 1.0),), {})
         return found.steady
 
-    assert judged(base)
+    assert is_predictable(base)
     assert runs == [(0.002, 0), (0.002, 1), (0.002, 2), (0.002, 3)]
     for axes, field, value, steady in (
         (("north",), "nis_mean", 1.099, True), (("north",), "nis_mean", 1.101, False),
@@ -280,7 +282,7 @@ def test_what_if_noise_sensitive_result_is_unpredictable(model, monkeypatch):
     ):  # fmt: skip
         other = structs.replace(north, **{field: value}) if axes else None
         changed = dict.fromkeys(axes, other) if axes else {field: value}
-        assert judged(structs.replace(base, **changed)) is steady
+        assert is_predictable(structs.replace(base, **changed)) is steady
     few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
     runs.clear()
     assert [one.steady for one in whatif._mark_unpredictable(model, [few, many], (), {})] == [

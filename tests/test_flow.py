@@ -51,9 +51,9 @@ def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
     turn = stretch.rotation[np.searchsorted(stretch.time_s, times - 1e-9)]
     raw = np.einsum("nji,nj->ni", turn, true_velocity(times))[:, :2]
     raw += np.random.default_rng(1).normal(0.0, 1.0, raw.shape) * noise_m_s
-    kept = low_passed(raw)[::every]
+    remaining = low_passed(raw)[::every]
     decay = (1.0 - SHARE) ** every
-    mean = (kept[1:] - decay * kept[:-1]) / (1.0 - decay)
+    mean = (remaining[1:] - decay * remaining[:-1]) / (1.0 - decay)
     return pd.DataFrame({
         "forward_m_s": mean[:, 0], "right_m_s": mean[:, 1], "samples": float(every),
         "interval_s": INTERVAL_S, "noise_m2_s2": max(noise_m_s, 0.3) ** 2,
@@ -112,11 +112,11 @@ def test_flow_samples_give_velocity_at_next_event(every):
     with_flow = add_flow_samples(stretch, flow_of(every=every), 3.0)
     end = next(iter(model().intervals.values()))[0].events.end
     found = mean_by_event(with_flow.flow, end, stretch.imu_velocity_m_s)
-    seen = found.number > 0.0
+    has_sample = found.number > 0.0
     assert found.number.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
-    speed = true_velocity(stretch.time_s[end[seen]])
-    expected = np.einsum("kab,kb->ka", found.turn[seen], speed)
-    off = found.value[seen] - expected
+    speed = true_velocity(stretch.time_s[end[has_sample]])
+    expected = np.einsum("kab,kb->ka", found.turn[has_sample], speed)
+    off = found.value[has_sample] - expected
     assert np.sqrt(np.mean(off**2)) < 0.03
     assert np.ptp(expected, axis=0).min() > 0.7
 
@@ -192,9 +192,9 @@ def test_read_gnss_while_disabled_omits_fixes():
     every = read_gnss(flight, with_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record)
     delay_s = ekf2.record.parameters["EKF2_GPS_DELAY"] * 1e-3
     measured_s = every.stamp_s - delay_s  # type: ignore[union-attr]
-    kept = (measured_s < 50.0) | (measured_s >= 60.0)
-    assert 0 < np.sum(~kept) < len(kept)
-    np.testing.assert_array_equal(found.stamp_s, every.stamp_s[kept])  # type: ignore[union-attr]
+    remaining = (measured_s < 50.0) | (measured_s >= 60.0)
+    assert 0 < np.sum(~remaining) < len(remaining)
+    np.testing.assert_array_equal(found.stamp_s, every.stamp_s[remaining])  # type: ignore[union-attr]
 
 
 def test_stretch_start_correlation_is_from_earlier_flight():

@@ -120,9 +120,9 @@ def test_findings_known_fault_has_id_numbers_and_remedy(shared_logs, name):
         boot_s = analysis.flight.log.boot_time_s
         time = np.array([each["t_px4_us"] for each in wrong]) * 1e-6 - boot_s
         segment = analysis.segment
-        truly = time[(time > segment.start_s) & (time < segment.end_s)]
-        right = np.abs(noise.outlier_time_s[:, None] - truly).min(axis=1) < 0.02
-        assert right.sum() > 0.9 * max(len(right), len(truly)) > 13
+        expected_s = time[(time > segment.start_s) & (time < segment.end_s)]
+        right = np.abs(noise.outlier_time_s[:, None] - expected_s).min(axis=1) < 0.02
+        assert right.sum() > 0.9 * max(len(right), len(expected_s)) > 13
 
 
 # Factor between reported and actual horizontal innovation variance in real motion-capture flights

@@ -190,8 +190,8 @@ def test_prepare_gnss_sigma_z_equals_ekf2_noise(eph_m, least_m, axes, expected_m
     request = ComparisonRequest(log="a.ulg", axes=axes)
     prepared = prepare_comparison(request, flight=flight)
     assert prepared.settings.sigma_z_m == pytest.approx(expected_m, rel=1e-3)
-    asked = ComparisonRequest(log="a.ulg", axes=axes, sigma_z_m=0.3)
-    assert prepare_comparison(asked, flight=flight).settings.sigma_z_m == 0.3
+    requested = ComparisonRequest(log="a.ulg", axes=axes, sigma_z_m=0.3)
+    assert prepare_comparison(requested, flight=flight).settings.sigma_z_m == 0.3
 
 
 def test_prepare_gnss_innovations_are_from_gnss(tmp_path):
@@ -251,8 +251,8 @@ def test_prepare_down_uses_fused_barometer(tmp_path):
 def test_prepare_down_unfused_barometer_needs_option(tmp_path):
     flight = flight_of(with_barometer(outdoors(), fused=False), tmp_path)
     assert prepare(flight, axes=("down",)).source.barometer is None
-    asked = prepare(flight, axes=("down",), height="barometer")
-    assert asked.source.barometer is not None
+    requested = prepare(flight, axes=("down",), height="barometer")
+    assert requested.source.barometer is not None
     bare = flight_of(outdoors(), tmp_path)
     with pytest.raises(MissingDataError, match="no height by a barometer"):
         prepare(bare, height="barometer")
@@ -693,12 +693,12 @@ def test_reconstruct_fixes_recovers_missing_fixes(recorded, request):
     ekf2 = replace(
         flight.ekf2, aids=dict(flight.ekf2.aids) | {"gnss_pos": replace(log, samples=rows)}
     )
-    kept = every.iloc[np.cumsum(np.random.default_rng(1).choice([4, 5, 5, 6], 200))]
-    made, (note,) = reconstruct_fixes(kept, ekf2, 0.11)
+    remaining = every.iloc[np.cumsum(np.random.default_rng(1).choice([4, 5, 5, 6], 200))]
+    made, (note,) = reconstruct_fixes(remaining, ekf2, 0.11)
 
     def notes_of(samples: pd.DataFrame) -> tuple[str, ...]:
         aids = dict(ekf2.aids) | {"gnss_pos": replace(log, samples=samples)}
-        return reconstruct_fixes(kept, replace(ekf2, aids=aids), 0.11)[1]
+        return reconstruct_fixes(remaining, replace(ekf2, aids=aids), 0.11)[1]
 
     assert len(made) > 60
     assert "0.0" in note
@@ -712,16 +712,16 @@ def test_reconstruct_fixes_recovers_missing_fixes(recorded, request):
     # nor from a row in the fusion step, whose fix is ambiguous
     assert notes_of(rows.set_axis(rows.index - 0.03)) == ()
     unknown = Unavailable("horizon", "not logged", "Log it.")
-    assert reconstruct_fixes(kept, replace(ekf2, horizon_s=unknown), 0.11)[1] == ()
+    assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=unknown), 0.11)[1] == ()
     # a fix older than the horizon is fused at the horizon
-    assert reconstruct_fixes(kept, replace(ekf2, horizon_s=0.05), 0.11)[1] != (note,)
+    assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=0.05), 0.11)[1] != (note,)
 
 
 def test_receiver_interval_is_found_from_logged_fixes():
     rng = np.random.default_rng(3)
     for interval_s in (0.1, 0.096, 0.2, 0.125):
-        kept = np.cumsum(rng.choice([4, 5, 6], 100)) * interval_s
-        found = px4_fixes._interval_s(kept + rng.normal(0.0, 0.0005, 100))
+        remaining = np.cumsum(rng.choice([4, 5, 6], 100)) * interval_s
+        found = px4_fixes._interval_s(remaining + rng.normal(0.0, 0.0005, 100))
         assert found == pytest.approx(interval_s, rel=0.01)
     assert px4_fixes._interval_s(np.cumsum(rng.uniform(0.3, 0.9, 100))) is None
     # ambiguous: every fifth of 0.1 s, or every fourth of 0.125 s

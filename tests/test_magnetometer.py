@@ -120,10 +120,10 @@ def magnetic(generation: str = "v1.16", kept_hz: float = 2.0) -> Log:
     """Return a log with a magnetometer at 5 Hz, and EKF2's copy at another rate."""
     log = gnss_log(generation)
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
-    at, kept = stamps(20.0, 5.0), stamps(20.0, kept_hz)
+    at, remaining = stamps(20.0, 5.0), stamps(20.0, kept_hz)
     log.add(topic("vehicle_magnetometer", at, {"magnetometer_ga": np.tile(EARTH, (len(at), 1))}))
-    own = {"observation": np.tile(2.0 * EARTH, (len(kept), 1))}
-    log.add(topic("estimator_aid_src_mag", kept, own))
+    own = {"observation": np.tile(2.0 * EARTH, (len(remaining), 1))}
+    log.add(topic("estimator_aid_src_mag", remaining, own))
     flags = np.where(at < at[40], 1 << 4, 1 << 5).astype(np.uint64)
     log.drop(*({"estimator_status"} & log.names()))
     log.add(topic("estimator_status", at, {"control_mode_flags": flags}))
@@ -154,12 +154,16 @@ def test_read_field_prefers_topic_with_more_samples(tmp_path: Path) -> None:
 def test_read_field_filtered_innovations_are_kept(tmp_path: Path) -> None:
     """EKF2's copy at a low rate is used, except if the sensor topic contains all samples."""
     log = magnetic()
-    kept = log["estimator_aid_src_mag"]
-    kept["innovation_filtered"] = np.linspace(0.0, 0.01, kept["timestamp"].size)[:, None] + EARTH
+    remaining = log["estimator_aid_src_mag"]
+    remaining["innovation_filtered"] = (
+        np.linspace(0.0, 0.01, remaining["timestamp"].size)[:, None] + EARTH
+    )
     field = field_of(log, tmp_path)
-    assert len(field) == kept["timestamp"].size
+    assert len(field) == remaining["timestamp"].size
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(2.0 * EARTH, (len(field), 1)), rtol=1e-6)
-    np.testing.assert_allclose(field[Columns.FIELD_INNOVATION], kept["innovation_filtered"], 1e-6)
+    np.testing.assert_allclose(
+        field[Columns.FIELD_INNOVATION], remaining["innovation_filtered"], 1e-6
+    )
     at = stamps(20.0, 12.0)
     log.drop("vehicle_magnetometer")
     log.add(topic("vehicle_magnetometer", at, {"magnetometer_ga": np.tile(EARTH, (len(at), 1))}))
@@ -187,19 +191,21 @@ def test_mean_field_recovers_mean_measurement() -> None:
     filtered = innovation.copy()
     for k in range(1, len(taken_s)):
         filtered[k] = filtered[k - 1] + share * (innovation[k] - filtered[k - 1])
-    kept = np.r_[np.arange(every - 1, len(taken_s), every)]
-    kept = np.delete(kept, [count, *range(20, 26)])  # the logger missed one row, then three seconds
+    remaining = np.r_[np.arange(every - 1, len(taken_s), every)]
+    remaining = np.delete(
+        remaining, [count, *range(20, 26)]
+    )  # the logger missed one row, then three seconds
     fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
     delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
     matrices = rotation.as_matrix()
     stretch = made(Stretch, time_s=time_s, rotation=matrices, attitude_error_rad=error)
-    found = _mean_field(stretch, delayed, taken_s[kept], filtered[kept])
-    near = np.flatnonzero(np.diff(kept) < 20) + 1
-    assert found.samples.tolist() == np.diff(kept)[near - 1].tolist()
+    found = _mean_field(stretch, delayed, taken_s[remaining], filtered[remaining])
+    near = np.flatnonzero(np.diff(remaining) < 20) + 1
+    assert found.samples.tolist() == np.diff(remaining)[near - 1].tolist()
     assert sorted(set(found.samples)) == [7.0, 14.0]
-    assert found.step.tolist() == step[kept[near]].tolist()
+    assert found.step.tolist() == step[remaining[near]].tolist()
     for row, samples, value, turn in zip(
-        kept[near], found.samples.astype(int), found.value, found.turn, strict=True
+        remaining[near], found.samples.astype(int), found.value, found.turn, strict=True
     ):
         of = row - np.arange(samples)
         weight = (1.0 - share) ** np.arange(samples)

@@ -178,13 +178,13 @@ def test_outdoor_mistake_is_cause_of_ekf2_error(
 
 def test_what_if_gnss_delay_matches_correct_flight() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
-    asked, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
-    (predicted,), true = asked.whatif, other.logged
+    result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
+    (predicted,), true = result.whatif, other.logged
     assert predicted.nis_mean == pytest.approx(true.nis_mean, rel=0.1)
     assert predicted.position_rmse_to_truth_m == pytest.approx(
         true.position_rmse_to_truth_m, rel=0.1
     )
-    assert asked.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
+    assert result.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
 
 
 def test_what_if_without_magnetometer_keeps_heading(tmp_path: Path) -> None:
@@ -192,9 +192,9 @@ def test_what_if_without_magnetometer_keeps_heading(tmp_path: Path) -> None:
     # with a heading mistake EKF2 fuses the magnetic heading only
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
     model = opened(read_log(log))
-    asked = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
-    assert asked.notes[0] == HEADING_STAYS
-    errors = [one.heading_error_mean_deg for one in (asked.logged, *asked.whatif)]
+    result = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
+    assert result.notes[0] == HEADING_STAYS
+    errors = [one.heading_error_mean_deg for one in (result.logged, *result.whatif)]
     assert errors[1] == pytest.approx(errors[0], abs=0.1)
     with pytest.raises(SettingsError, match="does not contain all fused magnetometer samples"):
         what_if(model, [{"EKF2_MAG_NOISE": 0.1}])

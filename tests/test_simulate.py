@@ -223,12 +223,12 @@ class TestMistakes:
         ("text", "start", "end"), [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)]
     )
     def test_dropout_removes_source_samples(self, text, start, end):
-        gone = simulate(UNFILTERED, parse([text]))
-        middle = gone.motion.duration_s / 2.0
+        with_gap = simulate(UNFILTERED, parse([text]))
+        middle = with_gap.motion.duration_s / 2.0
         start, end = start or middle - 3.0, end or middle + 3.0
         clean = self.CLEAN.positions.measured_s
-        kept = clean[(clean <= start) | (clean >= end)]
-        assert np.array_equal(gone.positions.measured_s, kept)
+        remaining = clean[(clean <= start) | (clean >= end)]
+        assert np.array_equal(with_gap.positions.measured_s, remaining)
 
     @pytest.mark.parametrize("rate", [2.0, 4.0])
     def test_decimation_keeps_remaining_samples(self, rate):
@@ -257,8 +257,8 @@ class TestMistakes:
         assert np.std(noisy[:25]) < 0.07  # on the ground; 0.10 m without the filter
 
     def test_no_vvo_removes_position_source(self):
-        kept = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
-        assert [round(track.rate_hz) for track in kept] == [2, 2]
+        remaining = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
+        assert [round(track.rate_hz) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
         assert flight.positions == ()
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):

@@ -298,11 +298,11 @@ def test_vision_gap_restarts_bias() -> None:
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.stretches[0].time_s[0]) + 20.0
     for gap_s, anew in ((0.9 * STOP_S, False), (1.5 * STOP_S, True)):
-        kept = (vision.stamp_s < at_s) | (vision.stamp_s > at_s + gap_s)
+        remaining = (vision.stamp_s < at_s) | (vision.stamp_s > at_s + gap_s)
         moved = vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None]
         fields = ("stamp_s", "arrival_s", "variance_m2", "rejected", "reset")
-        parts = {name: getattr(vision, name)[kept] for name in fields}
-        found = update_log(ran(flying(replace(vision, position_m=moved[kept], **parts))))
+        parts = {name: getattr(vision, name)[remaining] for name in fields}
+        found = update_log(ran(flying(replace(vision, position_m=moved[remaining], **parts))))
         after = found.loc[at_s + gap_s :]
         assert bool(after["rejected"].any()) is not anew
 
@@ -382,9 +382,9 @@ def test_vision_samples_same_step_or_late_are_dropped() -> None:
         vision, replace(vision, stamp_s=stamps, **doubled)))  # fmt: skip
     assert len(once) <= len(twice) <= 1.1 * len(once)
     horizon_s = flying(vision).horizon_s
-    for age_s, kept in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):
+    for age_s, remaining in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):
         late = replace(vision, arrival_s=vision.stamp_s + age_s)
-        assert bool(len(update_log(ran(flying(late))))) is kept
+        assert bool(len(update_log(ran(flying(late))))) is remaining
 
 
 # ------------------------------------------------------------- a flight with both
@@ -483,8 +483,8 @@ def test_what_if_smaller_vision_gate_rejects_more() -> None:
 
 
 def test_what_if_without_vision_or_gnss_uses_other() -> None:
-    gone = what_if(model(), [{}], {"ev_pos": 40.0})
-    assert gone.whatif[0].others == {}
+    without_vision = what_if(model(), [{}], {"ev_pos": 40.0})
+    assert without_vision.whatif[0].others == {}
     lost = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0))
     (after,) = lost.whatif
     assert after.resets == 1
@@ -529,8 +529,8 @@ def test_model_incomplete_vision_is_unavailable() -> None:
     assert isinstance(lacking, Unavailable)
     assert "no vehicle_visual_odometry" in lacking.reason
     record = flight.ekf2.record
-    kept = {name: v for name, v in record.parameters.items() if name != "EKF2_EV_CTRL"}
-    older = replace(record, parameters={**kept, "EKF2_AID_MASK": 9.0})
+    remaining = {name: v for name, v in record.parameters.items() if name != "EKF2_EV_CTRL"}
+    older = replace(record, parameters={**remaining, "EKF2_AID_MASK": 9.0})
     refused = open_model(replace(flight, ekf2=replace(flight.ekf2, record=older)))
     assert isinstance(refused, Unavailable)
     assert "relative vision positions" in refused.reason
