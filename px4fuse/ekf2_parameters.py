@@ -1,8 +1,7 @@
-"""EKF2's parameters: PX4's names by what they are for, with defaults, units and ranges.
+"""EKF2 aids and parameters: PX4 names by role, defaults, units and ranges.
 
-``ekf2_parameters.toml`` has a row for every aid and every parameter. Nothing else in the package
-spells the name of a parameter of external vision or GNSS: who needs one asks the aid for it
-(``EV_POS.noise``).
+``ekf2_parameters.toml`` has one row per aid and per parameter. Other modules get the names of
+parameters of external vision and GNSS from the aid (``EV_POS.noise``).
 """
 
 import math
@@ -17,37 +16,37 @@ from px4fuse.record import table
 
 @dataclass(frozen=True)
 class Aid:
-    """One kind of measurement that EKF2 takes, and the names of its parameters.
+    """Kind of measurement that EKF2 can fuse, and the names of its parameters.
 
     Attributes
     ----------
     name : str
-        PX4's own, as in ``estimator_aid_src_<name>``.
+        PX4's name, as in ``estimator_aid_src_<name>``.
     switch : str
-        What has EKF2 fuse it, from v1.14 on; EKF2_AID_MASK before.
+        Parameter that enables its fusion, from v1.14 on; EKF2_AID_MASK before.
     noise, gate, delay : str
-        Standard deviation of the measurement, its gate in standard deviations, its age in ms.
+        Parameters of its standard deviation, its gate in √S, and its age in ms.
     noise_mode : str
-        1: variances of the sender are not used; empty where there is no such choice.
+        Parameter that ignores reported variances if 1; empty without such a parameter.
     place : tuple of str
-        Where the sensor is in the body (m, FRD).
+        Parameters of the lever arm of the sensor (m, FRD).
     label, unit : str
-        What it is for a person, and the unit of its innovations.
+        Name for users, and unit of its innovations.
     reported : str
-        What forms its variance where ``noise`` alone does not; empty where it always does.
+        Other origin of its variance, if ``noise`` does not determine it; else empty.
     default_gate : float
-        In force where a log has no ``gate``.
+        Gate if the log has no ``gate``.
     axes : tuple of str
-        Of its innovations, in PX4's order.
+        Axes of its innovations, in PX4's order.
     fields : tuple of str
-        Of ``estimator_innovations`` and ``_variances``, by axis; empty where they have none.
+        Fields of ``estimator_innovations`` and ``_variances``, by axis; empty without such fields.
     before : tuple of str
-        Of ``ekf2_innovations`` (v1.8 to v1.10), to which ``_var`` is added for the variance.
+        Fields of ``ekf2_innovations`` (v1.8 to v1.10); ``_var`` is appended for the variance.
     flags : tuple of tuple of str
-        Of ``estimator_status_flags``: the first group that the log has tells, by any of its flags,
-        whether EKF2 means to fuse the aid.
+        Fields of ``estimator_status_flags``. The aid is enabled if any flag of the first logged
+        group is set.
     bit : int or None
-        The same of ``estimator_status.control_mode_flags``.
+        Bit of the same meaning in ``estimator_status.control_mode_flags``.
     """
 
     name: str
@@ -69,21 +68,21 @@ class Aid:
 
     @property
     def own_parameters(self) -> frozenset[str]:
-        """Names of parameters that concern its measurements alone."""
+        """Parameters that affect only the measurements of this aid."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged: Mapping[str, float]) -> dict[str, float]:
-        """Its parameters among those of a log, and what switches it."""
+        """Return its parameters and its switch from those of a log."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged[name]) for name in names if name in logged}
 
 
 AID_MASK = "EKF2_AID_MASK"
-# Since main of 2026 EKF2 takes a fix's own time of measurement, where the driver knows it
+# from main of 2026 on EKF2 uses the measurement time of a fix if the driver provides it
 GNSS_MODE = "EKF2_GPS_MODE"
-# Relative; half of the last digit of a float32 is 6e-8
+# relative tolerance; the rounding error of a float32 is 6e-8
 FLOAT32_ERROR = 1e-6
-# Age of a fix since v1.17, of the first receiver: EKF2 then takes the stamp with it taken off
+# age of a fix of the first receiver from v1.17 on; EKF2 subtracts it from the timestamp
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
 
@@ -95,7 +94,7 @@ class Parameter:
     ----------
     unit : str
     default : float
-        PX4's, from v1.14 on.
+        PX4's default, from v1.14 on.
     minimum, maximum : float
         PX4's range, both ends included.
     """
@@ -108,7 +107,7 @@ class Parameter:
     def outside(self, value: float) -> str:
         """Return the fault of a finite value outside the range; empty if it is inside.
 
-        Logs hold float32, in which the end 0.01 is 0.0099999998.
+        Logged values are float32, in which the limit 0.01 is 0.0099999998.
         """
         low = self.minimum - FLOAT32_ERROR * abs(self.minimum)
         high = self.maximum + FLOAT32_ERROR * abs(self.maximum)
@@ -128,26 +127,26 @@ EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
     ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
 )
 PARAMETERS = msgspec.convert(TABLE["parameters"], dict[str, Parameter])
-# Those of the model and all others of a log with which px4fuse computes
+# parameters of the model, and all other logged ones that px4fuse computes with
 RANGES = PARAMETERS | msgspec.convert(TABLE["logged"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
-# Up to v1.13, ekf2_params.c
+# defaults up to v1.13 (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
-# Only these enter the results
+# only these parameters are part of the results
 REPORTED: tuple[str, ...] = tuple(TABLE["reported"])
 
 
 def settings_in_force(
     logged: Mapping[str, float], aid: Aid = EV_POS, *others: Aid
 ) -> dict[str, float]:
-    """The model's parameters as the log has them, PX4's defaults where it has none.
+    """Return the values of the model's parameters: logged ones, else PX4's defaults.
 
     Parameters
     ----------
     logged : mapping
         Parameters of the log, by PX4 name.
     aid, *others : Aid
-        What EKF2 fused: those of other aids are left out.
+        Fused aids; parameters of other aids are omitted.
     """
     used = {fused_aid.switch for fused_aid in (aid, *others)}
     of_others = {
@@ -165,19 +164,19 @@ def settings_in_force(
 
 
 def fuses_by_mask(logged: Mapping[str, float]) -> bool:
-    """Whether the release is one that chooses aiding by EKF2_AID_MASK (up to v1.13)."""
+    """Return True for a release that enables aids by EKF2_AID_MASK (up to v1.13)."""
     return AID_MASK in logged and EV_POS.switch not in logged
 
 
 def valid_parameters(logged: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Replace each parameter of a log that is not finite or outside PX4's range by its default.
+    """Replace logged parameters that are not finite or outside PX4's range by their defaults.
 
     Returns
     -------
     valid : dict
-        The same parameters; without those that are not finite and have no default here.
+        All parameters, except non-finite ones without a known default.
     notes : tuple of str
-        One per parameter that was replaced or left out.
+        One per parameter that was replaced or omitted.
 
     Examples
     --------
@@ -198,18 +197,18 @@ def valid_parameters(logged: Mapping[str, float]) -> tuple[dict[str, float], tup
             notes.append(f"{name} is not a finite number and is not used.")
         else:
             valid[name] = defaults[name]
-            said = fault if finite else " is not a finite number"
-            notes.append(f"{name}{said}; the default {valid[name]:g} is used.")
+            problem = fault if finite else " is not a finite number"
+            notes.append(f"{name}{problem}; the default {valid[name]:g} is used.")
     return valid, tuple(notes)
 
 
 def check_parameters(chosen: Mapping[str, float]) -> dict[str, float]:
-    """The same parameters, each known to the model and within PX4's range.
+    """Return the parameters, if all are in the model and within PX4's range.
 
     Raises
     ------
     SettingsError
-        A name that the model does not know, or a value outside PX4's range.
+        A name that the model does not contain, or a value outside PX4's range.
 
     Examples
     --------
@@ -220,8 +219,8 @@ def check_parameters(chosen: Mapping[str, float]) -> dict[str, float]:
         known = PARAMETERS.get(name)
         if known is None:
             raise SettingsError(
-                f"{name}: the model of EKF2 does not have this parameter",
-                f"{suggest_name(name, PARAMETERS)}It knows {', '.join(PARAMETERS)}.",
+                f"{name} is not a parameter of the EKF2 replay",
+                f"{suggest_name(name, PARAMETERS)}Choose from {', '.join(PARAMETERS)}.",
             )
         if not known.minimum <= value <= known.maximum or not math.isfinite(value):
             unit = f" {known.unit}" if known.unit else ""
@@ -230,5 +229,5 @@ def check_parameters(chosen: Mapping[str, float]) -> dict[str, float]:
                 f"{known.maximum:g}{unit} (default {known.default:g})."
             )
         if name == EV_POS.noise_mode and value not in (0.0, 1.0):
-            raise SettingsError(f"{name}={value:g}: only 0 and 1 have a meaning.")
+            raise SettingsError(f"{name}={value:g}: give 0 or 1.")
     return {name: float(value) for name, value in chosen.items()}

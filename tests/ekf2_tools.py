@@ -1,4 +1,4 @@
-"""EKF2's model written down plainly, one prediction at a time: the oracle of the fast one."""
+"""Plain implementation of the EKF2 model, one prediction at a time: reference for the fast one."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from px4fuse.flight import Flight
 from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)
-# Of v1.16
+# rules of v1.16
 RULES = FusionRules(0.2, 0.4, 1.0, 5, None, False)
 
 
@@ -21,14 +21,14 @@ def opened(flight: Flight) -> Model:
 
 
 def step_matrix(stretch: Stretch, k: int, *, trapezoid: bool = True) -> np.ndarray:
-    """∂(state after step k) / ∂(state before); PX4's covariance has no trapezoid."""
+    """Return ∂(state after step k) / ∂(state before); PX4's covariance has no trapezoid."""
     dt, after = stretch.step_s[k], stretch.rotation[k + 1]
     F = EYE.copy()
     F[0:3, 9:12] = -after * dt
     F[3:6, 0:3] = -skew(after @ stretch.force_m_s2[k]) * dt
     F[3:6, 12:15] = -after * dt
     F[6:9, 3:6] = np.eye(3) * dt
-    if trapezoid:  # half of the velocity before, half of that after
+    if trapezoid:  # mean of the velocities before and after
         F[6:9] = EYE[6:9] + 0.5 * dt * (EYE[3:6] + F[3:6])
     return F
 
@@ -38,7 +38,7 @@ def step_noise(stretch: Stretch, k: int, gyro: float, force: float) -> np.ndarra
 
 
 def step_state(stretch: Stretch, k: int, x: np.ndarray) -> np.ndarray:
-    """One prediction of the state, straight from the equations."""
+    """Predict the state by one step, directly from the equations."""
     dt, after = stretch.step_s[k], stretch.rotation[k + 1]
     force = after @ stretch.force_m_s2[k]
     x = x.copy()
@@ -50,9 +50,9 @@ def step_state(stretch: Stretch, k: int, x: np.ndarray) -> np.ndarray:
 
 
 def plain_replay(inputs: Inputs, stretch: Stretch, events: Events) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations and variances of the flight as flown, for a flight without rejections.
+    """Return innovations and variances of a flight as flown, without rejections.
 
-    Covariance and state go on at each prediction; every measurement is fused alone.
+    Covariance and state are predicted in each step; every measurement is fused separately.
     """
     settings = inputs.settings
     gyro, force = settings["EKF2_GYR_NOISE"], settings["EKF2_ACC_NOISE"]

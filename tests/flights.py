@@ -1,9 +1,9 @@
-"""Synthetic flights with known truth, made in memory, with every mistake on demand.
+"""Synthetic flights with known truth, made in memory, with optional mistakes.
 
-The vehicle swings along an aisle. The accelerometer's noise is white and as strong as the filter's
-default process noise, and the UWB's is white too, so that with default settings a clean flight is
-consistent by construction. EKF2 is made by hand: truth plus noise of the size that its variances
-say, and innovations whose NIS is what the test wants.
+The vehicle moves back and forth along an aisle. Accelerometer noise is white and equals KF's
+default process noise, and UWB noise is white, so a clean flight is consistent with default
+settings. EKF2 is synthetic: truth plus noise according to its variances, and innovations with the
+wanted NIS.
 """
 
 from collections.abc import Mapping
@@ -36,16 +36,16 @@ from px4fuse.recording import Dropout, LogInfo
 
 Span = tuple[float, float]
 
-DT = 0.1  # s, the lesson's
+DT = 0.1  # s, KF's default
 GRAVITY_M_S2 = 9.80665
-PERIOD_S = 20.0  # of one swing along the aisle and back
+PERIOD_S = 20.0  # s, period of the motion along the aisle
 PARAMETERS = {"EKF2_EVP_NOISE": 0.10, "EKF2_EVP_GATE": 5.0, "SDLOG_PROFILE": 129.0}
 BODY_TO_NED = Rotation.from_euler("ZYX", [40.0, -3.0, 5.0], degrees=True)
 
 
 @dataclass(frozen=True)
 class Imu:
-    """The accelerometer: noise is white, of ``sigma_a_m_s2`` when averaged over DT."""
+    """Accelerometer with white noise; ``sigma_a_m_s2`` is that of the mean over DT."""
 
     rate_hz: float = 100.0
     sigma_a_m_s2: float = 0.5
@@ -69,10 +69,10 @@ class Uwb:
 
 @dataclass(frozen=True)
 class Estimator:
-    """EKF2, made by hand.
+    """Synthetic EKF2.
 
-    ``nis`` is the expected NIS of its innovations; ``every`` keeps one innovation in so many;
-    ``fusing`` is a step function of (time, 0 or 1) for horizontal position, None where not logged.
+    ``nis`` is the expected NIS of its innovations; ``every``: one of this many innovations is kept;
+    ``fusing``: step function of (time, 0 or 1) for horizontal position, None if not logged.
     """
 
     sigma_p_m: float = 0.05
@@ -112,7 +112,7 @@ def aisle_flight(
     damage: tuple[str, ...] = (),
     tumble_spans: tuple[Span, ...] = (),
 ) -> Flight:
-    """Fly along the aisle; None leaves a part out of the log."""
+    """Simulate a flight along the aisle; None omits a part of the log."""
     rng = np.random.default_rng(seed)
 
     def path(time_s: Array) -> tuple[Array, Array, Array]:
@@ -122,7 +122,7 @@ def aisle_flight(
     clipped_s = sensor.clipped_s or (np.inf, np.inf)
     time = times(duration_s, sensor.rate_hz, sensor.gap_s)
     force = (path(time)[2] - [0.0, 0.0, GRAVITY_M_S2]) @ BODY_TO_NED.as_matrix()
-    # white noise: averaged over DT it must be sigma_a
+    # white noise whose mean over DT has sigma_a
     force += rng.normal(0.0, sensor.sigma_a_m_s2 * np.sqrt(DT * sensor.rate_hz), force.shape)
     track = _track(rng, times(duration_s, uwb.rate_hz, uwb.gap_s), uwb, path)
     position_time = times(duration_s, 50.0)
@@ -176,7 +176,7 @@ def aisle_flight(
 
 
 def motion(time_s: Array, heading_deg: float, length_m: float) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration of the truth, each of shape (n, 3), NED."""
+    """Return true position, velocity and acceleration, each of shape (n, 3), NED."""
     # along, across, down
     amplitude = np.array([0.5, 0.02, 0.01]) * length_m
     pulsation = 2.0 * np.pi / PERIOD_S * np.array([1.0, 2.0, 1.0])
@@ -188,13 +188,13 @@ def motion(time_s: Array, heading_deg: float, length_m: float) -> tuple[Array, A
 
 
 def times(duration_s: float, rate_hz: float, gap_s: Span | None = None) -> Array:
-    """Times from 0 on, with nothing strictly inside the gap."""
+    """Return times from 0 on, without those strictly inside the gap."""
     time = np.arange(round(duration_s * rate_hz) + 1) / rate_hz
     return time if gap_s is None else time[(time <= gap_s[0]) | (time >= gap_s[1])]
 
 
 def table(time_s: Array, values: ArrayLike, columns: list[str]) -> pd.DataFrame:
-    """Time-indexed frame, put together column by column as the readers do."""
+    """Return a time-indexed frame, assembled by columns as the readers do."""
     return pd.DataFrame(
         dict(zip(columns, np.array(values, dtype=float).T, strict=True)),
         index=pd.Index(time_s, name="time_s"),
@@ -203,7 +203,7 @@ def table(time_s: Array, values: ArrayLike, columns: list[str]) -> pd.DataFrame:
 
 
 def unavailable(what: str) -> Unavailable:
-    """Make the stand-in for something that the log does not hold."""
+    """Return Unavailable for a part that the log does not contain."""
     return Unavailable(what, f"no topic for {what}", f"Log {what}.")
 
 
@@ -273,7 +273,7 @@ def _innovations(
     r = made.noise_m**2
     s = r + made.prior_variance_m2
     normalised = rng.normal(0.0, np.sqrt(made.nis), len(updates))
-    normalised[rejected] = 6.0  # outside the gate of 5
+    normalised[rejected] = 6.0  # outside the gate of 5 √S
     return pd.DataFrame(
         {
             "innovation_m": normalised * np.sqrt(s),
@@ -292,7 +292,7 @@ def line(
     measurement_m: ArrayLike,
     acceleration: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Axis:
-    """Make an axis of measurements and, as times and values, of acceleration."""
+    """Return an axis with measurements and, from times and values, acceleration."""
     time = np.asarray(measurement_time_s, dtype=float)
     north = np.array([1.0, 0.0, 0.0])
     if acceleration is None:
@@ -305,7 +305,7 @@ def line(
                 list(AXIS_NAMES),
             ),
             north,
-            Segment(-np.inf, np.inf, "all of it"),
+            Segment(-np.inf, np.inf, "whole flight"),
         )
     return Axis("north", north, 0.0, "", time, np.asarray(measurement_m, dtype=float), signal)
 
@@ -313,7 +313,7 @@ def line(
 def random_walk(
     rng: np.random.Generator, *, count: int, interval_s: float, sigma_a: float, sigma_z: float
 ) -> Axis:
-    """Make an axis for ``input="zero"`` whose process noise is the lesson's, step for step."""
+    """Return an axis for ``input="zero"`` whose process noise equals KF's in each step."""
     per_update = round(interval_s / DT)
     p, v = 0.0, 0.0
     measured = []
@@ -326,7 +326,7 @@ def random_walk(
 
 
 def given_placement(*warnings: str) -> Alignment:
-    """Make the placement of a position file for which all was given."""
+    """Return the placement of a position file with all values given."""
     return Alignment(
         frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
         origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given", reference="",
@@ -335,8 +335,8 @@ def given_placement(*warnings: str) -> Alignment:
 
 
 def unexplained(comparison: Comparison) -> Analysis:
-    """Make an analysis that knows nothing but the comparison."""
-    parts = {each.name: getattr(comparison, each.name) for each in fields(Comparison)}
+    """Return an analysis of the comparison only."""
+    parts = {part.name: getattr(comparison, part.name) for part in fields(Comparison)}
     return Analysis(
         **parts, tuning={}, clock=unavailable("clock offset"),
         ekf2_model=unavailable("EKF2 replay"), why={}, loop=unavailable("loop closure"),
@@ -345,7 +345,7 @@ def unexplained(comparison: Comparison) -> Analysis:
 
 
 def with_noises(comparison: Comparison) -> Analysis:
-    """Make an analysis that knows the noises that the two-state filter asks for, and no more."""
+    """Return an analysis of the comparison and the maximum-likelihood noises."""
     axes = tuple(result.axis for result in comparison.axes.values())
     tuning = tune(axes, comparison.settings, (HORIZONTAL, "down"))
     return replace(unexplained(comparison), tuning=tuning)

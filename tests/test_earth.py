@@ -1,4 +1,4 @@
-"""The earth in the model of EKF2: metres where EKF2 keeps latitude, and how the earth turns."""
+"""Earth in the EKF2 model: metres per degree in EKF2's state, and the earth rotation rate."""
 
 import numpy as np
 import pandas as pd
@@ -7,7 +7,7 @@ from ekf2_tools import opened
 from exchange import replace
 from findings_tools import made
 
-from px4fuse.ekf2.earth import earth_rate_rad_s, metres_of
+from px4fuse.ekf2.earth import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.flight import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
@@ -15,7 +15,7 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import make_scenario
 
-# Metres of a degree of latitude and of longitude on WGS84, from a table of both
+# m per degree of latitude and of longitude on WGS84, from a table
 DEGREE_M = {0.0: (110_574.0, 111_320.0), 45.0: (111_132.0, 78_847.0), 60.0: (111_412.0, 55_800.0)}
 ECCENTRICITY2 = 0.00669438
 
@@ -26,26 +26,26 @@ def record(latitude_deg: float, altitude_m: float = 0.0, north_m: float = np.nan
 
 
 @pytest.mark.parametrize("latitude_deg", DEGREE_M)
-def test_metres_are_by_the_radii_that_ekf2_has(latitude_deg: float) -> None:
-    """That of the meridian is longer than the earth's, by what PX4's power has too much."""
+def test_metres_of_latitude_uses_ekf2_curvature_radii(latitude_deg: float) -> None:
+    """PX4's power of 2.5 makes the meridian radius too long by a known factor."""
     north_m, east_m = DEGREE_M[latitude_deg]
     latitude = np.radians(latitude_deg)
     of_degree = np.radians(1.0) * EARTH_RADIUS_M
     too_long = 1.0 / (1.0 - ECCENTRICITY2 * np.sin(latitude) ** 2)
-    north, east, down = metres_of(record(latitude_deg))
+    north, east, down = ekf2_metres_per_metre(record(latitude_deg))
     assert north * of_degree == pytest.approx(north_m * too_long, rel=2e-5)
     assert east * of_degree * np.cos(latitude) == pytest.approx(east_m, rel=2e-5)
     assert down == 1.0
-    higher = metres_of(record(latitude_deg, 637.1))
+    higher = ekf2_metres_per_metre(record(latitude_deg, 637.1))
     assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
 
 
-def test_metres_are_those_of_the_track_where_ekf2_keeps_metres_or_has_no_origin() -> None:
-    assert metres_of(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
-    assert metres_of(record(np.nan)) == (1.0, 1.0, 1.0)
+def test_metres_of_record_in_metres_is_one() -> None:
+    assert ekf2_metres_per_metre(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
+    assert ekf2_metres_per_metre(record(np.nan)) == (1.0, 1.0, 1.0)
 
 
-def test_the_earth_turns_eastwards_once_in_a_sidereal_day() -> None:
+def test_earth_rate_matches_sidereal_day() -> None:
     rate = 2.0 * np.pi / 86_164.1
     for latitude_deg, expected in ((0.0, (rate, 0.0, 0.0)), (90.0, (0.0, 0.0, -rate)),
                                    (-30.0, (rate * 0.75**0.5, 0.0, 0.5 * rate))):  # fmt: skip
@@ -54,24 +54,24 @@ def test_the_earth_turns_eastwards_once_in_a_sidereal_day() -> None:
     np.testing.assert_array_equal(earth_rate_rad_s(record(np.nan)), np.zeros(3))
 
 
-def test_a_flight_on_gnss_is_replayed_on_the_earth() -> None:
-    """In EKF2's metres inside, in those of the tracks outside; simulated ones are on a sphere."""
+def test_model_gnss_flight_includes_earth_rotation() -> None:
+    """The model uses EKF2's metres, the output those of the track; simulations are flat."""
     flight = simulate_flight(make_scenario("outdoor", seed=3), parse(()))
     assert MODEL_NOTE in flight.log.notes
     flat, round_ = opened(flight), opened(replace(flight, log=replace(flight.log, notes=())))
     known = flight.ekf2.record
-    metres = metres_of(known)
+    metres = ekf2_metres_per_metre(known)
     assert metres == pytest.approx((1.00357, 1.00302, 1.0), abs=1e-5)
-    theirs, ours = (one.inputs.received.position_m for one in (flat, round_))
-    np.testing.assert_allclose(ours, theirs * metres)
+    flat_m, round_m = (found.inputs.received.position_m for found in (flat, round_))
+    np.testing.assert_allclose(round_m, flat_m * metres)
     (flat_stretch,), (stretch,) = flat.inputs.stretches, round_.inputs.stretches
     np.testing.assert_allclose(stretch.state[6:9], flat_stretch.state[6:9] * metres)
     turned = stretch.correction_rad - flat_stretch.correction_rad
     expected = earth_rate_rad_s(known) * stretch.step_s[:, None]
     np.testing.assert_allclose(turned, expected, atol=1e-12)
     for name in ("delayed", "published"):
-        apart = getattr(round_.flown, name) - getattr(flat.flown, name)
-        off_m = apart[["north_m", "east_m"]].abs().to_numpy()
+        difference = getattr(round_.flown, name) - getattr(flat.flown, name)
+        off_m = difference[["north_m", "east_m"]].abs().to_numpy()
         assert 1e-4 < off_m.max() < 0.05
-        # not with the distance from the origin, which is up to 20 m
+        # the difference does not grow with the distance from the origin (up to 20 m)
         assert getattr(flat.flown, name)[["north_m", "east_m"]].abs().to_numpy().max() > 15.0

@@ -1,6 +1,6 @@
-"""When a replay is believed: what it is compared by, and the limits.
+"""Agreement of a replay with the log: compared quantities and limits.
 
-The limits are written out here, so that one that is changed must be changed here as well.
+The limits are repeated here, so that a change in the code needs a change in the test.
 """
 
 import math
@@ -37,8 +37,8 @@ def replayed(fused_at: list[float], taken: list[float] | None = None) -> pd.Data
     return pd.DataFrame({"fused_at_s": fused_at}, index=index)
 
 
-def test_a_logged_innovation_belongs_to_the_sample_of_its_time():
-    """An older topic has none, and repeats the last fusion for half a second."""
+def test_match_updates_uses_measurement_or_fusion_time():
+    """An older topic has no measurement time, and repeats the last fusion for 0.5 s."""
     times = np.array([0.9, 0.9941, 1.0, 1.1059, 1.1061, 1.2, 1.3])
     found = match_updates(replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, own=True)
     assert found.tolist() == [-1, 0, 0, 1, -1, 2, -1]
@@ -47,16 +47,24 @@ def test_a_logged_innovation_belongs_to_the_sample_of_its_time():
     assert found.tolist() == [-1, 0, 0, 0, -1, 1, 1]
 
 
-def test_the_first_five_seconds_of_each_stretch_are_not_judged():
+def test_evaluated_spans_exclude_first_5_s():
     replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
-    judged = replay.judged_s
-    assert judged == ((15.0, 30.0), (45.0, 60.0))
-    # nor is what flow alone carried, and what follows it
+    evaluated_spans = replay.judged_s
+    assert evaluated_spans == ((15.0, 30.0), (45.0, 60.0))
+    # times with flow as the only aid, and the seconds after them, are excluded
     carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
                    flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
     assert carried.judged_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
-    assert inside_spans(times, judged).tolist() == [False, True, True, False, False, True, False]
+    assert inside_spans(times, evaluated_spans).tolist() == [
+        False,
+        True,
+        True,
+        False,
+        False,
+        True,
+        False,
+    ]
 
 
 def agreeing(
@@ -69,55 +77,55 @@ def agreeing(
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("axis", "logged", "replayed_share", "good", "says"), [
-    (agreeing(s=1.049), 0.0, 0.0, True, "correlate by 1.0000 or better"),
-    (agreeing(s=1.051), 0.0, 0.0, False, "is 1.05 of the logged one"),
-    (agreeing(s=0.949), 0.0, 0.0, False, "is 0.95 of the logged one"),
-    (agreeing(0.95), 0.0, 0.0, True, "correlate by 0.9500"),
-    (agreeing(published_m=0.09), 0.0, 0.0, True, "correlate by 1.0000 or better"),
-    (agreeing(published_m=0.11), 0.0, 0.0, False, "what is published is 0.11 m off the log"),
-    # with digits enough to be beyond what is allowed
-    (agreeing(published_m=0.1028), 0.0, 0.0, False, "is 0.103 m off the log (RMS; at most 0.1"),
-    (agreeing(published_m=0.10004), 0.0, 0.0, False, "published is 0.10004 m off the log"),
-    (agreeing(0.949), 0.0, 0.09, False, "correlate by 0.9490 only"),
-    # where much is rejected, shares and NIS decide
-    (agreeing(0.5), 0.1, 0.06, True, "6.0% of the samples are rejected, 10.0% in the log"),
-    (agreeing(0.5), 0.06, 0.1, True, "single samples part"),
-    (agreeing(0.5), 0.25, 0.19, False, "are allowed"),
-    (agreeing(0.5), 0.125, 0.1875, False, "are allowed"),
+@pytest.mark.parametrize(("axis", "logged", "replayed_share", "good", "expected"), [
+    (agreeing(s=1.049), 0.0, 0.0, True, "innovations 1.0000 or better"),
+    (agreeing(s=1.051), 0.0, 0.0, False, "replay / log is 1.05"),
+    (agreeing(s=0.949), 0.0, 0.0, False, "replay / log is 0.95"),
+    (agreeing(0.95), 0.0, 0.0, True, "innovations 0.9500"),
+    (agreeing(published_m=0.09), 0.0, 0.0, True, "innovations 1.0000 or better"),
+    (agreeing(published_m=0.11), 0.0, 0.0, False, "published position differs by 0.11 m"),
+    # enough digits to show the excess
+    (agreeing(published_m=0.1028), 0.0, 0.0, False, "differs by 0.103 m RMS (limit 0.1"),
+    (agreeing(published_m=0.10004), 0.0, 0.0, False, "differs by 0.10004 m"),
+    (agreeing(0.949), 0.0, 0.09, False, "innovations 0.9490 only"),
+    # with many rejections, shares and NIS decide
+    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% (log 10.0%)"),
+    (agreeing(0.5), 0.06, 0.1, True, "single innovations differ"),
+    (agreeing(0.5), 0.25, 0.19, False, "limits "),
+    (agreeing(0.5), 0.125, 0.1875, False, "limits "),
     (agreeing(0.5, nis=1.25), 0.1, 0.1, True, "mean NIS differs by 25%"),
     (agreeing(0.5, nis=1.26), 0.1, 0.1, False, "mean NIS differs by 26%"),
     (agreeing(0.5, nis=0.74), 0.1, 0.1, False, "mean NIS differs by 26%"),
 ])  # fmt: skip
-def test_when_a_replay_is_believed(axis, logged, replayed_share, good, says):
+def test_agreement_verdict_applies_limits(axis, logged, replayed_share, good, expected):
     for axes in ({"north": axis, "east": agreeing()}, {"north": agreeing(), "east": axis}):
         found, reason = _agreement_verdict(axes, logged, replayed_share)
         assert found is good
-        assert says in reason
+        assert expected in reason
 
 
 @pytest.mark.parametrize(("axis", "good"), [
     (agreeing(0.949), False), (agreeing(s=1.051), False), (agreeing(published_m=0.29), True),
     (agreeing(published_m=0.31), False),
 ])  # fmt: skip
-def test_where_much_is_rejected_the_replay_that_obeys_the_log_decides(axis, good):
-    """It refuses what by its own gate agreed by chance, and rescues what parted by chance."""
-    one = Agreement(
+def test_logged_rejections_decide_verdict(axis, good):
+    """The replay with logged rejections overrides the other verdict, good or bad."""
+    own_gate = Agreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50, rejected_share_logged=0.2,
         rejected_share_replayed=0.2, decisions_same=0.9, published_rms_difference_m=0.0,
         good=not good, reason="so far",
     )  # fmt: skip
-    obedient = replace(one, north=agreeing(), east=axis, decisions_same=1.0,
+    logged_gate = replace(own_gate, north=agreeing(), east=axis, decisions_same=1.0,
                        rejected_share_replayed=0.3)  # fmt: skip
-    for all_told in (False, True):
-        found = with_logged_rejections(one, obedient, has_all_decisions=all_told)
+    for all_known in (False, True):
+        found = with_logged_rejections(own_gate, logged_gate, has_all_decisions=all_known)
         assert found.good is good
-        assert found.reason.startswith("with EKF2's own rejections, ")
+        assert found.reason.startswith("with EKF2's logged rejections: ")
         assert (found.decisions_same, found.rejected_share_replayed) == (0.9, 0.2)
-        assert found.axes == (obedient if all_told else one).axes
+        assert found.axes == (logged_gate if all_known else own_gate).axes
 
 
-def test_what_an_axis_is_compared_by():
+def test_axis_agreement_computes_statistics():
     s_log = np.full(101, 4.0)
     s = np.linspace(4.0, 8.0, 101)
     nu_log = np.tile([2.0, -2.0], 51)[:101]
@@ -138,7 +146,7 @@ def test_what_an_axis_is_compared_by():
     assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
 
 
-def test_constant_velocity_innovations_have_no_correlation():
+def test_velocity_agreement_constant_is_empty():
     """np.corrcoef of a constant is NaN, with a warning."""
     index = pd.Index(10.0 + np.arange(30.0))
     updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)
@@ -149,7 +157,7 @@ def test_constant_velocity_innovations_have_no_correlation():
     assert _velocity_agreement(ekf2, replay, own=True) == ({}, True)
 
 
-def test_heading_without_a_logged_state_in_judged_time_is_absent():
+def test_heading_error_without_evaluated_state_is_none():
     delayed = pd.DataFrame(index=pd.Index([1.0]))
     ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
     replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, judged_s=((5.0, 9.0),))
@@ -157,7 +165,7 @@ def test_heading_without_a_logged_state_in_judged_time_is_absent():
 
 
 def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
-    """A log and a replay of itself, judged on this many samples."""
+    """Return the agreement of a log and its own replay with this many evaluated samples."""
     time = 10.0 + np.arange(count + 5.0)
     rng = np.random.default_rng(2)
     nu = rng.normal(0.0, 0.1, len(time)) if varying else np.full(len(time), 0.1)
@@ -184,19 +192,19 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
     return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 
 
-def test_twenty_innovations_are_enough_to_compare():
+def test_agreement_needs_20_varying_innovations():
     found = compared(20)
     assert found.samples == 20
     assert found.good
     shares = found.rejected_share_logged, found.rejected_share_replayed, found.decisions_same
     assert shares == pytest.approx((0.1, 0.05, 0.95))
     assert isinstance(few := compared(19), Unavailable)
-    assert "19 logged innovations to compare with are too few (at least 20)" in few.reason
+    assert "only 19 logged innovations to compare with (at least 20" in few.reason
     assert isinstance(same := compared(20, varying=False), Unavailable)
-    assert "do not vary" in same.reason
+    assert "are constant" in same.reason
 
 
-def test_without_innovations_there_is_nothing_to_compare():
+def test_logged_innovations_missing_axis_is_empty():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(Ekf2, innovations={"north": frame, "east": other}, innovation_topics=AID)

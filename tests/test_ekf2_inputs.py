@@ -1,6 +1,6 @@
-"""What the model of EKF2 takes from a log: parameters, rules, vision, and stretches of steps.
+"""Inputs of the EKF2 replay from a log: parameters, rules, vision, and stretches of steps.
 
-The limits are written out here, so that one that is changed must be changed here as well.
+The limits are repeated here, so that a change in the code needs a change in the test.
 """
 
 import math
@@ -62,11 +62,11 @@ AID = ("estimator_aid_src_ev_pos",)
 # ---------------------------------------------------------------- parameters
 
 
-def test_parameters_are_px4s():
-    """Defaults of PX4's module.yaml and params_*.yaml, by what is fused."""
+def test_settings_in_force_use_px4_defaults():
+    """Defaults of PX4's module.yaml and params_*.yaml, by fused aid."""
     vision, gnss = settings_in_force({}), settings_in_force({}, GNSS_POS)
-    for one, other, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
-        assert {*one} - {*other} == {name for name in PARAMETERS if name.startswith(begin)}
+    for names, other_names, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
+        assert {*names} - {*other_names} == {name for name in PARAMETERS if name.startswith(begin)}
     assert settings_in_force({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
     assert settings_in_force({})["EKF2_EV_DELAY"] == 0.0
     assert settings_in_force({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
@@ -78,16 +78,16 @@ def test_parameters_are_px4s():
     ("EKF2_EVP_GATE", (1.0, 1e3), (0.99, 1001.0)), ("EKF2_EV_NOISE_MD", (0.0, 1.0), (0.5, 2.0)),
     ("EKF2_EV_POS_X", (-5.0, 5.0), (math.inf, math.nan)),
 ])  # fmt: skip
-def test_both_ends_of_a_range_are_in_it(name, fits, not_fits):
+def test_check_parameters_range_includes_limits(name, fits, not_fits):
     for value in fits:
         assert check_parameters({name: value}) == {name: value}
     for value in not_fits:
         unit = {"EKF2_EVP_GATE": " SD", "EKF2_EV_POS_X": " m"}.get(name, "")
-        with pytest.raises(SettingsError, match=rf"{unit} \(default|only 0 and 1"):
+        with pytest.raises(SettingsError, match=rf"{unit} \(default|give 0 or 1"):
             check_parameters({name: value})
 
 
-def test_a_sweep_has_2_to_200_values():
+def test_sweep_values_accept_2_to_200():
     assert sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 2) == [0.0, 100.0]
     assert len(sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 200)) == 200
     assert len(sweep_values("EKF2_EV_DELAY", 0.0, 100.0)) == 9
@@ -102,7 +102,7 @@ def test_a_sweep_has_2_to_200_values():
 
 @pytest.fixture
 def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """What is prepared of a flight of which only the parameters matter."""
+    """Return a function that prepares inputs of a flight with the given parameters."""
     monkeypatch.setattr(
         inputs_module, "read_vision", lambda *_: made(ReceivedPositions, stamp_s=np.zeros(1))
     )
@@ -129,7 +129,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return prepared
 
 
-def test_rules_of_the_releases(flown):
+def test_rules_depend_on_release(flown):
     """EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h."""
     new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
@@ -141,7 +141,7 @@ def test_rules_of_the_releases(flown):
     assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)
 
 
-def test_what_a_log_must_hold(flown):
+def test_prepare_inputs_checks_imu_and_horizon(flown):
     assert isinstance(flown(0.0119), Inputs)
     assert "logged at 80 Hz" in flown(0.0125).reason
     assert isinstance(flown(horizon_s=NONE), Unavailable)
@@ -150,8 +150,8 @@ def test_what_a_log_must_hold(flown):
         assert flown(fusing=pd.DataFrame({"vertical": vertical})).vision_height is there
     assert flown(fusing=NONE).vision_height is False
     every = np.arange(2, 998)
-    assert "11% of the IMU's samples are missing" in flown(without=every[::10]).reason
-    # fewer, and a gap, at which a stretch ends
+    assert "11% of the IMU samples are missing" in flown(without=every[::10]).reason
+    # fewer missing samples, and a gap, at which a stretch ends
     assert isinstance(flown(without=every[::12]), Inputs)
     assert isinstance(flown(without=np.arange(400, 600)), Inputs)
 
@@ -168,19 +168,19 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
      "vehicle_visual_odometry"),
     ([track("file", POSITION_FILE), track("gps", GNSS)], "file"),
     ([track("mocap", MOTION_CAPTURE)], None),
-    # copies that the logger did not thin: below 0.9 of its interval, and 4 Hz at least
+    # complete copies: interval below 0.9 times the logger's, and at least 4 Hz
     ([track(ALIGNED_TOPIC, ALIGNED, 0.179)], ALIGNED_TOPIC),
     ([track(ALIGNED_TOPIC, ALIGNED, 0.181)], None),
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.25)], "estimator_aid_src_ev_pos"),
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.26)], None),
 ])  # fmt: skip
-def test_the_track_that_ekf2_received_whole(tracks, expected):
+def test_vision_track_selects_complete_track(tracks, expected):
     found = _vision_track(made(Flight, positions=tuple(tracks)))
     assert getattr(found, "name", None) == expected
 
 
-def test_a_frame_of_its_own_is_turned_with_its_variance():
-    """Published heading 90°, sent 0°: what was sent as north lies east."""
+def test_read_vision_frd_is_rotated_with_variance():
+    """Published heading 90°, sent 0°: sent north is east."""
     time = 10.0 + 0.1 * np.arange(30)
 
     def facing(heading: float) -> pd.DataFrame:
@@ -211,8 +211,8 @@ def test_a_frame_of_its_own_is_turned_with_its_variance():
     assert np.all(found.arrival_s == -np.inf)
 
 
-def test_what_ekf2_did_with_a_sample_is_found_by_its_time():
-    """Measured half a step and the delay before its stamp, to 6 ms; resets show within 0.2 s."""
+def test_logged_decisions_match_measurement_time():
+    """Measured half a step and the delay before the timestamp; resets show within 0.2 s."""
     stamp = 10.0 + 0.5 * np.arange(6)
     taken = stamp - 0.05 - 0.005
     off = np.array([0.0, 0.0059, -0.0059, 0.0061, -0.0061, 0.0])
@@ -221,10 +221,10 @@ def test_what_ekf2_did_with_a_sample_is_found_by_its_time():
     resets = (
         Reset(float(shown[0]) + 0.19, "position", (1.0, 0.0, 0.0)),
         Reset(float(shown[1]) + 0.21, "position", (1.0, 0.0, 0.0)),  # too late
-        Reset(float(shown[2]) + 0.1, "position", (0.0, 0.0, 1.0)),  # of the height
+        Reset(float(shown[2]) + 0.1, "position", (0.0, 0.0, 1.0)),  # height reset
         Reset(float(shown[3]) + 0.1, "velocity", (1.0, 0.0, 0.0)),
         Reset(float(shown[4]), "position", (0.0, 1.0, 0.0)),
-        Reset(float(shown[5]) + 0.1, "position", (0.0, 1.0, 0.0)),  # of what was fused
+        Reset(float(shown[5]) + 0.1, "position", (0.0, 1.0, 0.0)),  # this sample was fused
     )
     record = made(FusionRecord, parameters={"EKF2_EV_DELAY": 50.0})
     parts = {
@@ -243,8 +243,8 @@ def test_what_ekf2_did_with_a_sample_is_found_by_its_time():
 # ---------------------------------------------------------------- stretches
 
 
-def test_a_reset_of_the_position_is_no_fusion():
-    """EKF2 flies north at 2 m/s and is set 3 m east at 5 s; every third sample's fate is logged."""
+def test_position_corrections_exclude_resets():
+    """EKF2 flies north at 2 m/s and is reset 3 m east at 5 s; one of three decisions is logged."""
     times = np.arange(0.0, 10.0, 0.1)
     state = pd.DataFrame(0.0, pd.Index(times, name="time_s"), Columns.STATE)
     state["north_m"], state["north_m_s"], state["east_m"] = 2.0 * times, 2.0, 3.0 * (times >= 5.0)
@@ -259,29 +259,29 @@ def test_a_reset_of_the_position_is_no_fusion():
 
     assert_allclose(moved(reset), 0.0, atol=1e-9)
     assert np.nanmax(moved()) > 1.0
-    # nothing is rejected, or all is known
+    # no correction if nothing is rejected, or all decisions are logged
     assert moved(reset, rejected=fates) is None
     assert moved(reset, rejected=np.ones(70)) is None
 
 
 @pytest.mark.parametrize(("interval_ms", "known", "ends"), [
     ([4] * 5, [], [2, 4]),
-    ([4, 9, 4, 4], [], [2, 4]),  # longer than the target before its samples are there
+    ([4, 9, 4, 4], [], [2, 4]),  # longer than the target before its samples are complete
     ([9, 4, 4], [], [1, 3]),
     ([4, 4, 9, 4, 4], [], [2, 3, 5]),
-    ([4, 4, 1, 1.5, 4, 4, 4], [], [2, 5, 7]),  # by count when half of the target has passed
-    ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a known end sets the count again
+    ([4, 4, 1, 1.5, 4, 4, 4], [], [2, 5, 7]),  # by count after half of the target
+    ([4] * 9, [3], [2, 3, 5, 7, 9]),  # a logged end restarts the count
     ([10] * 3, [], [1, 2, 3]),
     ([2.75] * 7, [0, 6], [3, 6]),
-    ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # of two and a half, as the log shows it
+    ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip
-def test_a_step_ends_after_its_samples_or_when_it_is_long(interval_ms, known, ends):
+def test_step_ends_by_count_duration_or_log(interval_ms, known, ends):
     found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
     assert found.tolist() == ends
 
 
-def test_a_gain_is_seen_from_the_end_of_its_step():
-    """A turn of 1 mrad each sample: what was gained before lies turned by what came after."""
+def test_down_sampled_gain_is_in_final_frame():
+    """With 1 mrad per sample, earlier velocity changes are rotated by the later rotation."""
     turn = np.tile([0.0, 0.0, 0.001], (3, 1))
     gain = np.tile([1.0, 0.0, 0.0], (3, 1))
     total, gained = down_sampled(turn, gain, np.array([2, 3]))
@@ -296,7 +296,7 @@ def facing(at: Any, error: Any = 0.0) -> np.ndarray:
 
 
 def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, FusionRecord]:
-    """0.5 rad/s about the vertical; the gyro reads 0.01 rad/s too much, EKF2 knows."""
+    """Rotation of 0.5 rad/s about the vertical; EKF2 has estimated the gyro bias of 0.01 rad/s."""
     time = 10.0 + 0.005 * np.arange(401)
     imu = pd.DataFrame(0.0, index=time, columns=Columns.ANGULAR_RATE + Columns.SPECIFIC_FORCE)
     imu[Columns.ANGULAR_RATE[2]] = 0.51
@@ -315,7 +315,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_a_stretch_of_a_vehicle_that_turns():
+def test_stretch_rotating_vehicle_has_expected_fields():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _stretch(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)
@@ -324,7 +324,7 @@ def test_a_stretch_of_a_vehicle_that_turns():
     turned = matrix(facing(steps))
     assert_allclose(found.rotation, turned, atol=1e-6)
     assert_allclose(found.correction_rad, 0.0, atol=1e-6)
-    # in the frame at the end of the step, without its bias
+    # body frame at the end of the step, without bias
     assert_allclose(found.force_m_s2, [[0.8, 0.0, -10.0]] * 100, atol=5e-3)
     assert_allclose(found.state[:3], [0.0, 0.0, 0.05], atol=1e-6)
     assert_allclose(found.state[3:9], [2.0, 2.0, 2.0, 7.0, 7.0, 10.5])
@@ -341,7 +341,7 @@ def test_a_stretch_of_a_vehicle_that_turns():
 
 
 def stretches(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
-    """Start and end of each, of a flight of 60 s with everything every 0.01 or 0.1 s."""
+    """Return start and end of each stretch of a 60 s flight with samples every 0.01 or 0.1 s."""
     found: list[tuple[float, float]] = []
     tenths = np.arange(0.0, 60.0, 0.1)
     usual = {
@@ -367,15 +367,15 @@ def without(times: np.ndarray, low: float, high: float) -> np.ndarray:
     return times[(times < low + 1e-6) | (times > high - 1e-6)]
 
 
-def test_where_a_stretch_begins_and_ends(monkeypatch):
+def test_find_stretches_applies_limits(monkeypatch):
     imu, vision = np.arange(0.0, 60.0, 0.01), np.arange(0.0, 60.0, 0.1)
     assert stretches(monkeypatch) == [(1.0, 59.99)]
-    # a second of fusion, four in the air
+    # 1 s of fusion, 4 s in the air
     late = np.arange(20.0, 60.0, 0.1)
     assert stretches(monkeypatch, fused=late) == [(21.0, 59.99)]
     assert stretches(monkeypatch, airborne=((10.0, 50.0), (52.0, 60.0))) == [(14.0, 59.99)]
     assert stretches(monkeypatch, airborne=((70.0, 90.0),)) == [(1.0, 59.99)]
-    # gaps of vision beyond 2 s, and of the IMU beyond 0.05 s, part the flight
+    # gaps above 2 s in vision and above 0.05 s in the IMU split the flight
     assert len(stretches(monkeypatch, vision=without(vision, 30.0, 31.9))) == 1
     exactly = without(np.arange(0.0, 60.0, 0.125), 30.0, 32.0)
     assert len(stretches(monkeypatch, vision=exactly)) == 1
@@ -384,10 +384,10 @@ def test_where_a_stretch_begins_and_ends(monkeypatch):
     assert len(stretches(monkeypatch, imu=without(imu, 30.0, 30.04))) == 1
     parted = stretches(monkeypatch, imu=without(imu, 30.0, 30.07))
     assert [start for start, _ in parted] == [1.0, 31.5]
-    # so does a change to another instance of EKF2, which has states of its own
+    # another EKF2 instance has different states and splits the flight
     parted = stretches(monkeypatch, instances=((-np.inf, 0), (30.2, 1)))
     assert parted == [(1.0, 30.2), (31.5, 59.99)]
-    # ten seconds at least, and a second after the last sample of vision
+    # a stretch has at least 10 s and ends 1 s after the last vision sample
     assert stretches(monkeypatch, fused=np.arange(48.0, 60.0, 0.1))[0][0] == 49.0
     assert stretches(monkeypatch, fused=np.arange(49.3, 60.0, 0.1)) == []
     assert stretches(monkeypatch, fused=np.array([])) == []

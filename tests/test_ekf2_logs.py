@@ -1,4 +1,4 @@
-"""EKF2's model on every further log: agreement, walk and what-if, or why there is none."""
+"""EKF2 model on all other logs: agreement, steps and what-if, or the reason for their absence."""
 
 import sys
 from pathlib import Path
@@ -17,15 +17,13 @@ pytestmark = pytest.mark.reallogs
 
 NOT_CARRIED = {
     "v1.16.1_aisle_2hz_stock": "never fused external vision",
-    "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos holds one sample in",
+    "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos has a sample interval",
 }
-# Why is in test_gnss.py
+# the reasons are in test_gnss.py
 GNSS_NOT_CARRIED = ("v1.13.3_gps_profile1", "v1.14.4_gps_magdist")
 
 
-def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(
-    shared_logs, model_of, monkeypatch
-):
+def test_benchmark_numbers_match_documentation(shared_logs, model_of, monkeypatch):
     monkeypatch.setattr(bench_ekf2, "opened", model_of)
     paths = bench_ekf2.flights([shared_logs / "simulated", shared_logs / "gps"])
     models = bench_ekf2.agreement_table(paths)
@@ -36,14 +34,14 @@ def test_the_figures_of_the_benchmark_hold_on_every_simulated_flight(
 
 
 @pytest.mark.parametrize("name", NOT_CARRIED)
-def test_a_simulated_flight_that_cannot_carry_the_model_says_why(shared_logs, name):
+def test_model_insufficient_log_states_reason(shared_logs, name):
     found = open_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     assert isinstance(found, Unavailable)
     assert NOT_CARRIED[name] in found.reason
 
 
-def test_a_real_flight_whose_imu_was_logged_with_holes_says_so(shared_logs):
+def test_model_missing_imu_samples_states_fraction(shared_logs):
     name = "mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3.ulg"
     found = open_model(read_log(shared_logs / "real" / name))
     assert isinstance(found, Unavailable)
-    assert "30% of the IMU's samples are missing" in found.reason
+    assert "30% of the IMU samples are missing" in found.reason

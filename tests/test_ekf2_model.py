@@ -1,4 +1,4 @@
-"""The model of EKF2 against its equations written plainly, and against the log."""
+"""EKF2 model against its equations in plain form, and against the log."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ def vision_of(flight: Flight) -> pd.DataFrame:
     return next(t for t in flight.positions if t.name == "vehicle_visual_odometry").samples
 
 
-def test_an_interval_is_the_product_of_its_steps(model: Model) -> None:
+def test_interval_equals_product_of_steps(model: Model) -> None:
     stretch, made = model.inputs.stretches[0], next(iter(model.intervals.values()))[0]
     end = made.events.end
     starts = np.concatenate([[0], end[:-1]])
@@ -51,17 +51,15 @@ def test_an_interval_is_the_product_of_its_steps(model: Model) -> None:
         assert made.transition[at] == pytest.approx(F, abs=1e-12)
         moved = made.transition[at] @ x0 + made.turn[at] + made.drive[at]
         assert moved == pytest.approx(x, abs=1e-12)
-        # closed forms for equal steps under a mean force, where the real ones jitter
+        # closed forms assume equal steps and a mean force; the real ones vary
         part = slice(0, 9)
         scale = np.sqrt(np.outer(np.diag(Q), np.diag(Q)))[part, part]
         assert np.max(np.abs(noise[at] - Q)[part, part] / scale) < 0.03
 
 
 @pytest.mark.parametrize("attitude", [True, False])
-def test_within_an_interval_a_state_follows_from_its_beginning(
-    model: Model, attitude: bool
-) -> None:
-    """Without attitude as a state, the nominal one is not corrected either."""
+def test_delayed_states_follow_from_interval_start(model: Model, attitude: bool) -> None:
+    """Without attitude as a state, the nominal attitude is not corrected."""
     variant = Variant(model.inputs.settings, attitude=attitude)
     (part,) = run_variants(model.inputs, [variant], model.intervals)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
@@ -70,7 +68,7 @@ def test_within_an_interval_a_state_follows_from_its_beginning(
     if not attitude:
         stretch = replace(stretch, correction_rad=np.zeros_like(stretch.correction_rad))
     np.testing.assert_array_equal(state[ends], kept[1:, 0])
-    for at in (0, 1, 57, 300, len(ends)):  # after the last event comes one more
+    for at in (0, 1, 57, 300, len(ends)):  # after the last event follows one more interval
         x = kept[at, 0]
         first, last = np.concatenate([[0], ends, [len(stretch.step_s)]])[[at, at + 1]]
         for k in range(first, last - 1):
@@ -78,7 +76,7 @@ def test_within_an_interval_a_state_follows_from_its_beginning(
             np.testing.assert_allclose(state[k + 1], x, rtol=0.0, atol=1e-10)
 
 
-def test_the_recursion_is_the_plain_filter(model: Model) -> None:
+def test_recursion_matches_plain_replay(model: Model) -> None:
     events = next(iter(model.intervals.values()))[0].events
     nu, S = plain_replay(model.inputs, model.inputs.stretches[0], events[events.end < 3000])
     updates = model.flown.updates.iloc[: len(nu)]
@@ -88,7 +86,7 @@ def test_the_recursion_is_the_plain_filter(model: Model) -> None:
         np.testing.assert_allclose(updates[f"innovation_variance_{axis}_m2"], S[:, at], rtol=3e-3)
 
 
-def test_the_sample_flight_agrees_with_its_log(model: Model) -> None:
+def test_model_sample_flight_agrees_with_log(model: Model) -> None:
     agreement = model.agreement
     assert agreement.good
     assert agreement.samples > 200
@@ -104,7 +102,7 @@ def test_the_sample_flight_agrees_with_its_log(model: Model) -> None:
         assert axis.nis_mean_replayed == pytest.approx(axis.nis_mean_logged, rel=0.02)
 
 
-def test_several_settings_at_once_are_each_alone(model: Model) -> None:
+def test_replay_settings_together_equal_separate_runs(model: Model) -> None:
     settings = [
         {"EKF2_EVP_NOISE": 0.02}, {"EKF2_EV_DELAY": 80.0},
         {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 40.0, "EKF2_EVP_GATE": 2.0}, {},
@@ -113,16 +111,16 @@ def test_several_settings_at_once_are_each_alone(model: Model) -> None:
     for change, found in zip(settings, together, strict=True):
         alone = replay_settings(model, [change])[0]
         for part in ("updates", "delayed", "published"):
-            one, other = getattr(found, part), getattr(alone, part)
-            pd.testing.assert_frame_equal(one, other, rtol=0.0, atol=1e-9)
+            joint, separate = getattr(found, part), getattr(alone, part)
+            pd.testing.assert_frame_equal(joint, separate, rtol=0.0, atol=1e-9)
         assert dict(found.changed) == change
     pd.testing.assert_frame_equal(together[3].published, model.flown.published, rtol=0.0, atol=1e-9)
 
 
-def test_samples_that_arrive_after_the_horizon_are_late_or_lost(model: Model) -> None:
+def test_replay_delayed_arrival_is_late_or_lost(model: Model) -> None:
     vision = model.inputs.received
     assert (model.flown.late, model.flown.lost) == (0, 0)
-    # the horizon is 214 ms, and 100 ms more are forgiven
+    # the horizon is 214 ms, and samples may be 100 ms later
 
     def arriving(after_s: float, **settings: float) -> Any:
         slow = replace(vision, arrival_s=vision.stamp_s + after_s)
@@ -137,13 +135,13 @@ def test_samples_that_arrive_after_the_horizon_are_late_or_lost(model: Model) ->
     assert lost.updates["fused"].sum() < 10
     more = arriving(0.36, EKF2_DELAY_MAX=400.0)
     assert (more.late, more.lost) == (0, 0)
-    # EKF2 raises EKF2_DELAY_MAX to its longest delay
+    # EKF2 raises EKF2_DELAY_MAX to its largest delay
     longest = arriving(0.02, EKF2_EV_DELAY=300.0)
     assert (longest.late, longest.lost) == (0, 0)
 
 
 def with_copies(flight: Flight) -> Flight:
-    """With EKF2's own copies of the positions alone."""
+    """Return the flight with EKF2's copies of the positions only."""
     copies = tuple(track for track in flight.positions if track.origin != RECEIVED)
     return replace(flight, positions=copies)
 
@@ -155,7 +153,7 @@ def unavailable(flight: Flight) -> str:
     return found.reason
 
 
-def test_a_log_that_cannot_carry_the_model_says_why(sample_flight: Flight) -> None:
+def test_open_model_insufficient_log_states_reason(sample_flight: Flight) -> None:
     ekf2 = sample_flight.ekf2
     missing = Unavailable("IMU", "no topic sensor_combined", "Record it.")
     assert "sensor_combined" in unavailable(replace(sample_flight, imu=missing))
@@ -165,16 +163,16 @@ def test_a_log_that_cannot_carry_the_model_says_why(sample_flight: Flight) -> No
     slow = sample_flight.imu.iloc[::5]
     assert "53 Hz" in unavailable(replace(sample_flight, imu=slow))
     copies = unavailable(with_copies(sample_flight))
-    assert "estimator_aid_src_ev_pos holds one sample in 0.5" in copies
+    assert "estimator_aid_src_ev_pos has a sample interval of 0.5" in copies
     dropped = sample_flight.imu[(sample_flight.imu.index % 8.0) > 0.1]
     assert "without a gap" in unavailable(replace(sample_flight, imu=dropped))
     frame = with_vision(sample_flight, vision_of(sample_flight), frame="FRD")
     assert "no orientation" in unavailable(frame)
-    no_horizon = replace(ekf2, horizon_s=Unavailable("horizon", "not told", "Update PX4."))
-    assert "not told" in unavailable(replace(sample_flight, ekf2=no_horizon))
+    no_horizon = replace(ekf2, horizon_s=Unavailable("horizon", "not logged", "Update PX4."))
+    assert "not logged" in unavailable(replace(sample_flight, ekf2=no_horizon))
 
 
-def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight: Flight) -> None:
+def test_open_model_joined_mavlink_supplies_vision(sample_flight: Flight) -> None:
     recording = read_log(LOG.with_suffix(".tlog"))
     assert "estimator_states" in unavailable(recording)
     made = opened(join(with_copies(sample_flight), recording))
@@ -183,7 +181,7 @@ def test_a_mavlink_recording_gives_the_samples_that_the_log_lacks(sample_flight:
     assert made.agreement.ev_pos["north"].innovation_correlation > 0.999
 
 
-def test_height_of_vision_counts_where_ekf2_fused_it(model: Model, sample_flight: Flight) -> None:
+def test_model_fused_vision_height_is_used(model: Model, sample_flight: Flight) -> None:
     ekf2 = sample_flight.ekf2
     samples = vision_of(sample_flight).copy()
     samples["down_m"] += 0.7
@@ -195,7 +193,7 @@ def test_height_of_vision_counts_where_ekf2_fused_it(model: Model, sample_flight
     assert abs(own.mean() - vision.mean()) > 0.4
 
 
-def test_a_bias_that_ekf2_does_not_learn_is_no_trouble(sample_flight: Flight) -> None:
+def test_model_fixed_accelerometer_bias_is_finite(sample_flight: Flight) -> None:
     record = sample_flight.ekf2.record
     fixed = record.delayed.copy()
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0

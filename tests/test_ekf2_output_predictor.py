@@ -1,4 +1,4 @@
-"""EKF2's output predictor against its buffer, step by step."""
+"""EKF2's output predictor against a buffer, step by step."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ STEP_S = 0.01
 
 
 def buffered(gain, velocity, position, reset, lag, tau_v, tau_p):
-    """The predictor as PX4 runs it: a buffer whose every entry is corrected at each step."""
+    """Run the predictor as PX4: every entry of the buffer is corrected in each step."""
     n, k = gain.shape
     buffer = [(velocity[0].copy(), position[0].copy())]
     v, p = buffer[0]
@@ -42,13 +42,13 @@ def buffered(gain, velocity, position, reset, lag, tau_v, tau_p):
 
 
 @pytest.mark.parametrize("lag", [1, 6, 19])
-def test_the_recursive_filters_are_the_buffer(lag: int) -> None:
+def test_publish_matches_step_by_step_buffer(lag: int) -> None:
     rng = np.random.default_rng(lag)
     n = 400
     turn, turned = Rotation.random(n + 1, rng).as_matrix(), rng.normal(0.0, 0.1, (n + 1, 3))
     force, bias = rng.normal(0.0, 2.0, (n, 3)), np.full(3, 0.05)
-    felt = np.einsum("nij,nj->ni", turn[1:], force - bias)
-    gain = (felt + np.cross(turned[1:], felt) + GRAVITY_M_S2) * STEP_S
+    force_ned = np.einsum("nij,nj->ni", turn[1:], force - bias)
+    gain = (force_ned + np.cross(turned[1:], force_ned) + GRAVITY_M_S2) * STEP_S
     velocity = np.cumsum(rng.normal(0.0, 0.03, (n + 1, 3)), axis=0) + 0.3
     position = np.cumsum(velocity * STEP_S, axis=0) + 4.0
     reset = np.zeros((n + 1, 3))
@@ -64,8 +64,8 @@ def test_the_recursive_filters_are_the_buffer(lag: int) -> None:
         assert found == pytest.approx(known, abs=1e-9)
 
 
-def test_what_the_filter_was_moved_by_is_told_by_what_is_published() -> None:
-    """A tenth of a second between corrections and between rows, as GNSS and the log have it."""
+def test_corrections_published_track_recovers_updates() -> None:
+    """Corrections and rows have an interval of 0.1 s, as GNSS and the log."""
     lag, tau_s, count = 15, 0.25, 60
     rng = np.random.default_rng(3)
     moved = rng.normal(0.0, 0.1, (count, 2)) * (rng.random((count, 1)) < 0.5)
@@ -82,7 +82,7 @@ def test_what_the_filter_was_moved_by_is_told_by_what_is_published() -> None:
     assert np.abs(moved).max() > 0.2
     np.testing.assert_allclose(found, moved, atol=0.05)
     assert np.corrcoef(found.ravel(), moved.ravel())[0, 1] > 0.97
-    # with half a second of rows missing, and as much without a position
+    # half a second of missing rows, and another without a position
     rows = np.delete(rows, np.arange(20, 25))
     p[400:450] = np.nan
     partly = corrections(rows * STEP_S, v[rows], p[rows], known_s, tau_s)
@@ -93,7 +93,7 @@ def test_what_the_filter_was_moved_by_is_told_by_what_is_published() -> None:
     np.testing.assert_allclose(partly[~lost], moved[~lost], atol=0.08)
 
 
-def test_the_published_attitude_follows_by_half_a_step_per_horizon() -> None:
+def test_follow_attitude_matches_recursion() -> None:
     lag, horizon_s = 19, 0.2
     error = np.zeros((600, 3))
     error[100:] = 0.01, 0.0, -0.02

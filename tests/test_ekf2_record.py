@@ -1,4 +1,4 @@
-"""The inside of EKF2's filter, read from each generation into one layout and unit."""
+"""Internal state of EKF2, read from each release into one layout and unit."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def made_log(generation, position=True):
 
 
 @pytest.mark.parametrize("generation", ["v1.12", "v1.14", "v1.15", "v1.16"])
-def test_states_and_variances_have_one_layout(read, generation):
+def test_read_record_each_release_has_same_layout(read, generation):
     ekf2 = read(made_log(generation, position=generation != "v1.16")).ekf2
     record = ekf2.record
     assert list(record.delayed) == Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
@@ -45,14 +45,14 @@ def test_states_and_variances_have_one_layout(read, generation):
     logged = covariances(16)[4 if old else 3 :]
     assert row[Columns.DELAYED_VARIANCE[3:9]].to_numpy() == pytest.approx(logged[:6])
     assert row[Columns.DELAYED_VARIANCE[9:15]].to_numpy() == pytest.approx(logged[6:12] / per**2)
-    # the fields of a magnetometer
+    # magnetic fields
     fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
     assert row[fields].to_numpy() == pytest.approx(STATES[16:])
     of_fields = covariances(22 if old else 21)[-6:]
     assert row[Columns.DELAYED_VARIANCE[15:]].to_numpy() == pytest.approx(of_fields)
 
 
-def test_attitude_variance_of_a_quaternion_is_that_of_many_draws(read):
+def test_read_record_quaternion_variance_matches_samples(read):
     log = made_log("v1.14")
     variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
     log["estimator_states"]["covariances"][:, :4] = variance
@@ -64,7 +64,7 @@ def test_attitude_variance_of_a_quaternion_is_that_of_many_draws(read):
     assert found == pytest.approx(errors.var(axis=0), rel=0.02)
 
 
-def test_every_ekf2_parameter_is_kept_and_results_hold_theirs_only(read, tmp_path):
+def test_read_record_keeps_all_ekf2_parameters(read, tmp_path):
     log = made_log("v1.16")
     kept = {name: value for name, value in log.parameters.items() if name.startswith("EKF2_")}
     assert read(log).ekf2.record.parameters == pytest.approx(kept)
@@ -76,7 +76,7 @@ def test_every_ekf2_parameter_is_kept_and_results_hold_theirs_only(read, tmp_pat
     ("cs_opt_flow", ("optical flow",)),
     ("cs_ev_vel", ("vision velocity",)),
 ])  # fmt: skip
-def test_other_horizontal_aiding_is_named(read, flag, names):
+def test_read_record_other_aiding_is_listed(read, flag, names):
     log = made_log("v1.16")
     flags = log["estimator_status_flags"]
     used = np.zeros(len(flags["timestamp"]), np.bool_)
@@ -87,7 +87,7 @@ def test_other_horizontal_aiding_is_named(read, flag, names):
     assert read(log).ekf2.record.other_aiding == names
 
 
-def test_the_age_of_vision_is_publication_minus_measurement(read):
+def test_read_record_vision_age_is_publication_delay(read):
     log = made_log("v1.16")
     fields = log["vehicle_visual_odometry"]
     age = read(log).ekf2.record.vision_age_s
@@ -99,17 +99,17 @@ def test_the_age_of_vision_is_publication_minus_measurement(read):
     assert moved.vision_age_s.to_numpy() == pytest.approx(age.to_numpy())
 
 
-def test_without_quaternions_or_topic_there_is_no_record(read):
+def test_read_record_missing_states_is_unavailable(read):
     assert isinstance(read(make_log("v1.16")).ekf2.record, Unavailable)  # quaternions of zero
     assert isinstance(read(made_log("v1.16").drop("estimator_states")).ekf2.record, Unavailable)
     assert isinstance(read(make_log("v1.11")).ekf2.record, Unavailable)
 
 
-STEP_S = 0.010  # of EKF2 at the made flight's 100 Hz
+STEP_S = 0.010  # s, EKF2's step at an IMU rate of 100 Hz
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_bias_is_in_m_s2_whatever_the_state_vector_holds(read, generation):
+def test_read_record_bias_is_in_m_s2(read, generation):
     log = make_log(generation)
     number = int(generation.removeprefix("v1."))
     holder = log["estimator_states" if number >= 12 else "estimator_status"]
@@ -120,7 +120,7 @@ def test_bias_is_in_m_s2_whatever_the_state_vector_holds(read, generation):
     np.testing.assert_allclose(found, np.tile(BIAS, (len(found), 1)), rtol=1e-5)
 
 
-def test_its_own_topic_is_preferred(read):
+def test_read_bias_prefers_sensor_bias_topic(read):
     log = make_log("v1.14")
     own = {"accel_bias": np.tile(BIAS, (10, 1))}
     log.add(topic("estimator_sensor_bias", stamps(10.0, 1.0), own, sampled=True))
@@ -129,12 +129,12 @@ def test_its_own_topic_is_preferred(read):
     assert bias.index[1] == pytest.approx(1.0)
 
 
-def test_step_is_a_whole_number_of_imu_samples(read):
+def test_read_step_is_multiple_of_imu_interval(read):
     log = make_log("v1.14", imu_hz=1.0 / 0.004)
     log.parameters["EKF2_PREDICT_US"] = 10_000
     log["estimator_states"]["states"][:, 13:16] = BIAS * 0.012
     ekf2 = read(log).ekf2
-    assert ekf2.step_s == pytest.approx(0.012)  # 2.5 samples round to 3: roundf, away from 0
+    assert ekf2.step_s == pytest.approx(0.012)  # 2.5 samples round to 3, as roundf does
     np.testing.assert_allclose(ekf2.accelerometer_bias.iloc[0], BIAS, rtol=1e-5)
     imu = log["sensor_combined"]
     for name in imu:
@@ -142,7 +142,7 @@ def test_step_is_a_whole_number_of_imu_samples(read):
     assert read(log).ekf2.step_s == STEP_S
 
 
-def test_horizon_is_the_age_at_publication_where_that_is_told(read):
+def test_read_horizon_is_age_at_publication(read):
     log = make_log("v1.16")
     assert read(log).ekf2.horizon_s == pytest.approx(0.060)
     states = log["estimator_states"]

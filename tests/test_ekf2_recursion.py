@@ -1,6 +1,6 @@
-"""The model of EKF2 on numbers whose answer is known, and at its limits: intervals and recursion.
+"""EKF2 model on cases with a known answer, and at its limits: intervals and recursion.
 
-The limits are written out here, so that one that is changed must be changed here as well.
+The limits are repeated here, so that a change in the code needs a change in the test.
 """
 
 import math
@@ -42,12 +42,12 @@ from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew
 
 
-def test_the_variance_of_a_bias_stays_within_px4s_limits():
+def test_limit_bias_applies_px4_limits():
     P = np.zeros((2, 15, 15))
     for each in P:
         np.fill_diagonal(each[12:, 12:], [4.0, 1e-3, 0.1])
     _limit_bias(P, 5e-4, np.array([True, False]))
-    # 0.1 g at most, a ratio of 100 between the axes at least
+    # at most 0.1 g, ratio between the axes at most 100
     np.testing.assert_allclose(np.diag(P[0])[12:], [0.980665**2, 0.04, 0.1])
     np.testing.assert_allclose(np.diag(P[1])[12:], [4.0, 1e-3, 0.1])
     np.fill_diagonal(P[0][12:, 12:], [1e-3, 1e-5, 1e-3])
@@ -55,25 +55,25 @@ def test_the_variance_of_a_bias_stays_within_px4s_limits():
     np.testing.assert_allclose(np.diag(P[0])[12:], [1e-3, 5e-4, 1e-3])
 
 
-def test_what_counts_as_measurement_and_noise():
+def test_measurements_apply_lever_arm_and_noise():
     vision = made(ReceivedPositions, position_m=np.array([[1.0, 2.0, 3.0]]),
                   variance_m2=np.array([[0.04, 0.0001, 0.0]]))  # fmt: skip
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     stretch = made(Stretch, rotation=np.array([np.eye(3), turned]))
-    knob = {
+    parameters = {
         "EKF2_EVP_NOISE": np.array([0.1, 0.001]), "EKF2_EV_NOISE_MD": np.array([0.0, 1.0]),
         "EKF2_EV_POS_X": np.array([0.0, 0.3]), "EKF2_EV_POS_Y": np.zeros(2),
         "EKF2_EV_POS_Z": np.zeros(2),
     }  # fmt: skip
     inputs = made(Inputs, received=vision, imu_offset_m=np.zeros(3))
     at = np.array([0]), np.array([[1]])
-    position, noise = measurements(inputs, stretch, *at, knob, np.array([True, True]))
+    position, noise = measurements(inputs, stretch, *at, parameters, np.array([True, True]))
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
     assert np.isnan(position[..., :3]).all()
     np.testing.assert_allclose(position[0, :, 3:], [[1, 2, 3], [1, 1.7, 3]], atol=1e-12)
-    # what is reported, EKF2_EVP_NOISE at least; or that alone, 1 cm at least
+    # the reported variance, at least EKF2_EVP_NOISE; or EKF2_EVP_NOISE only, at least 1 cm
     np.testing.assert_allclose(noise[0, :, 3:], [[0.04, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
-    _, noise = measurements(inputs, stretch, *at, knob, np.array([False, False]))
+    _, noise = measurements(inputs, stretch, *at, parameters, np.array([False, False]))
     np.testing.assert_allclose(noise[0, :, 3:], [[0.01, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
 
 
@@ -82,23 +82,23 @@ def deciding(
     action: int = FUSE,
     startable: bool = False,
     gated: bool = True,
-    obeys: bool = False,
+    follows_log: bool = False,
     logged: float = np.nan,
     logged_reset: bool = False,
     outside: bool = True,
-    silent_s: float = 0.5,
+    gap_s: float = 0.5,
     stopped: bool = False,
     left: int = 5,
     rules: FusionRules = RULES,
-    velocity_silent_s: float = 0.0,
+    velocity_gap_s: float = 0.0,
 ) -> tuple[bool, bool, bool, float, bool, int]:
-    """What is rejected, taken and reset at 10 s; then last fusion, whether stopped, resets left."""
+    """Return rejected, fused and reset at 10 s; then last fusion, stopped, remaining resets."""
     fusion = _Fusion(
-        rules, 10.0 - silent_s, action=np.array([[action]]), startable=np.array([[startable]]),
-        time_s=np.array([[10.0]]), gated=np.array([gated]), as_logged=np.array([obeys]),
+        rules, 10.0 - gap_s, action=np.array([[action]]), startable=np.array([[startable]]),
+        time_s=np.array([[10.0]]), gated=np.array([gated]), as_logged=np.array([follows_log]),
         rejected=np.array([logged]), reset=np.array([logged_reset]),
     )  # fmt: skip
-    fusion.velocity_s = np.array([10.0 - velocity_silent_s])
+    fusion.velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.stopped, fusion.left = np.array([stopped]), np.array([left])
     rejected, taken, reset, _ = fusion.decide(0, np.array([outside]), np.array([False]))
     last, stop, rest = fusion.last_s[0], fusion.stopped[0], fusion.left[0]
@@ -108,25 +108,26 @@ def deciding(
 @pytest.mark.parametrize(("case", "expected"), [
     ({"outside": False}, (False, True, False, 10.0, False, 5)),
     ({}, (True, False, False, 9.5, False, 5)),
-    ({"silent_s": 1.0}, (True, False, False, 9.0, False, 5)),
-    ({"silent_s": 1.5}, (True, False, True, 10.0, False, 4)),
-    ({"silent_s": 1.5, "left": 1}, (True, False, True, 10.0, False, 0)),
-    ({"silent_s": 1.5, "left": 0}, (True, False, False, 8.5, True, 0)),
+    ({"gap_s": 1.0}, (True, False, False, 9.0, False, 5)),
+    ({"gap_s": 1.5}, (True, False, True, 10.0, False, 4)),
+    ({"gap_s": 1.5, "left": 1}, (True, False, True, 10.0, False, 0)),
+    ({"gap_s": 1.5, "left": 0}, (True, False, False, 8.5, True, 0)),
     ({"gated": False}, (False, True, False, 10.0, False, 5)),
     ({"action": START, "left": 2}, (False, False, True, 10.0, False, 5)),
     ({"stopped": True, "outside": False}, (False, False, False, 9.5, True, 5)),
     ({"stopped": True, "startable": True, "left": 0}, (True, False, True, 10.0, False, 5)),
     ({"action": IDLE}, (False, False, False, 9.5, False, 5)),
-    # as the log tells
-    ({"obeys": True, "logged": 0.0}, (False, True, False, 10.0, False, 5)),
-    ({"obeys": True, "logged": 1.0, "outside": False}, (True, False, False, 9.5, False, 5)),
-    ({"obeys": True, "logged": 1.0, "silent_s": 9.0, "left": 0},
+    # logged decisions
+    ({"follows_log": True, "logged": 0.0}, (False, True, False, 10.0, False, 5)),
+    ({"follows_log": True, "logged": 1.0, "outside": False}, (True, False, False, 9.5, False, 5)),
+    ({"follows_log": True, "logged": 1.0, "gap_s": 9.0, "left": 0},
      (True, False, False, 1.0, False, 0)),
-    ({"obeys": True, "logged": 1.0, "logged_reset": True}, (True, False, True, 10.0, False, 5)),
-    ({"obeys": True}, (True, False, False, 9.5, False, 5)),
+    ({"follows_log": True, "logged": 1.0, "logged_reset": True},
+     (True, False, True, 10.0, False, 5)),
+    ({"follows_log": True}, (True, False, False, 9.5, False, 5)),
     ({"logged": 0.0}, (True, False, False, 9.5, False, 5)),
 ])  # fmt: skip
-def test_what_is_decided_of_a_sample(case, expected):
+def test_fusion_decision_matches_ekf2_rules(case, expected):
     assert deciding(**case) == expected
 
 
@@ -138,7 +139,7 @@ def test_what_is_decided_of_a_sample(case, expected):
     ({"EKF2_EV_DELAY": 50.0}, True, Timing(0.05, 0.12)),
     ({"EKF2_EV_DELAY": 200.0}, True, Timing(0.2, 0.19)),
 ])  # fmt: skip
-def test_the_horizon_is_the_length_of_the_buffer(settings, by_delay, timing):
+def test_variant_timing_horizon_is_buffer_length(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
     rules = replace(RULES, horizon_by_delay=by_delay)
     inputs = made(Inputs, rules=rules, settings=usual, horizon_s=0.12, step_s=0.01, predict_s=0.01)
@@ -148,13 +149,15 @@ def test_the_horizon_is_the_length_of_the_buffer(settings, by_delay, timing):
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
-def test_a_release_without_delay_max_has_none():
+def test_replay_delay_max_unknown_raises_error():
     rules = replace(RULES, horizon_by_delay=True)
     received = made(ReceivedPositions, own_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
     model = made(Model, inputs=inputs, flight=flight)
-    with pytest.raises(SettingsError, match=r"in PX4 v1\.14 the longest delay makes the horizon"):
+    with pytest.raises(
+        SettingsError, match=r"in PX4 v1\.14 the fusion horizon follows from the largest delay"
+    ):
         replay_settings(model, [{"EKF2_DELAY_MAX": 100.0}])
     assert replay_settings(model, []) == ()
 
@@ -162,23 +165,19 @@ def test_a_release_without_delay_max_has_none():
 GNSS_RULES = replace(RULES, stop_s=math.inf, reset_s=7.0, resets=1_000_000, with_velocity=True)
 
 
-@pytest.mark.parametrize(("silent_s", "velocity_silent_s", "with_velocity", "resets"), [
+@pytest.mark.parametrize(("gap_s", "velocity_gap_s", "with_velocity", "resets"), [
     (7.1, 7.1, True, True), (6.9, 7.1, True, False), (7.1, 6.9, True, False),
     (13.9, 0.0, True, False), (14.1, 0.0, True, True), (7.1, 0.0, False, True),
 ])  # fmt: skip
-def test_gnss_is_reset_to_without_both_for_7_s_or_position_for_14_s(
-    silent_s, velocity_silent_s, with_velocity, resets
-):
-    """shouldResetGpsFusion, gps_control.cpp; since main of 2026 each aid by itself."""
+def test_fusion_gnss_reset_after_7_or_14_s(gap_s, velocity_gap_s, with_velocity, resets):
+    """As shouldResetGpsFusion, gps_control.cpp; from main of 2026 on aids are independent."""
     rules = replace(GNSS_RULES, with_velocity=with_velocity)
-    _, taken, reset, *_ = deciding(
-        silent_s=silent_s, velocity_silent_s=velocity_silent_s, rules=rules, left=9
-    )
+    _, taken, reset, *_ = deciding(gap_s=gap_s, velocity_gap_s=velocity_gap_s, rules=rules, left=9)
     assert (taken, reset) == (False, resets)
 
 
-def test_states_fused_in_turn_keep_the_innovations_of_before():
-    """As EKF2 does: the second gain has the new covariance and the old S, so it is not optimal."""
+def test_sequential_update_uses_initial_innovations():
+    """As in EKF2 the second gain uses the new covariance and the old S, so it is not optimal."""
     rng = np.random.default_rng(6)
     root = rng.normal(size=(2, 15, 15))
     P, nu, R = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 6)), np.full((2, 6), 0.5)
@@ -186,12 +185,12 @@ def test_states_fused_in_turn_keep_the_innovations_of_before():
     taken = np.array([True, False])
     x, left = _sequential_update(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken[:, None])
     expected, state = P[0], np.zeros(15)
-    for told, row in ((3, 6), (4, 7)):
-        K = expected[:, row] / S[0, told]
+    for column, row in ((3, 6), (4, 7)):
+        K = expected[:, row] / S[0, column]
         kept = np.eye(15) - np.outer(K, np.eye(15)[row])
-        expected = kept @ expected @ kept.T + R[0, told] * np.outer(K, K)
-        state = state + K * nu[0, told]
-        if row == 6:  # the first is the Kalman filter's
+        expected = kept @ expected @ kept.T + R[0, column] * np.outer(K, K)
+        state = state + K * nu[0, column]
+        if row == 6:  # the first update is that of the Kalman filter
             np.testing.assert_allclose(expected, P[0] - np.outer(K, P[0, 6]), atol=1e-9)
     np.testing.assert_allclose(x, [state, np.zeros(15)], atol=1e-9)
     np.testing.assert_allclose(left, [expected, P[1]], atol=1e-9)
@@ -199,27 +198,27 @@ def test_states_fused_in_turn_keep_the_innovations_of_before():
 
 
 def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> StretchRun:
-    """:func:`at_rest` on GNSS, with the velocity that each fix has too."""
+    """:func:`at_rest` on GNSS, with a velocity for each fix."""
     speed = np.zeros((len(north_m_s), 3))
     speed[:, 0] = north_m_s
     return at_rest(north_m, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed, **more)
 
 
-def test_what_else_tells_of_the_tilt_makes_it_surer_and_leaves_it():
-    """Down to the logged variance, as a measurement of it would, and only with GNSS."""
+def test_recursion_gnss_tilt_variance_is_as_logged():
+    """As by a measurement, down to the logged variance, and only with GNSS."""
     fixes = [0.0] * 20
-    free, told = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
-    np.testing.assert_allclose(told.variance[1:, 0, :2], 2.5e-5, rtol=0.02)
+    free, limited = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
+    np.testing.assert_allclose(limited.variance[1:, 0, :2], 2.5e-5, rtol=0.02)
     assert (free.variance[1:, 0, :2] > 5e-5).all()
-    np.testing.assert_allclose(told.state, free.state, atol=1e-9)
-    assert (told.variance[-1, 0, 3:5] < free.variance[-1, 0, 3:5]).all()
+    np.testing.assert_allclose(limited.state, free.state, atol=1e-9)
+    assert (limited.variance[-1, 0, 3:5] < free.variance[-1, 0, 3:5]).all()
     vision, with_tilt = (at_rest(fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
     np.testing.assert_array_equal(vision.variance, with_tilt.variance)
 
 
 @pytest.mark.parametrize(("speed_m_s", "moves"), [(1.0, True), (3.0, False)])
-def test_a_velocity_beyond_its_gate_moves_nothing(speed_m_s, moves):
-    """Five times √(P + 0.09) is 1.5 m/s; the fix's position is fused all the same."""
+def test_recursion_velocity_outside_gate_is_rejected(speed_m_s, moves):
+    """Five times √(P + 0.09) is 1.5 m/s; the position of the fix is fused nevertheless."""
     done = on_gnss([0.0] * 20, [0.0] * 10 + [speed_m_s] + [0.0] * 9)
     assert done.fused.all()
     assert bool(abs(done.state[11, 0, 3]) > 1e-3) is moves
@@ -232,8 +231,8 @@ def test_a_velocity_beyond_its_gate_moves_nothing(speed_m_s, moves):
     (2.0, 0.6, True), (2.0, 0.4, False), (3.3, 0.6, True), (3.3, 0.4, False),
     (1.5, 0.4, True), (4.0, 0.6, False),
 ])  # fmt: skip
-def test_on_the_edge_of_the_gate_what_is_published_tells_of_a_fix(north_m, share, fused):
-    """The gate is at 2.515 m: to which share of a fusion was the position moved thereafter?"""
+def test_recursion_gate_limit_uses_published_motion(north_m, share, fused):
+    """The gate is at 2.515 m; ``share`` is the published motion over the full correction."""
     fixes = [0.0] * 10 + [north_m] + [0.0] * 9
     done = on_gnss(fixes, [0.0] * 20)
     S, R = done.innovation_variance[10, 0, 3], done.noise[10, 0, 3]
@@ -244,8 +243,8 @@ def test_on_the_edge_of_the_gate_what_is_published_tells_of_a_fix(north_m, share
     assert bool(done.fused[10, 0]) is (north_m < 2.515)
 
 
-def test_at_rest_tilt_and_bias_are_known_together():
-    """Against a plain Kalman filter of a vehicle that stood for a minute, facing east."""
+def test_settled_correlation_matches_kalman_filter():
+    """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
     stretch = made(
@@ -269,30 +268,30 @@ def test_at_rest_tilt_and_bias_are_known_together():
     assert np.linalg.eigvalsh(found).min() > -1e-9
 
 
-def test_a_reset_to_a_fix_takes_its_velocity_too():
-    """Seven seconds without both: position and velocity are the fix's, with their variances."""
+def test_recursion_gnss_reset_sets_velocity():
+    """After 7 s without both: position and velocity are those of the fix, with their variances."""
     done = on_gnss([0.0] * 5 + [300.0] * 80, [0.0] * 5 + [40.0] * 80)
     at = int(np.flatnonzero(done.reset[:, 0])[0])
-    assert at == 5 + 70  # the 71st rejected one is the first more than 7 s after the last fusion
+    assert at == 5 + 70  # the 71st rejected fix is the first more than 7 s after the last fusion
     np.testing.assert_allclose(done.state[at + 1, 0, [6, 3]], [300.0, 40.0], atol=1e-9)
     np.testing.assert_allclose(done.variance[at + 1, 0, 6:8], 0.25)
     np.testing.assert_allclose(done.variance[at + 1, 0, 3:5], 0.09)
 
 
-def test_from_when_on_an_aid_is_lost_it_moves_nothing_more():
-    """Ten fixes at the origin, then ten 1 m north that say 0.5 m/s; 11.05 s lies between."""
+def test_recursion_lost_aid_is_not_fused():
+    """Ten fixes at the origin, then ten 1 m north with 0.5 m/s; the aid is lost at 11.05 s."""
     fixes, speeds = [0.0] * 10 + [1.0] * 10, [0.0] * 10 + [0.5] * 10
     done = {name: on_gnss(fixes, speeds, without=dict.fromkeys(name.split(), 11.05))
             for name in ("", "gnss_pos", "gnss_vel", "gnss_pos gnss_vel")}  # fmt: skip
     whole = done[""]
-    for name, one in done.items():
-        np.testing.assert_array_equal(one.state[:10], whole.state[:10])
-        assert one.fused[:10].all()
-        # what it would have innovated is still told
-        assert np.isfinite(one.innovation[10:, 0, 3:5]).all()
-        assert one.fused[10:].any() == ("gnss_pos" not in name)
-        assert not (one.rejected | one.reset).any()
-    north, speed = ({name: one.state[-1, 0, row] for name, one in done.items()} for row in (6, 3))
+    for name, run in done.items():
+        np.testing.assert_array_equal(run.state[:10], whole.state[:10])
+        assert run.fused[:10].all()
+        # innovations are still computed
+        assert np.isfinite(run.innovation[10:, 0, 3:5]).all()
+        assert run.fused[10:].any() == ("gnss_pos" not in name)
+        assert not (run.rejected | run.reset).any()
+    north, speed = ({name: run.state[-1, 0, row] for name, run in done.items()} for row in (6, 3))
     assert [north["gnss_pos gnss_vel"], speed["gnss_pos gnss_vel"]] == pytest.approx([0.0, 0.0])
     assert speed["gnss_pos"] == pytest.approx(0.5, abs=0.05)
     assert 0.0 < north["gnss_pos"] < north[""]
@@ -300,17 +299,17 @@ def test_from_when_on_an_aid_is_lost_it_moves_nothing_more():
 
 
 @pytest.mark.parametrize("speed_m_s", [None, np.zeros((20, 3))])
-def test_with_a_magnetometer_the_heading_is_told_by_it_and_the_height_is_ekf2s_own(speed_m_s):
-    """The filter begins 0.05 rad off, and what the log has of the heading is not taken."""
+def test_recursion_magnetometer_estimates_heading(speed_m_s):
+    """The initial heading error is 0.05 rad; the logged heading is not used."""
     done = at_rest([0.0] * 5 + [1.0] * 15, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed_m_s,
                    heading_rad=0.05, down_m=-3.0, field_gauss=(0.21, 0.0, 0.43))  # fmt: skip
     assert done.state.shape == (len(done.innovation) + 1, 1, 21)
     heading = done.state[:, 0, 2]
     assert 0.02 < heading[1] < 0.05
     assert heading[-1] == pytest.approx(0.0, abs=0.01)
-    # 28 samples of 0.21 gauss, each 0.05 exact; the gyro adds a little
-    told = 1.0 / (0.01**-1 + 28 * (0.21 / 0.05) ** 2)
-    assert told < done.variance[-1, 0, 2] < 1.4 * told
+    # 28 samples of 0.21 gauss with σ 0.05; the gyro adds a little
+    expected = 1.0 / (0.01**-1 + 28 * (0.21 / 0.05) ** 2)
+    assert expected < done.variance[-1, 0, 2] < 1.4 * expected
     np.testing.assert_array_equal(done.state[1:, 0, 8], -3.0)
     np.testing.assert_allclose(done.variance[10:, 0, 8], 4e-4, rtol=1e-3)
     assert done.fused.all()
@@ -322,7 +321,7 @@ def at_rest(
     speed_m_s: Any = None, tilt_rad2: float = np.inf, without: Any = None,
     heading_rad: float = 0.0, field_gauss: Any = None, moved_m: Any = None, **settings: float,
 ) -> StretchRun:  # fmt: skip
-    """A level vehicle that stands still at the origin, seen at 10 Hz at these places north."""
+    """Run a level vehicle at rest at the origin, measured at 10 Hz at these north positions."""
     count = 10 * (len(measured_m) + 1)
     flat = np.zeros((count, 3))
     stretch = Stretch(
@@ -359,22 +358,22 @@ def at_rest(
     return run_stretch(inputs, stretch, [variant], [intervals])
 
 
-def test_a_vehicle_at_rest_stays_and_its_variance_is_the_kalman_filters():
+def test_recursion_at_rest_matches_kalman_filter():
     done = at_rest([0.0] * 20)
     np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
     assert done.fused.all()
     np.testing.assert_allclose(done.noise[..., 3:], 0.01)
-    # P after = P R / (P + R), each of north and east alone
+    # P after = P R / (P + R), separately for north and east
     before, after = done.innovation_variance[0, 0, 3:5] - 0.01, done.variance[1, 0, 6:8]
     np.testing.assert_allclose(after, before * 0.01 / (before + 0.01), rtol=1e-3)
-    # the first 0.1 s: position 1e-4 and velocity 1e-4 over it, and what tilt and noise add
+    # first 0.1 s: 1e-4 from position and from velocity, plus tilt and noise
     assert before[0] == pytest.approx(1e-4 + 1e-4 * 0.1**2, rel=0.05)
-    # heading and height have the variances of EKF2's own
+    # heading and height have the logged variances
     np.testing.assert_allclose(done.variance[1:, 0, 2], 1e-4, rtol=0.01)
     assert done.variance[-1, 0, 8] == pytest.approx(4e-4, rel=0.01)
 
 
-def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to():
+def test_recursion_source_jump_resets_after_1_s():
     done = at_rest([0.0] * 5 + [3.0] * 15)
     rejected, reset, fused = done.rejected[:, 0], done.reset[:, 0], done.fused[:, 0]
     assert np.flatnonzero(rejected).tolist() == list(range(5, 16))
@@ -384,7 +383,7 @@ def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to():
     np.testing.assert_allclose(done.state[16, 0, 6:8], [3.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(done.state[15, 0, 6:8], [0.0, 0.0], atol=1e-3)
     np.testing.assert_allclose(done.variance[16, 0, 6:8], 0.01)
-    # nothing else is touched
+    # other states do not change
     np.testing.assert_allclose(done.variance[16, 0, 8], done.variance[15, 0, 8], rtol=0.01)
     assert (done.variance[16, 0, 3:6] > done.variance[15, 0, 3:6]).all()
     assert at_rest([0.0] * 5 + [3.0] * 15, EKF2_EVP_GATE=100.0).fused.all()
@@ -397,8 +396,8 @@ def test_a_step_of_the_source_is_rejected_for_a_second_and_then_reset_to():
 
 
 @pytest.mark.parametrize("n", [4, 200])
-def test_unit_noise_at_the_end_of_an_interval_is_that_of_its_steps(n):
-    """Step by step: θ gains unit noise · dt, v turns with it, p follows v."""
+def test_interval_unit_noise_matches_steps(n):
+    """Step by step: θ gains unit noise · dt, v depends on θ, p on v."""
     dt = 0.008
     tilt = -skew(np.array([[0.3, -0.2, -9.8]]))[0] * dt
     F = np.eye(9)
@@ -408,11 +407,11 @@ def test_unit_noise_at_the_end_of_an_interval_is_that_of_its_steps(n):
         for at, rows in enumerate((slice(0, 3), slice(3, 6))):
             sums[at] = F @ sums[at] @ F.T
             sums[at][rows, rows] += dt**2 * np.eye(3)
-    made_at_once = _noises(np.array([float(n)]), np.array([n * dt]), (n * tilt)[None])
-    # of the gyro, leading terms of position alone with velocity and itself
-    sums[0][6:9, 3:9] = made_at_once[0][0, 6:9, 3:9] if n == 4 else sums[0][6:9, 3:9]
+    closed_forms = _noises(np.array([float(n)]), np.array([n * dt]), (n * tilt)[None])
+    # for the gyro, only leading terms of position with velocity and itself
+    sums[0][6:9, 3:9] = closed_forms[0][0, 6:9, 3:9] if n == 4 else sums[0][6:9, 3:9]
     sums[0][3:6, 6:9] = sums[0][6:9, 3:6].T
-    for found, true in zip(made_at_once, sums, strict=True):
+    for found, true in zip(closed_forms, sums, strict=True):
         scale = np.sqrt(np.outer(np.diag(true), np.diag(true)))
         scale[scale == 0.0] = 1.0
         assert np.max(np.abs(found[0] - true) / scale) < (1e-9 if n == 4 else 0.03)
@@ -436,11 +435,11 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     return action.tolist()
 
 
-def test_fusion_starts_on_the_second_of_two_samples_and_stops_in_silence():
+def test_actions_start_and_stop_by_sample_interval():
     assert acting([10.1, 10.3, 10.45], fusing=False) == [IDLE, IDLE, START]
     assert acting([10.1, 10.29, 10.45], fusing=False) == [IDLE, START, FUSE]
     assert acting([10.1, 10.29, 10.45]) == [FUSE, FUSE, FUSE]
-    # 0.4 s to the step before
+    # 0.4 s to the previous step
     assert acting([10.1, 10.5, 10.6]) == [FUSE, FUSE, FUSE]
     assert acting([10.1, 10.53, 10.6]) == [FUSE, IDLE, START]
     old = replace(RULES, start_interval_s=math.inf, stop_s=7.0)
@@ -456,16 +455,16 @@ def events(
     return _events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 
 
-def test_a_sample_is_fused_at_the_end_of_the_step_of_its_measurement():
-    """Half a step and the delay before its stamp; events without one where vision is silent."""
+def test_events_sample_is_fused_at_its_step_end():
+    """Half a step and the delay before its timestamp; additional events in gaps of vision."""
     found = events([10.2, 10.305, 10.9])
-    seen = found.sample >= 0
+    has_sample = found.sample >= 0
     assert found.sample.tolist() == [0, 1, -1, -1, 2]
-    assert found.end[seen].tolist() == [20, 30, 90]
-    assert found.end[~seen].tolist() == [50, 70]
+    assert found.end[has_sample].tolist() == [20, 30, 90]
+    assert found.end[~has_sample].tolist() == [50, 70]
     assert found.time_s == pytest.approx([10.195, 10.3, 10.5, 10.7, 10.895])
-    assert found.usable[seen].all()
-    assert not found.usable[~seen].any()
+    assert found.usable[has_sample].all()
+    assert not found.usable[~has_sample].any()
     assert found.action.tolist() == [FUSE, FUSE, IDLE, IDLE, IDLE]
     assert events([10.2, 10.305], delay_s=0.05).end[:2].tolist() == [15, 25]
     assert events([10.505]).sample[:3].tolist() == [-1, -1, 0]
@@ -480,8 +479,8 @@ def test_a_sample_is_fused_at_the_end_of_the_step_of_its_measurement():
 @pytest.mark.parametrize(("age_s", "late", "lost"), [
     (0.22, False, False), (0.24, True, False), (0.28, True, False), (0.31, False, True),
 ])  # fmt: skip
-def test_a_sample_that_comes_after_the_horizon_is_late_or_lost(age_s, late, lost):
-    """Due 0.2 s after its stamp: late by more than 0.03 s, lost from 0.1 s on."""
+def test_events_late_arrival_is_late_or_lost(age_s, late, lost):
+    """Due 0.2 s after its timestamp: late by more than 0.03 s, lost from 0.1 s on."""
     found = events([10.2, 10.4], age_s=age_s, horizon_s=0.2)
     assert (bool(found.late[0]), bool(found.lost[0])) == (late, lost)
     assert bool(found.usable[0]) is not lost

@@ -1,4 +1,4 @@
-"""What if EKF2 had had other parameters, and why it differs: sums, sweeps and messages."""
+"""EKF2 with other parameters, and steps from KF to EKF2: sums, sweeps and messages."""
 
 import math
 from pathlib import Path
@@ -20,12 +20,12 @@ from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
 from px4fuse.ekf2.stretches import SensorSamples, Stretch
 from px4fuse.ekf2.walk import (
     ATTITUDE,
-    FIELD,
-    FLOWING,
+    FIELD_STEP,
+    FLOW_STEP,
     GATE,
     OUTPUT,
-    SPEED,
     STEPS,
+    VELOCITY_STEP,
     Why,
     _longest_rejection,
     explain_by_steps,
@@ -43,7 +43,7 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
 
-def test_side_by_side(model):
+def test_what_if_has_logged_and_replayed_columns(model):
     made = what_if(model, [{"EKF2_EVP_NOISE": 0.5}, {"EKF2_EVP_NOISE": 0.02}])
     wide, narrow = made.whatif
     for axis in ("north", "east"):
@@ -55,9 +55,9 @@ def test_side_by_side(model):
         assert wide.axes[axis].nis_mean < 0.1
         assert narrow.axes[axis].nis_mean > 5.0
         assert replayed.nis_band[0] < 1.0 < replayed.nis_band[1]
-        # the truth knows which is best: UWB noise is 0.10 m
+        # ground truth shows the best setting: UWB noise is 0.10 m
         assert narrow.axes[axis].position_rmse_to_truth_m > replayed.position_rmse_to_truth_m
-    assert made.replayed.samples > 2 * made.logged.samples  # the log holds 2 Hz of 5 Hz
+    assert made.replayed.samples > 2 * made.logged.samples  # the log has 2 of 5 samples per second
     assert isinstance(made.logged.longest_without_fusion_s, Unavailable)
     assert made.replayed.longest_without_fusion_s == pytest.approx(0.22, abs=0.04)
     assert made.replayed.rejected_share == made.logged.rejected_share == 0.0
@@ -67,14 +67,14 @@ def test_side_by_side(model):
     assert not made.notes
 
 
-def test_without_agreement_there_is_no_what_if_and_no_why(model):
+def test_what_if_without_agreement_is_unavailable(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
     for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), explain_by_steps(doubtful)):
         assert isinstance(result, Unavailable)
         assert "no reason" in result.reason
 
 
-def test_the_bars_add_up_and_little_is_left(model):
+def test_steps_add_up_to_total_difference(model):
     for axis in explain_by_steps(model).values():
         assert axis.coast is None
         assert tuple(step.name for step in axis.steps) == STEPS
@@ -84,42 +84,42 @@ def test_the_bars_add_up_and_little_is_left(model):
             assert total == pytest.approx(getattr(axis, quantity), abs=1e-12)
         assert axis.position_left_share < 0.03
         by_name = {step.name: step for step in axis.steps}
-        # what is the same in both filters moves nothing
+        # properties that do not differ between the filters change nothing
         assert by_name["measurement noise"].position_moved_m < 1e-6
-        assert by_name["gate, missed samples, resets"].position_moved_m < 1e-6
+        assert by_name["gate, missed samples and resets"].position_moved_m < 1e-6
         largest = sorted(axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
         assert {step.name for step in largest} == {"process noise", OUTPUT}
         last = axis.steps[-1].position_rmse_to_truth_m
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
 
-def test_a_run_of_another_time_is_not_walked_from(model):
+def test_steps_without_common_time_are_unavailable(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
     result = explain_by_steps(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
     assert isinstance(result, Unavailable)
     assert "no time in common" in result.reason
 
 
-# ---------------------------------------------------------------- on numbers whose answer is known
+# ----------------------------------------------------------- cases with a known answer
 
 
-def test_the_walk_changes_one_thing_after_the_other():
+def test_step_variants_change_one_property_each():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(Stretch, flow=None, heights=None),)
     flight = made(Inputs, settings=flown, step_s=0.01, received=received, stretches=plain)
-    ours = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
-    found = list(step_variants(flight, ours).values())
-    settings = [one.settings for one in found]
+    kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
+    found = list(step_variants(flight, kf_settings).values())
+    settings = [variant.settings for variant in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
-    assert [one.reported for one in found] == [False] * 2 + [True] * 5
+    assert [variant.reported for variant in found] == [False] * 2 + [True] * 5
     assert settings[0]["EKF2_EV_POS_X"] == 0.0
-    assert [one.biases for one in found] == [False] * 3 + [True] * 4
-    assert [one.attitude for one in found] == [False] * 5 + [True] * 2
-    assert [one.gated for one in found] == [False] * 6 + [True]
-    assert [one.as_logged for one in found] == [False] * 6 + [True]
-    assert [one.stamp_offset_s for one in found] == [-0.05] + [None] * 6
+    assert [variant.biases for variant in found] == [False] * 3 + [True] * 4
+    assert [variant.attitude for variant in found] == [False] * 5 + [True] * 2
+    assert [variant.gated for variant in found] == [False] * 6 + [True]
+    assert [variant.as_logged for variant in found] == [False] * 6 + [True]
+    assert [variant.stamp_offset_s for variant in found] == [-0.05] + [None] * 6
     gnss = made(
         Inputs,
         aid=GNSS_POS,
@@ -128,22 +128,24 @@ def test_the_walk_changes_one_thing_after_the_other():
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
         stretches=plain,
     )
-    found = list(step_variants(gnss, ours).values())
-    assert [one.velocity for one in found] == [False] * 6 + [True] * 2
-    assert [one.gated for one in found] == [False] * 7 + [True]
-    # the delay was taken from the positions of GNSS that ours is given
+    found = list(step_variants(gnss, kf_settings).values())
+    assert [variant.velocity for variant in found] == [False] * 6 + [True] * 2
+    assert [variant.gated for variant in found] == [False] * 7 + [True]
+    # the GNSS positions of KF already include the delay
     assert found[0].stamp_offset_s == pytest.approx(-0.16)
-    assert [one.settings["EKF2_GPS_P_NOISE"] for one in found] == [0.2] * 2 + [0.5] * 6
+    assert [variant.settings["EKF2_GPS_P_NOISE"] for variant in found] == [0.2] * 2 + [0.5] * 6
     flow = (made(Stretch, flow=made(SensorSamples), heights=None),)
     more = {"stretches": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
-    variants = step_variants(made(Inputs, **{**vars(gnss), **more}), ours)
-    assert list(variants)[-5:] == [ATTITUDE, FIELD, SPEED, FLOWING, GATE]
-    assert ["mag" in one.without for one in variants.values()] == [True] * 6 + [False] * 4
-    assert ["optical_flow" in one.without for one in variants.values()] == [True] * 8 + [False] * 2
-    assert [one.velocity for one in variants.values()] == [False] * 7 + [True] * 3
+    variants = step_variants(made(Inputs, **{**vars(gnss), **more}), kf_settings)
+    assert list(variants)[-5:] == [ATTITUDE, FIELD_STEP, VELOCITY_STEP, FLOW_STEP, GATE]
+    assert ["mag" in each.without for each in variants.values()] == [True] * 6 + [False] * 4
+    assert ["optical_flow" in each.without for each in variants.values()] == [True] * 8 + [
+        False
+    ] * 2
+    assert [each.velocity for each in variants.values()] == [False] * 7 + [True] * 3
 
 
-def test_the_longest_run_of_rejections_is_said_with_how_far_it_led():
+def test_difference_steps_report_longest_rejection_run():
     taken = 20.0 + np.arange(10.0)
     updates = pd.DataFrame(
         {"rejected": [0, 1, 0, 0, 1, 1, 1, 0, 1, 1], "fused_at_s": taken + 0.5}, index=taken
@@ -157,13 +159,13 @@ def test_the_longest_run_of_rejections_is_said_with_how_far_it_led():
     found = _longest_rejection(one, still, (0.0, 99.0), ((0.0, 99.0),))
     assert (found.start_s, found.samples, found.duration_s) == (24.5, 3, 3.0)
     assert found.distance_m == pytest.approx(5.0)
-    # what is not judged, and what nobody rejected
+    # outside the evaluated time, and without rejections
     early = _longest_rejection(one, still, (0.0, 22.0), ((0.0, 99.0),))
     assert (early.start_s, early.samples, early.duration_s) == (21.5, 1, 0.0)
     assert _longest_rejection(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
 
-def test_errors_to_the_truth_are_of_its_own_span():
+def test_rms_to_truth_uses_common_span():
     times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
     frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=Columns.STATE)
     truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))
@@ -176,14 +178,14 @@ def test_errors_to_the_truth_are_of_its_own_span():
     assert rms_to_truth(made(Flight, truth=NONE), there, direction, times) is None
 
 
-def test_the_longest_time_without_fusion_counts_both_ends():
-    judged = ((15.0, 30.0), (40.0, 60.0))
-    assert _longest_between_fusions(np.array([16.0, 29.0, 41.0, 59.0]), judged) == 18.0
-    assert _longest_between_fusions(np.array([40.0]), judged) == 25.0
-    assert _longest_between_fusions(np.array([16.0]), judged) == 44.0
+def test_longest_between_fusions_includes_both_ends():
+    evaluated_spans = ((15.0, 30.0), (40.0, 60.0))
+    assert _longest_between_fusions(np.array([16.0, 29.0, 41.0, 59.0]), evaluated_spans) == 18.0
+    assert _longest_between_fusions(np.array([40.0]), evaluated_spans) == 25.0
+    assert _longest_between_fusions(np.array([16.0]), evaluated_spans) == 44.0
 
 
-def test_a_summary_joins_north_and_east() -> None:
+def test_summary_combines_north_and_east() -> None:
     north, east = (AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, m) for nis, m in ((1.0, 0.3), (3.0, 0.4)))
     one = Summary(changed={}, north=north, east=east, samples=9, rejected_share=0.0,
                   longest_without_fusion_s=0.1, resets=0)  # fmt: skip
@@ -194,7 +196,7 @@ def test_a_summary_joins_north_and_east() -> None:
     assert why.position_left_share == 0.25
 
 
-def test_samples_that_come_too_late_are_a_note():
+def test_what_if_late_samples_add_note():
     for by_delay, remedy in ((False, ": raise EKF2_DELAY_MAX"), (True, "")):
         rules = replace(RULES, horizon_by_delay=by_delay)
         model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
@@ -208,11 +210,11 @@ def test_samples_that_come_too_late_are_a_note():
         assert list(_notes(model, one)) == []
 
 
-# ------------------------------------------------------------------ where single rejections decide
+# ---------------------------------------------------------- predictability of results
 
 
 def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
-    """A flight with one of EKF2's parameters wrong, as its log is read."""
+    """Return the model of a simulated flight with one wrong EKF2 parameter, read from its log."""
     log = tmp_path / f"{seed}{mistake.partition('=')[2]}.ulg"
     log.write_bytes(to_ulog(simulate(Scenario(seed=seed), parse([mistake] if mistake else []))))
     return opened(read_log(log))
@@ -222,32 +224,34 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     ("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
     ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0}),
 ])  # fmt: skip
-def test_a_flight_that_rejects_most_tells_what_its_cure_does(tmp_path, mistake, seed, changes):
-    """By its own gate the replay parts from these logs, with EKF2's own rejections it does not."""
-    ill, well = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
-    assert ill.agreement.rejected_share_logged > 0.35
-    assert ill.agreement.good
-    (cured,) = what_if(ill, [changes]).whatif
-    truly = what_if(well, [{}]).logged
-    assert cured.steady
-    assert cured.nis_mean == pytest.approx(truly.nis_mean, rel=0.1)
-    assert cured.rejected_share == pytest.approx(truly.rejected_share, abs=0.03)
-    assert cured.position_rmse_to_truth_m == pytest.approx(truly.position_rmse_to_truth_m, rel=0.15)
+def test_what_if_rejecting_flight_predicts_remedy(tmp_path, mistake, seed, changes):
+    """Only with the logged rejections does the replay agree with these logs."""
+    faulty, correct = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
+    assert faulty.agreement.rejected_share_logged > 0.35
+    assert faulty.agreement.good
+    (predicted,) = what_if(faulty, [changes]).whatif
+    expected = what_if(correct, [{}]).logged
+    assert predicted.steady
+    assert predicted.nis_mean == pytest.approx(expected.nis_mean, rel=0.1)
+    assert predicted.rejected_share == pytest.approx(expected.rejected_share, abs=0.03)
+    assert predicted.position_rmse_to_truth_m == pytest.approx(
+        expected.position_rmse_to_truth_m, rel=0.15
+    )
 
 
-def test_where_most_would_be_rejected_nothing_is_predicted(model):
-    chaotic, some, none = what_if(
+def test_what_if_most_rejected_is_unpredictable(model):
+    unpredictable, some, none = what_if(
         model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif
-    assert chaotic.rejected_share > 0.35
-    assert not chaotic.steady
+    assert unpredictable.rejected_share > 0.35
+    assert not unpredictable.steady
     assert some.steady
     assert none.rejected_share <= 0.02
     assert none.steady
 
 
-def test_a_prediction_that_a_little_noise_changes_is_not_steady(model, monkeypatch):
-    """Each of the three numbers, just inside what is allowed and just outside."""
+def test_what_if_noise_sensitive_result_is_unpredictable(model, monkeypatch):
+    """Each of the three numbers just inside and just outside its limit."""
     north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Summary(
         changed={"EKF2_EVP_GATE": 3.0}, north=north, east=north, samples=500, rejected_share=0.2,
@@ -259,30 +263,30 @@ def test_a_prediction_that_a_little_noise_changes_is_not_steady(model, monkeypat
         runs.append((sigma_m, seed))
         return model
 
-    def judged(changed: Summary) -> bool:
+    def is_predictable(changed: Summary) -> bool:
         monkeypatch.setattr(whatif, "with_position_noise", with_position_noise)
         monkeypatch.setattr(whatif, "replay_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_summarise_replay", lambda *_: changed)
         (found,) = whatif._mark_unpredictable(model, [base], ((0.0, 1.0),), {})
         return found.steady
 
-    assert judged(base)
+    assert is_predictable(base)
     assert runs == [(0.002, 0), (0.002, 1), (0.002, 2), (0.002, 3)]
     for axes, field, value, steady in (
         (("north",), "nis_mean", 1.099, True), (("north",), "nis_mean", 1.101, False),
         (("east",), "nis_mean", 1.099, True), (("east",), "nis_mean", 1.101, False),
-        # the error is of both axes together
+        # the RMSE is that of both axes together
         (("north", "east"), "position_rmse_to_truth_m", 0.1149, True),
         (("north", "east"), "position_rmse_to_truth_m", 0.1151, False),
         ((), "rejected_share", 0.2299, True), ((), "rejected_share", 0.2301, False),
     ):  # fmt: skip
         other = structs.replace(north, **{field: value}) if axes else None
         changed = dict.fromkeys(axes, other) if axes else {field: value}
-        assert judged(structs.replace(base, **changed)) is steady
+        assert is_predictable(structs.replace(base, **changed)) is steady
     few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
     runs.clear()
     assert [one.steady for one in whatif._mark_unpredictable(model, [few, many], (), {})] == [
         True,
         False,
     ]
-    assert runs == []  # nothing to try
+    assert runs == []  # no repeated runs are needed

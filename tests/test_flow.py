@@ -1,4 +1,4 @@
-"""Optical flow in the model of EKF2, and what the model cannot follow."""
+"""Optical flow in the EKF2 model, and times that the model cannot replay."""
 
 from functools import cache
 
@@ -21,11 +21,12 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import make_scenario
 
-INTERVAL_S, SHARE = 0.02, 0.1  # of EKF2's low pass, ekf.h
+# interval (s) and weight of a new sample in EKF2's low-pass filter, ekf.h
+INTERVAL_S, SHARE = 0.02, 0.1
 
 
 def low_passed(raw: np.ndarray) -> np.ndarray:
-    """As EKF2's AlphaFilter."""
+    """Apply EKF2's AlphaFilter."""
     found = raw.copy()
     for k in range(1, len(raw)):
         found[k] = found[k - 1] + SHARE * (raw[k] - found[k - 1])
@@ -44,15 +45,15 @@ def true_velocity(times: np.ndarray) -> np.ndarray:
 
 
 def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
-    """What a log has of a flow at 50 Hz."""
+    """Return logged flow rows of a sensor at 50 Hz."""
     (stretch,) = model().inputs.stretches
     times = np.arange(stretch.time_s[0] + 1.0, stretch.time_s[-1] - 0.5, INTERVAL_S)
     turn = stretch.rotation[np.searchsorted(stretch.time_s, times - 1e-9)]
     raw = np.einsum("nji,nj->ni", turn, true_velocity(times))[:, :2]
     raw += np.random.default_rng(1).normal(0.0, 1.0, raw.shape) * noise_m_s
-    kept = low_passed(raw)[::every]
+    remaining = low_passed(raw)[::every]
     decay = (1.0 - SHARE) ** every
-    mean = (kept[1:] - decay * kept[:-1]) / (1.0 - decay)
+    mean = (remaining[1:] - decay * remaining[:-1]) / (1.0 - decay)
     return pd.DataFrame({
         "forward_m_s": mean[:, 0], "right_m_s": mean[:, 1], "samples": float(every),
         "interval_s": INTERVAL_S, "noise_m2_s2": max(noise_m_s, 0.3) ** 2,
@@ -60,18 +61,18 @@ def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
 
 
 def flying(noise_m_s: float = 0.3) -> Model:
-    """The flight, with flow."""
+    """Return the model with flow samples."""
     inputs = model().inputs
     stretches = tuple(add_flow_samples(one, flow_of(noise_m_s), 3.0) for one in inputs.stretches)
     return replace(model(), inputs=replace(inputs, stretches=stretches))
 
 
-def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path):
+def test_read_flow_recovers_mean_between_rows(tmp_path):
     log = gnss_log("v1.16")
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)
     raw = np.random.default_rng(3).normal(0.0, 1.0, (len(at), 2))
-    # a logger that is late now and then, and once misses four
+    # irregular logging intervals, with one of 50 samples
     rows = np.cumsum([*[10, 10, 9, 11] * 6, 50, *[10, 10, 9, 11] * 12])
     log.add(topic("estimator_optical_flow_vel", at[rows], {
         "vel_body": raw[rows], "vel_body_filtered": low_passed(raw)[rows],
@@ -84,7 +85,7 @@ def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path)
         "observation_variance": np.full((len(at[::25]), 2), 0.04),
     }))  # fmt: skip
     flags = log["estimator_status_flags"]
-    off_us = at[rows[30]]  # EKF2 gives flow up then, by the flags of the next second
+    off_us = at[rows[30]]  # µs; EKF2 disables flow then, shown by the flags of the next second
     flags["cs_opt_flow"] = flags["timestamp"] < off_us
     ekf2 = read_log(log.write(tmp_path / "a.ulg")).ekf2
     flow = ekf2.record.flow
@@ -105,45 +106,47 @@ def test_what_lies_between_two_rows_is_read_as_the_mean_of_all_samples(tmp_path)
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_flow_tells_the_velocity_at_the_event_after_it(every):
-    """Where the body moved since a sample is known from the IMU: corners are no innovations."""
+def test_flow_samples_give_velocity_at_next_event(every):
+    """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (stretch,) = model().inputs.stretches
-    told = add_flow_samples(stretch, flow_of(every=every), 3.0)
+    with_flow = add_flow_samples(stretch, flow_of(every=every), 3.0)
     end = next(iter(model().intervals.values()))[0].events.end
-    found = mean_by_event(told.flow, end, stretch.gained_m_s)
-    seen = found.number > 0.0
+    found = mean_by_event(with_flow.flow, end, stretch.imu_velocity_m_s)
+    has_sample = found.number > 0.0
     assert found.number.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
-    speed = true_velocity(stretch.time_s[end[seen]])
-    expected = np.einsum("kab,kb->ka", found.turn[seen], speed)
-    off = found.value[seen] - expected
+    speed = true_velocity(stretch.time_s[end[has_sample]])
+    expected = np.einsum("kab,kb->ka", found.turn[has_sample], speed)
+    off = found.value[has_sample] - expected
     assert np.sqrt(np.mean(off**2)) < 0.03
     assert np.ptp(expected, axis=0).min() > 0.7
 
 
-def test_the_mean_counts_as_often_as_it_has_samples_and_the_gate_is_of_one():
+def test_fuse_flow_mean_is_weighted_by_sample_count():
     turn = np.eye(3)[None, :2]
     x, P = np.zeros((1, 15)), np.diag(np.full(15, 1e-9))[None].copy()
     P[0, 3:5, 3:5] = 0.25 * np.eye(2)
-    told = EventSamples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
-    after, left = fuse_flow(x, P, told, 3.0)
+    samples = EventSamples(np.array([[1.0, -0.5]]), turn, np.array([10.0]), np.array([0.8]))
+    after, left = fuse_flow(x, P, samples, 3.0)
     # 1/P = 1/P₀ + n/R
     assert left[0, 3, 3] == pytest.approx(1.0 / (1.0 / 0.25 + 10.0 / 0.8), rel=1e-6)
     assert after[0, 3:5] == pytest.approx(np.array([1.0, -0.5]) * left[0, 3, 3] * 10.0 / 0.8)
-    far = told._replace(value=np.array([[3.1, 0.0]]))  # 3 σ of one sample are 3.07
+    far = samples._replace(value=np.array([[3.1, 0.0]]))  # 3 σ of one sample are 3.07
     np.testing.assert_array_equal(fuse_flow(x, P, far, 3.0)[0], x)
     assert fuse_flow(x, P, far, 3.1)[0][0, 3] > 1.0
-    none = told._replace(number=np.zeros(1), noise=np.zeros(1), turn=np.zeros((1, 2, 3)))
+    none = samples._replace(number=np.zeros(1), noise=np.zeros(1), turn=np.zeros((1, 2, 3)))
     np.testing.assert_array_equal(fuse_flow(x, P, none, 3.0)[0], x)
 
 
-def test_flow_carries_the_filter_without_gnss():
-    """A minute: by flow to a metre, by the IMU alone not to ten."""
+def test_replay_without_gnss_flow_limits_drift():
+    """Over one minute the drift is about 1 m with flow, above 10 m with the IMU only."""
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0)
     off = []
     for carried in (flying(), model()):
         (replay,) = replay_settings(carried, [{}], without=lost)
-        apart = replay.delayed[["north_m", "east_m"]] - model().flown.delayed[["north_m", "east_m"]]
-        off.append(float(np.hypot(*apart.loc[100.0:101.0].to_numpy().T).max()))
+        difference = (
+            replay.delayed[["north_m", "east_m"]] - model().flown.delayed[["north_m", "east_m"]]
+        )
+        off.append(float(np.hypot(*difference.loc[100.0:101.0].to_numpy().T).max()))
     assert off[0] < 1.5
     assert off[1] > 10.0
     (alone,) = replay_settings(flying(), [{}], without={"optical_flow": 0.0})
@@ -156,7 +159,7 @@ def stretches_s(flight: Flight) -> list[tuple[float, float]]:
     return [(float(one.time_s[0]), float(one.time_s[-1])) for one in stretches]
 
 
-def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped():
+def test_stretches_split_at_height_resets_and_clipping():
     flight = model().flight
     ((start, end),) = stretches_s(flight)
     for delta, parted in (((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.0), False)):
@@ -179,7 +182,7 @@ def test_the_model_begins_again_after_resets_of_height_and_where_much_is_clipped
             assert found[1][0] > 60.5
 
 
-def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused():
+def test_read_gnss_while_disabled_omits_fixes():
     flight = model().flight
     ekf2 = flight.ekf2
     enabled = pd.Series([1.0, 0.0, 1.0], index=[0.0, 50.0, 60.0])
@@ -189,28 +192,28 @@ def test_fixes_that_come_while_ekf2_does_without_gnss_are_not_fused():
     every = read_gnss(flight, with_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record)
     delay_s = ekf2.record.parameters["EKF2_GPS_DELAY"] * 1e-3
     measured_s = every.stamp_s - delay_s  # type: ignore[union-attr]
-    kept = (measured_s < 50.0) | (measured_s >= 60.0)
-    assert 0 < np.sum(~kept) < len(kept)
-    np.testing.assert_array_equal(found.stamp_s, every.stamp_s[kept])  # type: ignore[union-attr]
+    remaining = (measured_s < 50.0) | (measured_s >= 60.0)
+    assert 0 < np.sum(~remaining) < len(remaining)
+    np.testing.assert_array_equal(found.stamp_s, every.stamp_s[remaining])  # type: ignore[union-attr]
 
 
-def test_a_replay_begins_with_the_correlations_of_what_was_before():
-    """It stood for six seconds and rose: tilt and bias of the accelerometer are known together."""
+def test_stretch_start_correlation_is_from_earlier_flight():
+    """Six seconds at rest and the climb correlate tilt and accelerometer bias."""
     (stretch,) = model().inputs.stretches
     assert stretch.history is not None
     assert stretch.history.time_s[-1] == pytest.approx(stretch.time_s[0], abs=1e-6)
     assert stretch.history.time_s[0] < 1.0
     of_tilt = stretch.correlation[:2, 12:15] @ stretch.rotation[0].T
-    # θ x f = Rb, with f = -g: north by the tilt to the east, east by that to the north
+    # θ × f = Rb with f = -g: the north bias couples with the east tilt, and vice versa
     np.testing.assert_allclose(of_tilt[:, :2], [[0.0, 0.98], [-0.98, 0.0]], atol=0.02)
 
 
-# ---------------------------------------------------------------- flights of PX4's EKF2
+# ------------------------------------------------------------------ flights of PX4's EKF2
 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.16.1_gps_stock_flow", "main202603_gps_outage_flow"])
-def test_flights_with_flow_are_replayed(name, shared_logs, model_of):
+def test_model_real_flow_flights_agree_with_log(name, shared_logs, model_of):
     found = model_of(shared_logs / "gps" / f"{name}.ulg")
     agreement = found.agreement
     assert agreement.good
@@ -227,15 +230,15 @@ def test_flights_with_flow_are_replayed(name, shared_logs, model_of):
         assert back_s == pytest.approx(72.6, abs=1.0)
     else:
         assert agreement.carried_difference_m is None
-        said = " ".join(
+        notes = " ".join(
             what_if(found, [{}], without=dict.fromkeys(("gnss_pos", "gnss_vel"), 60.0)).notes
         )  # type: ignore[union-attr]
-        assert "Without gnss_pos from 60 s on" in said
-        assert "gives its position up" not in said
+        assert "Without gnss_pos from 60 s on" in notes
+        assert "EKF2_NOAID_TOUT" not in notes
 
 
 @pytest.mark.reallogs
-def test_what_flow_carried_too_far_off_is_left_out(shared_logs, monkeypatch):
+def test_model_flow_beyond_limit_splits_stretch(shared_logs, monkeypatch):
     monkeypatch.setattr("px4fuse.ekf2.replay.MAX_CARRIED_OFF_M", 0.3)
     found = opened(read_log(shared_logs / "gps" / "main202603_gps_outage_flow.ulg"))
     assert set(found.agreement.doubtful) == {"optical_flow"}
@@ -246,8 +249,8 @@ def test_what_flow_carried_too_far_off_is_left_out(shared_logs, monkeypatch):
 
 
 @pytest.mark.reallogs
-def test_a_flight_that_crashes_is_followed_up_to_its_tumble(shared_logs):
-    """Vertical velocity was reset at 47 s, and much of the IMU clipped at 26 and at 46 s."""
+def test_model_crash_flight_is_replayed_until_tumble(shared_logs):
+    """Vertical velocity was reset at 47 s; the IMU clipped strongly at 26 and 46 s."""
     found = opened(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
     ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.stretches]
     assert np.array(ends) == pytest.approx(np.array([(6.7, 24.7), (30.7, 44.2), (49.7, 67.2)]),

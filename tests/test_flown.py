@@ -1,4 +1,4 @@
-"""Flights with known faults, each analysed once, and all that must be said of them."""
+"""Flights with known faults: expected findings, remedies and steps from KF to EKF2."""
 
 import json
 from typing import Any, NamedTuple
@@ -22,12 +22,12 @@ def about(value: float, rel: float = 0.1) -> Any:
 
 
 class Flown(NamedTuple):
-    """Findings with severity, evidence and words of a remedy; words of why EKF2 differs.
+    """Expected findings (id, severity, evidence, text of the remedy) and texts of the steps.
 
-    ``offset_s`` is what must be added to the stamps; None where no clock is asked about.
+    ``offset_s`` is the expected time offset; None: not checked.
     """
 
-    findings: tuple[tuple[str, str | None, dict[str, Any], str], ...] = ()
+    findings: tuple[tuple[str, str | None, dict[str, Any], tuple[str, ...]], ...] = ()
     first: tuple[str, ...] = ()
     elsewhere: tuple[str, ...] = ()
     offset_s: float | None = None
@@ -37,36 +37,34 @@ FLIGHTS = {
     "v1.16.1_aisle_overconfident": Flown(
         (("ekf2_variance_understated", "error",
           {"nis_mean": about(22.0, 0.2), "sigma_z_asked_m": about(0.10, 0.2)},
-          "Set EKF2_EVP_NOISE to 0.098 m: rejected 53% → 0%, mean NIS 22 → 1.0, position error "
-          "0.31 → 0.11 m (replayed)"),),
-        ("is the gate", "54.9% of the samples", "samples in a row and coasted"),
+          ("EKF2_EVP_NOISE to 0.098 m", "22 → 1.0", "0.31 → 0.11 m")),),
+        ("gate", "54.9"),
     ),
-    # outliers are of the gate; it did not fuse for 15 s
+    # outliers are rejected by the gate; EKF2 did not fuse for 15 s
     "v1.16.1_aisle_nlos": Flown(
-        (("source_gap", "warning", {"longest_s": about(8.0, 0.04)}, ""),
-         ("kf_variance_understated", None, {}, "Remove the outliers"),
-         ("ekf2_variance_understated", None, {}, "Remove the outliers")),
-        elsewhere=("the gate, missed samples, resets", "EKF2 is closer to the truth",
-                   "up to 4.0 m apart (at 64 s)"),
+        (("source_gap", "warning", {"longest_s": about(8.0, 0.04)}, ()),
+         ("kf_variance_understated", None, {}, ("outliers",)),
+         ("ekf2_variance_understated", None, {}, ("outliers",))),
+        elsewhere=("gate, missed samples and resets", "4.0 m", "64 s"),
     ),
     "v1.16.1_aisle_clock_late": Flown(
-        (("ekf2_ev_delay_wrong", None, {}, "position error 0.34 → 0.11 m"),
-         ("source_clock_offset", None, {}, "For EKF2 set EKF2_EV_DELAY to 264 ms")),
+        (("ekf2_ev_delay_wrong", None, {}, ("0.34 → 0.11 m",)),
+         ("source_clock_offset", None, {}, ("EKF2_EV_DELAY to 264 ms",))),
         offset_s=-0.25,
     ),
     "v1.13.3_aisle_evdelay175": Flown(
-        (("ekf2_ev_delay_wrong", None, {}, "position error 0.15 → 0.10 m"),),
-        ("is the stamps and delay", "175 ms older than its stamp (EKF2_EV_DELAY), ours 0 ms"),
-        ("mostly through the stamps and delay",), 0.0,
+        (("ekf2_ev_delay_wrong", None, {}, ("0.15 → 0.10 m",)),),
+        ("timestamps and delay", "175 ms", "EKF2_EV_DELAY"),
+        ("timestamps and delay",), 0.0,
     ),
     "v1.16.1_aisle_hwlog": Flown(
-        (("source_not_logged", "warning", {}, "SDLOG_PROFILE to 129"),
-         ("source_decimated", "warning", {"logger_limit_hz": 2.0}, "")),
+        (("source_not_logged", "warning", {}, ("SDLOG_PROFILE to 129",)),
+         ("source_decimated", "warning", {"logger_limit_hz": 2.0}, ())),
         offset_s=0.0,
     ),
     "v1.16.1_aisle_2hz_stock": Flown(
         (("ekf2_not_fusing", "error",
-          {"fusing_share": 0.0, "source_interval_s": about(0.5, 0.05)}, "10 Hz"),),
+          {"fusing_share": 0.0, "source_interval_s": about(0.5, 0.05)}, ("10 Hz",)),),
     ),
     "v1.14.4_aisle_nominal": Flown(),
     "v1.16.1_aisle_nominal": Flown(),
@@ -74,24 +72,29 @@ FLIGHTS = {
 
 
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_what_is_said_of_a_flight_with_a_known_fault(shared_logs, name):
+def test_findings_known_fault_has_id_numbers_and_remedy(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
     analysis, flown = explain(compare(read_log(log))), FLIGHTS[name]
     found = find(analysis)
     for wanted, severity, evidence, remedy in flown.findings:
-        (first, *_) = [one for one in found if one.id == wanted and remedy in one.remedy]
+        (first, *_) = [
+            item
+            for item in found
+            if item.id == wanted and all(text in item.remedy for text in remedy)
+        ]
         assert severity in (None, first.severity)
         assert {key: first.evidence[key] for key in evidence} == evidence
     if name.endswith("nominal"):
-        assert {one.severity for one in found} <= {"info"}
+        assert {item.severity for item in found} <= {"info"}
     if flown.first or flown.elsewhere or name.endswith("clock_late"):
         why = analysis.why["aisle"]
         assert all(words in why.sentences[0] for words in flown.first)
         assert all(words in " ".join(why.sentences) for words in flown.elsewhere)
         assert why.position_left_share < 0.03
-    if name.endswith("clock_late"):  # on a late clock no delay is blamed
+    # with late timestamps the delay parameter is not the largest step
+    if name.endswith("clock_late"):
         by_name = {step.name: step for step in why.steps}
-        stamps = by_name["stamps and delay"].position_mean_square_m2
+        stamps = by_name["timestamps and delay"].position_mean_square_m2
         assert abs(stamps) < 0.05 * why.position_mean_square_m2
         assert by_name["measurement noise"].position_moved_m < 1e-6
     if flown.offset_s is not None:
@@ -105,24 +108,24 @@ def test_what_is_said_of_a_flight_with_a_known_fault(shared_logs, name):
     if name.endswith("evdelay175"):
         assert not low <= -0.175 <= high
         advice = clock_advice(analysis, clock)["PX4"]
-        assert "EKF2_EV_DELAY is 175 ms" in advice
-        assert "set it, or correct the sender's clock" in advice
+        assert "EKF2_EV_DELAY" in advice
+        assert "175 ms" in advice
     if name.endswith("nlos"):
         noise = analysis.tuning["horizontal"]
         assert noise.sigma_z.value == about(0.10)
         assert noise.sigma_z.low <= 0.10 <= noise.sigma_z.high
         made = json.loads(log.with_suffix(".json").read_text(encoding="utf-8"))
         wrong = [each for each in made["uwb"] if each.get("outlier") and not each.get("dropped")]
-        # from the first data
+        # times from the first data
         boot_s = analysis.flight.log.boot_time_s
         time = np.array([each["t_px4_us"] for each in wrong]) * 1e-6 - boot_s
         segment = analysis.segment
-        truly = time[(time > segment.start_s) & (time < segment.end_s)]
-        right = np.abs(noise.outlier_time_s[:, None] - truly).min(axis=1) < 0.02
-        assert right.sum() > 0.9 * max(len(right), len(truly)) > 13
+        expected_s = time[(time > segment.start_s) & (time < segment.end_s)]
+        right = np.abs(noise.outlier_time_s[:, None] - expected_s).min(axis=1) < 0.02
+        assert right.sum() > 0.9 * max(len(right), len(expected_s)) > 13
 
 
-# How many times EKF2 overstates its horizontal innovation variance in real motion-capture flights
+# Factor between reported and actual horizontal innovation variance in real motion-capture flights
 OVERSTATED = {
     "vladimireganov_ROS_PX4_MOCAP_log_3_2022-6-9-13-01-36": 92.0,
     "vladimireganov_ROS_PX4_MOCAP_min_snap_01": 22.0,
@@ -132,10 +135,8 @@ OVERSTATED = {
 
 
 @pytest.mark.parametrize(("name", "factor"), OVERSTATED.items())
-def test_motion_capture_flights_overstate_the_variance_and_nobody_is_blamed(
-    shared_logs, name, factor
-):
-    """Sent with an orientation, as odometry is; all noises are the programs' own."""
+def test_findings_motion_capture_flights_are_underconfident(shared_logs, name, factor):
+    """Sent with an orientation, as odometry is; all noises are defaults."""
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     whole = compare(flight, start_s=0.0, end_s=flight.log.duration_s)
     assert whole.horizontal["ekf2"].sigma_factor == pytest.approx(factor**0.5, rel=0.05)

@@ -1,4 +1,4 @@
-"""Height in the model of EKF2 on GNSS: closed forms, simulated pairs, and flights of PX4's EKF2."""
+"""Height fusion in the EKF2 model on GNSS: closed forms, simulated pairs, flights of PX4's EKF2."""
 
 import json
 from functools import cache
@@ -46,17 +46,17 @@ def climbing(heights: HeightSamples, count: int = 400, up_m_s2: float = 0.0) -> 
 
 def sampled(
     steps: list[int], down_m: list[float], *, fused: tuple[str, ...] = BOTH,
-    reference: str = "gnss_hgt", dead_m: float = 0.0, weight: float = 1.0,
+    reference: str = "gnss_hgt", dead_zone_m: float = 0.0, weight: float = 1.0,
 ) -> HeightSamples:  # fmt: skip
     step = np.array(steps)
     return HeightSamples(
         fused, reference, (0.0, 1.0), step, STEP_S * step, np.array(down_m),
-        np.full(len(step), dead_m), weight,
+        np.full(len(step), dead_zone_m), weight,
     )  # fmt: skip
 
 
 def of_baro(steps: list[int], down_m: list[float], **more: float) -> HeightSamples:
-    """Of the barometer alone."""
+    """Return samples of a flight with the barometer only."""
     return sampled(steps, down_m, fused=("baro_hgt",), reference="baro_hgt", **more)
 
 
@@ -66,12 +66,14 @@ def fusing(
     (samples,) = barometer_samples(stretch, [end])
     there, time_s = np.zeros((len(end), 1), bool), stretch.time_s[end][:, None]
     on = {"baro_hgt": np.ones_like(there), "gnss_hgt": time_s < reference_until}
-    knob = {"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])}
-    return HeightFilter(stretch, samples[..., None], time_s, there, on, knob, np.array([gated]))
+    parameters = {"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])}
+    return HeightFilter(
+        stretch, samples[..., None], time_s, there, on, parameters, np.array([gated])
+    )
 
 
 def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFilter, pd.DataFrame]:
-    """A state that nobody moves, and what the barometer told it at each of its samples."""
+    """Return the filter of a state at rest, and the update of each barometer sample."""
     end = np.unique(of.step)
     heights = fusing(climbing(of, count), end, **how)
     for e in range(len(end)):
@@ -79,10 +81,11 @@ def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFil
     return heights, heights.updates("baro_hgt", 0, end * STEP_S)
 
 
-def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> None:
-    """Of a barometer 1.7 m too high (down 1.7 less) over a height that is known exactly.
+def test_height_bias_matches_scalar_kalman_filter() -> None:
+    """The barometer reads 1.7 m too high (down 1.7 m less); the height is known exactly.
 
-    Steady: p = (q + √(q² + 4 q R)) / 2 before a sample, with q = 0.13² T (bias_estimator.cpp).
+    Steady state: p = (q + √(q² + 4 q R)) / 2 before a sample, with q = 0.13² T
+    (bias_estimator.cpp).
     """
     steps = list(range(10, 4000, 10))
     heights, found = standing(sampled(steps, [-1.7] * len(steps)), 4000)
@@ -91,7 +94,7 @@ def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> Non
     assert heights.bias.variance_m2[0] == pytest.approx(p * R / (p + R), rel=1e-6)
     assert found["innovation_variance_down_m2"].iloc[-1] == pytest.approx(p + R, rel=1e-6)
     assert heights.bias.value_m[0] == pytest.approx(1.7, abs=1e-6)
-    # and on the way there as its recursion has it
+    # transient as in the scalar recursion
     bias, variance, innovations = 0.0, 1.0, []
     for _ in steps:
         variance = min(variance + q, R)
@@ -102,7 +105,7 @@ def test_the_bias_is_the_scalar_kalman_filters_with_its_steady_variance() -> Non
     np.testing.assert_allclose(found["innovation_down_m"], innovations, atol=1e-9)
 
 
-def test_without_its_reference_the_bias_of_the_other_stays() -> None:
+def test_height_bias_without_reference_is_constant() -> None:
     steps = list(range(10, 400, 10))
     _, found = standing(sampled(steps, [-1.0] * len(steps)), reference_until=1.005)
     after = found["innovation_down_m"].loc[1.15:]
@@ -111,21 +114,21 @@ def test_without_its_reference_the_bias_of_the_other_stays() -> None:
 
 
 @pytest.mark.parametrize(("down_m", "learned"), [(-2.0, True), (-2.3, False)])
-def test_beyond_three_standard_deviations_nothing_is_learned_of_a_bias(down_m, learned) -> None:
-    """Of √(0.25 + 0.25) m here."""
+def test_height_bias_outside_gate_is_not_updated(down_m, learned) -> None:
+    """The gate is 3 √(0.25 + 0.25) m."""
     heights, _ = standing(sampled([10], [down_m]))
     assert (heights.bias.value_m[0] > 0.0) == learned
 
 
 @pytest.mark.parametrize("reference", BOTH)
-def test_the_reference_has_no_bias(reference: str) -> None:
+def test_height_bias_of_reference_is_zero(reference: str) -> None:
     steps = list(range(10, 400, 10))
     heights, _ = standing(sampled(steps, [-1.0] * len(steps), reference=reference))
     assert (heights.bias.value_m[0] == 0.0) == (reference == "baro_hgt")
 
 
-def test_a_sample_is_judged_by_where_the_vehicle_was_then() -> None:
-    """Climbing at 2 m/s and 3 m/s², two samples before each event, and one at it."""
+def test_height_innovation_refers_to_sample_time() -> None:
+    """Climb at 2 m/s and 3 m/s², with two samples before an event, and one at it."""
     time = STEP_S * np.arange(401)
     down = -2.0 * time - 1.5 * time**2
     steps = [13, 17, 30, 45]
@@ -142,8 +145,8 @@ def test_a_sample_is_judged_by_where_the_vehicle_was_then() -> None:
     np.testing.assert_allclose(found["fused_at_s"], [0.2, 0.2, 0.3, 0.5])
 
 
-def test_one_sample_in_the_log_weighs_as_those_that_ekf2_had() -> None:
-    """Of R = 0.25 m² with weight 2 as two of them; S is of one."""
+def test_height_sample_weight_equals_repeated_samples() -> None:
+    """R = 0.25 m² with weight 2 acts as two samples; S is that of one."""
     P = np.zeros((1, 9, 9))
     P[0, 8, 8] = 0.5
     variances = []
@@ -159,24 +162,24 @@ def test_one_sample_in_the_log_weighs_as_those_that_ekf2_had() -> None:
 @pytest.mark.parametrize(
     ("innovation", "expected"), [(-0.5, -0.5), (0.5, 0.0), (3.9, 0.0), (4.5, 0.5)]
 )
-def test_in_ground_effect_too_low_a_barometer_is_unheeded(innovation, expected) -> None:
-    """baro_height_control.cpp: a dead zone of EKF2_GND_EFF_DZ."""
-    _, found = standing(of_baro([10], [innovation], dead_m=4.0))
+def test_heights_ground_effect_ignores_low_barometer(innovation, expected) -> None:
+    """Dead zone EKF2_GND_EFF_DZ of baro_height_control.cpp."""
+    _, found = standing(of_baro([10], [innovation], dead_zone_m=4.0))
     assert found["innovation_down_m"].item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("gated", "fused"), [(True, 0.0), (False, 1.0)])
-def test_beyond_its_gate_a_height_is_rejected(gated: bool, fused: float) -> None:
+def test_height_outside_gate_is_rejected(gated: bool, fused: float) -> None:
     _, found = standing(of_baro([10], [2.6]), gated=gated)
     assert (found["fused"].item(), found["rejected"].item()) == (fused, 1.0 - fused)
 
 
-# ---------------------------------------------------------------- simulated flights
+# -------------------------------------------------------------------- simulated flights
 
 
 @cache
 def outdoors(baro_noise_m: float = 0.4) -> Flight:
-    """A flight whose EKF2 takes its barometer to be so exact."""
+    """Simulate a flight with this EKF2_BARO_NOISE."""
     usual = simulated.parameters
     noise = {"EKF2_BARO_NOISE": baro_noise_m}
     with pytest.MonkeyPatch.context() as patch:
@@ -189,7 +192,7 @@ def opened_once() -> Model:
     return opened(outdoors())
 
 
-def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> None:
+def test_what_if_barometer_noise_matches_real_run() -> None:
     model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
@@ -203,21 +206,23 @@ def test_what_if_predicts_the_height_of_the_flight_with_the_other_noise() -> Non
         error_m = logged.height_rmse_to_truth_m
         assert predicted.height_rmse_to_truth_m == pytest.approx(error_m, rel=0.1)
         assert HEIGHT_FOLLOWS in found.notes
-    # with 25 times the variance, the barometer holds the height more loosely
-    tight, loose = (one.heights["baro_hgt"].nis_mean for one in (found.whatif[0], found.logged))
+    # with 25 times the variance the barometer corrects the height less
+    tight, loose = (
+        column.heights["baro_hgt"].nis_mean for column in (found.whatif[0], found.logged)
+    )
     assert tight > 5.0 * loose
 
 
-def test_without_its_only_sensor_the_height_drifts_and_that_is_told() -> None:
+def test_what_if_without_height_sensor_reports_drift() -> None:
     found = what_if(opened_once(), [{}], {"baro_hgt": 40.0})
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
-    assert "; its height is " in found.notes[-1]
+    assert "; the height by at most " in found.notes[-1]
 
 
-def test_a_height_that_would_be_rejected_for_long_is_not_predicted() -> None:
-    """EKF2 resets it after five seconds, which the model does not."""
+def test_what_if_long_height_rejection_is_unpredictable() -> None:
+    """EKF2 resets the height after 5 s, which the model does not contain."""
     flight = outdoors()
     jump = flight.barometer.copy()
     jump.loc[40.0:50.0, "down_m"] += 3.0
@@ -230,35 +235,35 @@ def test_a_height_that_would_be_rejected_for_long_is_not_predicted() -> None:
     assert found.whatif[0].heights["baro_hgt"].longest_without_fusion_s > 5.0
 
 
-def test_a_height_that_does_not_agree_is_named_and_the_rest_stands() -> None:
+def test_model_disagreeing_height_is_excluded() -> None:
     flight = outdoors()
     noise = np.random.default_rng(1).normal(0.0, 1.0, (len(flight.barometer), 1))
     model = opened(replace(flight, barometer=flight.barometer + noise))
     agreement = model.agreement
     assert agreement.good
     assert set(agreement.doubtful) == {"baro_hgt"}
-    assert "correlate by" in agreement.doubtful["baro_hgt"]
+    assert "correlation of" in agreement.doubtful["baro_hgt"]
     assert agreement.baro_hgt["down"].innovation_correlation < 0.95
-    assert ". Not so the barometer, of which nothing is concluded: " in format_agreement(agreement)
+    assert "barometer" in format_agreement(agreement)
     assert model.flown.other_aid_updates == {}
     own = np.interp(model.flown.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"])
     assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
     found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
     assert HEIGHT_STAYS in found.notes
-    with pytest.raises(SettingsError, match=r"EKF2_BARO_NOISE changes nothing here: .*barometer: "):
+    with pytest.raises(SettingsError, match=r"EKF2_BARO_NOISE has no effect .*barometer: "):
         what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
-    with pytest.raises(SettingsError, match=r"baro_hgt: of this log .*barometer: "):
+    with pytest.raises(SettingsError, match=r"baro_hgt: in this log .*barometer: "):
         what_if(model, [{}], {"baro_hgt": 40.0})
 
 
-def test_what_the_log_lacks_of_the_heights_is_said() -> None:
+def test_add_heights_insufficient_log_returns_reason() -> None:
     flight = outdoors()
     model = opened_once()
     ekf2, stretches = model.flight.ekf2, model.inputs.stretches
     record = ekf2.record
 
     def why(enabled: dict[str, float], rows: int = 1, **parameters: float) -> str:
-        """With aids meant to be fused for so much of the flight; 0 is GNSS from 60 s on."""
+        """Return the reason for aids enabled from the start (1) or from 60 s on (0)."""
         found = {
             name: made(AidLog, enabled=pd.Series([share, 1.0], index=[0.0, 60.0]))
             for name, share in enabled.items()
@@ -269,49 +274,49 @@ def test_what_the_log_lacks_of_the_heights_is_said() -> None:
         return update_log if isinstance(update_log, str) else ""
 
     assert why({"baro_hgt": 1.0}) == ""
-    assert "range to the ground in a part" in why({"baro_hgt": 1.0, "rng_hgt": 0.0})
-    assert "GNSS height in a part" in why({"baro_hgt": 1.0, "gnss_hgt": 0.0})
+    assert "range to the ground in part" in why({"baro_hgt": 1.0, "rng_hgt": 0.0})
+    assert "GNSS height in part" in why({"baro_hgt": 1.0, "gnss_hgt": 0.0})
     assert "bias of the barometer" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=1.0)
     assert "bias of the GNSS height" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=0.0)
-    assert "reference is neither" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=2.0)
-    assert "reference is neither" in why({})
-    assert "3.3 samples of the barometer" in why({"baro_hgt": 1.0}, rows=3)
+    assert "height reference is neither" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=2.0)
+    assert "height reference is neither" in why({})
+    assert "barometer is logged at 3.3 Hz" in why({"baro_hgt": 1.0}, rows=3)
     old = {"EKF2_AID_MASK": 1.0}
     log = replace(record, parameters=old)
     assert "before PX4 v1.14" in add_heights(flight, ekf2, log, stretches)
 
 
-def test_an_acceleration_that_ekf2_took_to_be_wrong_is_noise_of_4_9() -> None:
-    """covariance.cpp, BADACC_BIAS_PNOISE."""
+def test_recursion_bad_acceleration_noise_is_4_9() -> None:
+    """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
     inputs = opened_once().inputs
     (stretch,) = inputs.stretches
-    spoilt = replace(stretch, distrusted_share=np.ones(len(stretch.time_s), bool))
+    spoilt = replace(stretch, bad_acceleration_share=np.ones(len(stretch.time_s), bool))
 
     def ran(one: Stretch, **changed: float) -> StretchRun:
         settings = inputs.settings | changed
         return run_variants(replace(inputs, stretches=(one,)), [Variant(settings)], {})[0]
 
     np.testing.assert_array_equal(ran(spoilt).state, ran(stretch, EKF2_ACC_NOISE=4.9).state)
-    # one axis of three throughout is as a third of the steps
+    # one clipped axis of three equals a third of the steps
     third = np.sqrt((2.0 * inputs.settings["EKF2_ACC_NOISE"] ** 2 + 4.9**2) / 3.0)
-    clipped = replace(stretch, distrusted_share=np.full(len(stretch.time_s), 1.0 / 3.0))
+    clipped = replace(stretch, bad_acceleration_share=np.full(len(stretch.time_s), 1.0 / 3.0))
     expected = ran(stretch, EKF2_ACC_NOISE=float(third)).variance
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
-def test_axes_at_the_end_of_their_range_are_relied_on_less_in_their_step() -> None:
+def test_stretch_clipped_axes_increase_noise_share() -> None:
     flight = outdoors()
     (plain,) = opened_once().inputs.stretches
     clipped = pd.Series(0, flight.imu.index)
     at = plain.time_s[[100, 200]] - 1e-4
     clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
     (update_log,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.stretches
-    assert not plain.distrusted_share.any()
-    assert update_log.distrusted_share[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
-    assert np.flatnonzero(update_log.distrusted_share).tolist() == [100, 200]
+    assert not plain.bad_acceleration_share.any()
+    assert update_log.bad_acceleration_share[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
+    assert np.flatnonzero(update_log.bad_acceleration_share).tolist() == [100, 200]
 
 
-# ---------------------------------------------------------------- flights of PX4's EKF2
+# ------------------------------------------------------------------ flights of PX4's EKF2
 
 FLOWN = {
     "delay0": (0.998, 0.96, 0.05), "fullrate": (0.998, 0.96, 0.05), "nominal": (0.998, 0.96, 0.05),
@@ -326,8 +331,8 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLOWN)
-def test_heights_are_replayed(models: dict[str, Model], name: str) -> None:
-    """Half of the barometer's samples are not in the log, but for the last flight."""
+def test_model_real_heights_agree_with_log(models: dict[str, Model], name: str) -> None:
+    """Half of the barometer samples are not logged, except in the last flight."""
     gnss, barometer, published_m = FLOWN[name]
     agreement = models[name].agreement
     assert agreement.doubtful == {}
@@ -345,29 +350,29 @@ def test_heights_are_replayed(models: dict[str, Model], name: str) -> None:
 
 
 @pytest.mark.reallogs
-def test_what_other_settings_of_heights_would_have_done(models: dict[str, Model]) -> None:
-    """The barometer's noise of 0.5 m makes its NIS; the gate rejects what lies beyond."""
+def test_what_if_height_settings_change_statistics(models: dict[str, Model]) -> None:
+    """EKF2_BARO_NOISE scales NIS; the gate rejects innovations outside it."""
 
     def heights(without: dict[str, float] | None = None, **settings: float) -> Any:
         found = what_if(models["nominal"], [settings], without)
         return found.whatif[0], found.replayed
 
     loose, flown = heights(EKF2_BARO_NOISE=3.5)
-    # R is 49 times as large, and the bias takes up what is slow
+    # R is 49 times larger; the bias takes up the slow part
     ratio = loose.heights["baro_hgt"].nis_mean / flown.heights["baro_hgt"].nis_mean
     assert 1.0 / 49.0 < ratio < 1.0 / 25.0
-    # R of 1.5 times EKF2_GPS_P_NOISE, in place of the 0.6 m that the receiver states
+    # R is 1.5 times EKF2_GPS_P_NOISE instead of the reported 0.6 m
     wide = heights(EKF2_GPS_P_NOISE=2.0)[0].heights["gnss_hgt"]
-    assert 8.0 < wide.innovation_std_m**2 / wide.nis_mean < 9.6  # and a mean besides
+    assert 8.0 < wide.innovation_std_m**2 / wide.nis_mean < 9.6  # plus the square of the mean
     narrow, _ = heights(EKF2_BARO_GATE=1.0)
-    # of a normal distribution with the variance that its NIS tells, beyond 1 √S
+    # share outside 1 √S of a normal distribution with this NIS
     assert narrow.heights["baro_hgt"].rejected_share == pytest.approx(0.17, abs=0.03)
     assert narrow.heights["gnss_hgt"].rejected_share == 0.0
-    # GNSS alone has the height: 0.6 m of noise ten times a second, held by its own velocity
+    # GNSS only: 0.6 m noise at 10 Hz, stabilised by its velocity
     alone, flown = heights({"baro_hgt": 60.0})
     assert alone.heights.keys() == {"gnss_hgt"}
     assert alone.height_rmse_to_truth_m == pytest.approx(flown.height_rmse_to_truth_m, abs=0.05)
-    # and what the barometer's bias was is then wrong for good
+    # the barometer bias is then no longer estimated
     drifting, flown = heights({"gnss_hgt": 60.0})
     assert drifting.height_rmse_to_truth_m > 1.5 * flown.height_rmse_to_truth_m
     error_m = flown.north.position_rmse_to_truth_m
@@ -375,25 +380,27 @@ def test_what_other_settings_of_heights_would_have_done(models: dict[str, Model]
 
 
 @pytest.mark.reallogs
-def test_a_flight_whose_height_was_also_of_a_range_finder_says_so(shared_logs: Path) -> None:
+def test_what_if_range_finder_height_raises_error(shared_logs: Path) -> None:
     model = opened(read_log(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg"))
     assert model.agreement.good
-    with pytest.raises(SettingsError, match="EKF2 fused range to the ground in a part"):
+    with pytest.raises(SettingsError, match="EKF2 also fused range to the ground"):
         what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
 
 
 @pytest.mark.reallogs
-def test_table_and_results_have_each_sensor_of_height(models: dict[str, Model]) -> None:
+def test_what_if_results_contain_each_height_sensor(models: dict[str, Model]) -> None:
     model, changes, without = models["nominal"], {"EKF2_BARO_GATE": 1.5}, {"gnss_hgt": 100.0}
     request = WhatIfRequest(log=model.flight.log.name, changes=changes, without=without)
     asked = what_if(model, [changes], without)
     found = WhatIfAnalysis(model.flight, asked, changes, asked=False, why={}, without=without)
-    said = json.loads(to_json(whatif_results(request, found)))
-    jsonschema.validate(said, schema())
-    assert said["whatif"]["heights"].keys() == {"baro_hgt"}
-    assert said["replayed"]["heights"].keys() == {"baro_hgt", "gnss_hgt"}
+    results = json.loads(to_json(whatif_results(request, found)))
+    jsonschema.validate(results, schema())
+    assert results["whatif"]["heights"].keys() == {"baro_hgt"}
+    assert results["replayed"]["heights"].keys() == {"baro_hgt", "gnss_hgt"}
     shown = {row[0]: row[1:] for row in rows(found)}
     assert shown["GNSS height: mean NIS"][-1] == "n/a"
-    assert shown["height: RMSE to truth (m)"] == [
-        f"{said[which]['height_rmse_to_truth_m']:.3f}" for which in ("logged", "replayed", "whatif")
+    row = next(row for label, row in shown.items() if label.startswith("height: "))
+    assert row == [
+        f"{results[which]['height_rmse_to_truth_m']:.3f}"
+        for which in ("logged", "replayed", "whatif")
     ]

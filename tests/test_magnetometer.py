@@ -1,4 +1,4 @@
-"""The magnetometer in the model of EKF2: against the field that was made, and in what is read."""
+"""Magnetometer in the EKF2 model: fusion against simulated fields, and reading from logs."""
 
 from pathlib import Path
 
@@ -17,15 +17,15 @@ from px4fuse.readers import read_log
 EARTH = np.array([0.21, 0.015, 0.43])
 
 
-def told(rotation: Rotation, body: np.ndarray, size: int = 1) -> EventSamples:
-    """What the magnetometer of a body that stands so measures."""
+def field_samples(rotation: Rotation, body: np.ndarray, size: int = 1) -> EventSamples:
+    """Return the measurement of a magnetometer with this attitude."""
     turn = rotation.inv().as_matrix()
     value = np.tile(turn @ EARTH + body, (size, 1))
     return EventSamples(value, np.tile(turn, (size, 1, 1)), np.ones(size), np.zeros(size))
 
 
-def knowing(size: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """State and covariance of filters that know the earth's field and the tilt."""
+def known_field_state(size: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return state and covariance of filters with a known earth field and tilt."""
     x = np.zeros((size, 21))
     x[:, 15:18] = EARTH
     deviation = np.full(21, 1e-6)
@@ -33,19 +33,19 @@ def knowing(size: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return x, np.tile(np.diag(deviation**2), (size, 1, 1))
 
 
-def test_a_heading_error_is_put_right_and_its_variance_is_the_kalman_filters() -> None:
-    """The body is turned by 0.05 rad about the vertical beyond what the filter takes it to be."""
+def test_fuse_field_corrects_heading_error() -> None:
+    """The true heading is 0.05 rad larger than the filter's."""
     body = np.zeros(3)
     nominal = Rotation.from_euler("ZYX", [0.7, 0.1, -0.05])
     true = Rotation.from_rotvec([0.0, 0.0, 0.05]) * nominal
-    seen = told(nominal, body)._replace(value=told(true, body).value)
-    x, P = knowing()
+    seen = field_samples(nominal, body)._replace(value=field_samples(true, body).value)
+    x, P = known_field_state()
     for _ in range(400):
-        x, P, told_of = fuse_field(x, P, seen, np.array([0.02]), np.array([3.0]))
-    # what is left between measured and expected, and its variance: HPH' + R
-    np.testing.assert_allclose(told_of[0, 0], 0.0, atol=5e-4)
-    np.testing.assert_allclose(told_of[1, 0], 0.02**2, rtol=0.01)
-    assert told_of[2].all()
+        x, P, innovation = fuse_field(x, P, seen, np.array([0.02]), np.array([3.0]))
+    # remaining innovation, and its variance HPH' + R
+    np.testing.assert_allclose(innovation[0, 0], 0.0, atol=5e-4)
+    np.testing.assert_allclose(innovation[1, 0], 0.02**2, rtol=0.01)
+    assert innovation[2].all()
     assert x[0, 2] == pytest.approx(0.05, abs=0.002)
     # 1/P = 1/P₀ + n·|horizontal field|²/R
     information = 0.1**-2 + 400 * np.hypot(*EARTH[:2]) ** 2 / 0.02**2
@@ -53,24 +53,26 @@ def test_a_heading_error_is_put_right_and_its_variance_is_the_kalman_filters() -
     assert np.linalg.eigvalsh(P[0]).min() > -1e-15
 
 
-def test_the_fields_of_earth_and_body_are_told_apart_where_the_vehicle_turns() -> None:
+def test_fuse_field_rotation_separates_body_field() -> None:
     body = np.array([0.05, -0.03, 0.02])
-    x, P = knowing()
+    x, P = known_field_state()
     deviation = np.full(21, 1e-6)
     deviation[15:] = 0.1
     P[0] = np.diag(deviation**2)
     x[0, 15:18] += [0.03, -0.02, 0.01]
     for heading in np.linspace(0.0, 6.0, 200):
-        seen = told(Rotation.from_euler("ZYX", [heading, 0.3 * np.sin(heading), 0.0]), body)
+        seen = field_samples(
+            Rotation.from_euler("ZYX", [heading, 0.3 * np.sin(heading), 0.0]), body
+        )
         x, P, _ = fuse_field(x, P, seen, np.array([0.01]), np.array([100.0]))
     np.testing.assert_allclose(x[0, 18:], body, atol=1e-3)
     np.testing.assert_allclose(x[0, 15:18], EARTH, atol=1e-3)
 
 
-def test_one_sample_that_stands_for_several_counts_as_often() -> None:
-    seen = told(Rotation.from_euler("z", 0.4), np.zeros(3))
+def test_fuse_field_weighted_sample_equals_repeats() -> None:
+    seen = field_samples(Rotation.from_euler("z", 0.4), np.zeros(3))
     noise, gate = np.array([0.05]), np.array([3.0])
-    x, P = knowing()
+    x, P = known_field_state()
     once = fuse_field(x, P, seen._replace(number=np.full(1, 5.0)), noise, gate)
     for _ in range(5):
         x, P, _ = fuse_field(x, P, seen, noise, gate)
@@ -78,26 +80,26 @@ def test_one_sample_that_stands_for_several_counts_as_often() -> None:
     np.testing.assert_allclose(once[1], P, atol=1e-9)
 
 
-def test_each_variant_has_its_own_noise_and_gate_and_takes_what_it_was_sent() -> None:
-    x, P = knowing(4)
-    seen = told(Rotation.identity(), np.array([0.3, 0.0, 0.0]), size=4)
+def test_fuse_field_variants_use_separate_noise_and_gate() -> None:
+    x, P = known_field_state(4)
+    seen = field_samples(Rotation.identity(), np.array([0.3, 0.0, 0.0]), size=4)
     seen = seen._replace(number=np.array([1.0, 1.0, 0.0, 1.0]))
     noise, gate = np.array([0.05, 0.2, 0.2, 0.0]), np.array([3.0, 3.0, 3.0, 100.0])
-    after, left, told_of = fuse_field(x, P, seen, noise, gate)
-    # 0.3 gauss off: 6 standard deviations of the first; the third was sent nothing
+    after, left, innovation = fuse_field(x, P, seen, noise, gate)
+    # 0.3 gauss is 6 σ for the first variant; the third has no sample
     moved = np.abs(after - x).max(axis=1) > 0.0
     assert moved.tolist() == [False, True, False, True]
     np.testing.assert_array_equal(left[0], P[0])
-    assert told_of[2, [0, 1, 3], 0].tolist() == [0.0, 1.0, 1.0]
-    np.testing.assert_allclose(told_of[0, [0, 1, 3], 0], 0.3)
-    assert np.isnan(told_of[:, 2]).all()
-    # 0.01 gauss of noise at least, as mag_control.cpp has it
+    assert innovation[2, [0, 1, 3], 0].tolist() == [0.0, 1.0, 1.0]
+    np.testing.assert_allclose(innovation[0, [0, 1, 3], 0], 0.3)
+    assert np.isnan(innovation[:, 2]).all()
+    # the noise is at least 0.01 gauss, as in mag_control.cpp
     least, *_ = fuse_field(x[:1], P[:1], EventSamples(*(each[:1] for each in seen)),
                            np.array([0.01]), np.array([100.0]))  # fmt: skip
     np.testing.assert_allclose(after[3], least[0])
 
 
-def test_samples_are_fused_at_the_first_event_after_them() -> None:
+def test_mean_by_event_assigns_next_event() -> None:
     rotation = Rotation.from_rotvec(0.1 * np.eye(3)[2] * np.arange(10)[:, None]).as_matrix()
     gauss = np.arange(12.0).reshape(4, 3)
     step = np.array([2, 3, 6, 9])
@@ -115,13 +117,13 @@ def test_samples_are_fused_at_the_first_event_after_them() -> None:
 
 
 def magnetic(generation: str = "v1.16", kept_hz: float = 2.0) -> Log:
-    """A log with a magnetometer at 5 Hz, whose samples EKF2 has kept at another rate."""
+    """Return a log with a magnetometer at 5 Hz, and EKF2's copy at another rate."""
     log = gnss_log(generation)
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
-    at, kept = stamps(20.0, 5.0), stamps(20.0, kept_hz)
+    at, remaining = stamps(20.0, 5.0), stamps(20.0, kept_hz)
     log.add(topic("vehicle_magnetometer", at, {"magnetometer_ga": np.tile(EARTH, (len(at), 1))}))
-    own = {"observation": np.tile(2.0 * EARTH, (len(kept), 1))}
-    log.add(topic("estimator_aid_src_mag", kept, own))
+    own = {"observation": np.tile(2.0 * EARTH, (len(remaining), 1))}
+    log.add(topic("estimator_aid_src_mag", remaining, own))
     flags = np.where(at < at[40], 1 << 4, 1 << 5).astype(np.uint64)
     log.drop(*({"estimator_status"} & log.names()))
     log.add(topic("estimator_status", at, {"control_mode_flags": flags}))
@@ -134,14 +136,14 @@ def field_of(log: Log, folder: Path) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("generation", ["v1.14", "v1.16"])
-def test_the_field_is_read_with_when_ekf2_fused_all_of_it(generation: str, tmp_path: Path) -> None:
+def test_read_field_contains_3d_fusion_flag(generation: str, tmp_path: Path) -> None:
     field = field_of(magnetic(generation), tmp_path)
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(EARTH, (len(field), 1)), rtol=1e-6)
     assert field["fused_3d"].tolist() == [0.0] * 40 + [1.0] * (len(field) - 40)
 
 
-def test_what_ekf2_kept_is_taken_where_that_is_more(tmp_path: Path) -> None:
-    """By the time of the sensor, from which EKF2 takes its delay and half a step."""
+def test_read_field_prefers_topic_with_more_samples(tmp_path: Path) -> None:
+    """The measurement time is that of the sensor, minus EKF2's delay and half a step."""
     log = magnetic(kept_hz=20.0)
     field = field_of(log, tmp_path)
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(2.0 * EARTH, (len(field), 1)), rtol=1e-6)
@@ -149,15 +151,19 @@ def test_what_ekf2_kept_is_taken_where_that_is_more(tmp_path: Path) -> None:
     assert field.index[0] - stamped_s == pytest.approx(0.02 + 0.5 * 0.01, abs=1e-6)
 
 
-def test_samples_between_two_rows_are_told_by_the_low_pass_of_innovations(tmp_path: Path) -> None:
-    """Those that EKF2 kept at a low rate are taken all the same, unless the sensor has them all."""
+def test_read_field_filtered_innovations_are_kept(tmp_path: Path) -> None:
+    """EKF2's copy at a low rate is used, except if the sensor topic contains all samples."""
     log = magnetic()
-    kept = log["estimator_aid_src_mag"]
-    kept["innovation_filtered"] = np.linspace(0.0, 0.01, kept["timestamp"].size)[:, None] + EARTH
+    remaining = log["estimator_aid_src_mag"]
+    remaining["innovation_filtered"] = (
+        np.linspace(0.0, 0.01, remaining["timestamp"].size)[:, None] + EARTH
+    )
     field = field_of(log, tmp_path)
-    assert len(field) == kept["timestamp"].size
+    assert len(field) == remaining["timestamp"].size
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(2.0 * EARTH, (len(field), 1)), rtol=1e-6)
-    np.testing.assert_allclose(field[Columns.FIELD_INNOVATION], kept["innovation_filtered"], 1e-6)
+    np.testing.assert_allclose(
+        field[Columns.FIELD_INNOVATION], remaining["innovation_filtered"], 1e-6
+    )
     at = stamps(20.0, 12.0)
     log.drop("vehicle_magnetometer")
     log.add(topic("vehicle_magnetometer", at, {"magnetometer_ga": np.tile(EARTH, (len(at), 1))}))
@@ -166,8 +172,8 @@ def test_samples_between_two_rows_are_told_by_the_low_pass_of_innovations(tmp_pa
     assert list(field) == ["forward_gauss", "right_gauss", "down_gauss", "fused_3d"]
 
 
-def test_a_mean_of_samples_is_what_was_expected_less_the_mean_innovation() -> None:
-    """The vehicle turns, EKF2's attitude is off the published one, and the sensor is noisy."""
+def test_mean_field_recovers_mean_measurement() -> None:
+    """The vehicle rotates, EKF2's attitude differs from the published one, the sensor is noisy."""
     count, every, rows = 12, 7, 30
     interval_s, dt = 0.5 / every, 0.008
     time_s = 100.0 + dt * np.arange(round(rows * 0.5 / dt) + 200)
@@ -185,19 +191,21 @@ def test_a_mean_of_samples_is_what_was_expected_less_the_mean_innovation() -> No
     filtered = innovation.copy()
     for k in range(1, len(taken_s)):
         filtered[k] = filtered[k - 1] + share * (innovation[k] - filtered[k - 1])
-    kept = np.r_[np.arange(every - 1, len(taken_s), every)]
-    kept = np.delete(kept, [count, *range(20, 26)])  # the logger missed one, then three seconds
+    remaining = np.r_[np.arange(every - 1, len(taken_s), every)]
+    remaining = np.delete(
+        remaining, [count, *range(20, 26)]
+    )  # the logger missed one row, then three seconds
     fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
     delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
     matrices = rotation.as_matrix()
     stretch = made(Stretch, time_s=time_s, rotation=matrices, attitude_error_rad=error)
-    found = _mean_field(stretch, delayed, taken_s[kept], filtered[kept])
-    near = np.flatnonzero(np.diff(kept) < 20) + 1
-    assert found.samples.tolist() == np.diff(kept)[near - 1].tolist()
+    found = _mean_field(stretch, delayed, taken_s[remaining], filtered[remaining])
+    near = np.flatnonzero(np.diff(remaining) < 20) + 1
+    assert found.samples.tolist() == np.diff(remaining)[near - 1].tolist()
     assert sorted(set(found.samples)) == [7.0, 14.0]
-    assert found.step.tolist() == step[kept[near]].tolist()
+    assert found.step.tolist() == step[remaining[near]].tolist()
     for row, samples, value, turn in zip(
-        kept[near], found.samples.astype(int), found.value, found.turn, strict=True
+        remaining[near], found.samples.astype(int), found.value, found.turn, strict=True
     ):
         of = row - np.arange(samples)
         weight = (1.0 - share) ** np.arange(samples)
@@ -214,7 +222,7 @@ def settled(frame_hz: float, on: slice, count: int = 60) -> tuple[float, float] 
     return _field_span(made(FusionRecord, field_gauss=frame))
 
 
-def test_the_magnetometer_is_replayed_where_all_of_it_was_fused_without_a_break() -> None:
+def test_field_span_needs_continuous_3d_fusion() -> None:
     assert settled(2.0, slice(20, 50)) == (11.0, 24.5)
     assert settled(1.4, slice(20, 50)) is None
     assert settled(2.0, slice(0, 0)) is None

@@ -1,4 +1,4 @@
-"""Simulated flights against their own truth: motion, sensors, mistakes, ULog and command."""
+"""Simulated flights against their truth: motion, sensors, mistakes, ULog and command."""
 
 import json
 from dataclasses import fields
@@ -32,7 +32,7 @@ AISLE = Scenario(passes=2, seed=4)
 UNFILTERED = replace(AISLE, ekf2=False)
 LOOP = Scenario(kind="loop", passes=1, length_m=8.0, seed=4)
 FOLLOWING = Scenario(passes=2, yaw="follow", seed=4)
-# Errors of the sensors other than white noise switched off
+# no sensor errors except white noise
 IDEAL = {
     "accel_bias_sigma_m_s2": 0.0, "gyro_bias_sigma_rad_s": 0.0, "tilt_error_deg": 0.0,
     "yaw_error_deg": 0.0,
@@ -40,14 +40,14 @@ IDEAL = {
 
 
 @pytest.mark.parametrize("record", [Scenario, Mistakes])
-def test_every_number_has_bounds(record) -> None:
-    numbers = {one.name for one in fields(record) if {"int", "float"} & {*str(one.type).split()}}
-    numbers |= {one.name for one in fields(record) if one.type in (int, float)}
+def test_scenario_and_mistakes_numbers_have_bounds(record) -> None:
+    numbers = {item.name for item in fields(record) if {"int", "float"} & {*str(item.type).split()}}
+    numbers |= {item.name for item in fields(record) if item.type in (int, float)}
     assert set(quantities(record)) == numbers
 
 
 def motion_of(scenario, mistakes=NO_MISTAKES):
-    return plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
+    return plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
 
 
 def stamps_s(simulation):
@@ -60,14 +60,14 @@ def stamps_s(simulation):
 
 @pytest.mark.parametrize("scenario", [AISLE, LOOP, FOLLOWING], ids=["aisle", "loop", "follow"])
 class TestMotion:
-    def test_derivatives_agree(self, scenario):
+    def test_derivatives_integrate_to_values(self, scenario):
         motion = motion_of(scenario)
         time = np.linspace(0.0, motion.duration_s, 40_001)
         state = motion.at(time)
         for value, derivative, tolerance in (
             (state.position_m, state.velocity_m_s, 1e-6),
             (state.velocity_m_s, state.acceleration_m_s2, 1e-6),
-            # the jerk steps where the wander's fade begins and ends
+            # the jerk has steps at the ends of the fade of the slow deviation
             (state.acceleration_m_s2, state.jerk_m_s3, 1e-3),
         ):
             integral = value[0] + cumulative_simpson(derivative, x=time, axis=0, initial=0)
@@ -75,7 +75,7 @@ class TestMotion:
         turned = cumulative_simpson(state.yaw_rate_rad_s, x=time, initial=0)
         assert np.allclose(state.yaw_rad, state.yaw_rad[0] + turned, atol=1e-6)
 
-    def test_stands_on_the_ground_before_and_after(self, scenario):
+    def test_start_and_end_are_at_rest_on_ground(self, scenario):
         motion = motion_of(scenario)
         time = np.array([0.0, motion.take_off_s, motion.touch_down_s + 1e-6, motion.duration_s])
         state = motion.at(time)
@@ -83,9 +83,9 @@ class TestMotion:
         assert np.allclose(state.acceleration_m_s2, 0.0, atol=1e-9)
         assert np.allclose(state.position_m[:, 2], 0.0, atol=1e-9)
 
-    def test_attitude_explains_acceleration_and_rates(self, scenario):
+    def test_attitude_matches_acceleration_and_rates(self, scenario):
         motion = motion_of(scenario)
-        # not at the ends of the wander's fade, where the jerk has a small step
+        # the jerk has small steps at the ends of the fade
         time = np.linspace(0.0, motion.duration_s, 20_001)
         step = 1e-4
         before, here, after = (attitude(motion.at(time + s)) for s in (-step, 0.0, step))
@@ -100,18 +100,18 @@ class TestMotion:
 
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
-def test_loop_closes_but_for_what_is_left_out(left_out, texts):
+def test_loop_open_end_equals_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
     flown = simulate(scenario, parse(texts))
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
-    # its last side points back along heading + 270 degrees
+    # the last side points back along heading + 270 degrees
     assert np.allclose(last - first, -left_out * direction(30.0 + 270.0), atol=1e-9)
-    told = answer(flown)["truth"]["closure_error_m"]
-    assert told == pytest.approx(left_out, abs=1e-9)
+    error_m = answer(flown)["truth"]["closure_error_m"]
+    assert error_m == pytest.approx(left_out, abs=1e-9)
 
 
 @pytest.mark.parametrize("yaw", ["fixed", "follow"])
-def test_aisle_is_as_long_as_asked_ends_where_it_began_and_the_nose_follows_or_stays(yaw):
+def test_aisle_path_has_length_and_yaw_mode(yaw):
     motion = motion_of(replace(AISLE, wander_m=0.0, yaw=yaw))
     state = motion.at(np.linspace(0.0, motion.duration_s, 5001))
     assert (state.position_m @ direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)
@@ -129,7 +129,7 @@ def test_aisle_is_as_long_as_asked_ends_where_it_began_and_the_nose_follows_or_s
 
 
 @pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
-def test_acceleration_noise_per_step_is_sigma_a(texts):
+def test_imu_noise_averaged_over_dt_is_sigma_a(texts):
     scenario = Scenario(seed=3, passes=4, wander_m=0.0, **IDEAL)
     simulation = simulate(scenario, parse(texts))
     imu = to_flight(simulation).imu
@@ -146,21 +146,21 @@ def test_acceleration_noise_per_step_is_sigma_a(texts):
         assert np.std(mean) == pytest.approx(expected, rel=0.07)
 
 
-def test_biases_are_constant_and_drawn_as_stated():
+def test_biases_are_constant_with_given_sigma():
     simulation = simulate(Scenario(seed=9))
     imu = to_flight(simulation).imu
     truth = attitude(simulation.motion.at(imu.index.to_numpy()))
-    told = answer(simulation)["truth"]
+    truth_values = answer(simulation)["truth"]
     bias = imu.to_numpy()[:, :3].astype(float) - truth.specific_force_m_s2
-    assert bias.mean(axis=0) == pytest.approx(told["accelerometer_bias_m_s2"], abs=0.025)
+    assert bias.mean(axis=0) == pytest.approx(truth_values["accelerometer_bias_m_s2"], abs=0.025)
     bias = imu[Columns.ANGULAR_RATE].to_numpy(float) - truth.angular_rate_rad_s
-    assert bias.mean(axis=0) == pytest.approx(told["gyro_bias_rad_s"], abs=3e-4)
+    assert bias.mean(axis=0) == pytest.approx(truth_values["gyro_bias_rad_s"], abs=3e-4)
     drawn = [sensors.biases(Scenario(seed=seed), NO_MISTAKES) for seed in range(400)]
     assert np.std([b[0] for b in drawn]) == pytest.approx(0.03, rel=0.1)
     assert np.std([b[1] for b in drawn]) == pytest.approx(0.002, rel=0.1)
 
 
-def test_vio_drifts_as_stated():
+def test_vio_drift_has_given_rate_and_random_walk():
     ends = []
     for seed in range(40):
         scenario = Scenario(kind="loop", passes=1, length_m=8.0, seed=seed, sigma_vio_m=0.0)
@@ -168,7 +168,7 @@ def test_vio_drifts_as_stated():
         source = sensors.positions(scenario, NO_MISTAKES, motion)
         assert np.allclose(source.error_m[-1], source.drift_m, atol=1e-9)
         ends.append(source.drift_m)
-    # 1.5 % of 32 m (and of the wander) with a random walk of 0.01 m/√m
+    # 1.5 % of 32 m plus the deviation, with a random walk of 0.01 m/√m
     length = np.hypot(*np.array(ends)[:, :2].T)
     assert np.mean(length) == pytest.approx(0.015 * source.distance_m, rel=0.06)
     assert np.std(np.array(ends)[:, 2]) == pytest.approx(0.01 * np.sqrt(source.distance_m), rel=0.3)
@@ -184,7 +184,7 @@ class TestMistakes:
     @pytest.mark.parametrize(("text", "offset_s", "share"), [
         ("clock-offset=80ms", 0.08, 0), ("clock-drift=500ppm", 0, 5e-4),
     ])  # fmt: skip
-    def test_a_wrong_clock_shifts_the_stamps_and_nothing_else(self, text, offset_s, share):
+    def test_clock_error_shifts_only_timestamps(self, text, offset_s, share):
         late = simulate(UNFILTERED, parse([text]))
         time = late.positions.measured_s
         assert np.allclose(stamps_s(late) - time, offset_s + share * time, atol=1e-6)
@@ -192,7 +192,7 @@ class TestMistakes:
         assert np.array_equal(*arrivals)
         assert answer(late)["truth"]["clock_offset_to_add_s"] == -offset_s
 
-    def test_clock_jump_ends_when_timesync_converges(self):
+    def test_clock_jump_ends_at_timesync_convergence(self):
         jumping = simulate(Scenario(seed=4), parse(["clock-jump=0.25"]))
         fields, time = jumping.positions.topic.fields, jumping.positions.measured_s
         before = time < 50.0
@@ -202,7 +202,7 @@ class TestMistakes:
         assert np.mean(late[before]) == pytest.approx(0.25, abs=1e-3)
         assert np.allclose(late[~before], 0.0, atol=1e-6)
 
-    def test_nlos_is_an_exact_share_in_bursts(self):
+    def test_nlos_has_exact_fraction_in_bursts(self):
         simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse(["nlos=5%,3m"]))
         outlier, motion = simulation.positions.outlier, simulation.motion
         time = simulation.positions.measured_s
@@ -215,50 +215,50 @@ class TestMistakes:
         assert np.mean(size[outlier]) == pytest.approx(3.0, rel=0.2)
         starts = np.count_nonzero(np.diff(outlier.astype(int)) == 1)
         assert np.count_nonzero(outlier) / starts > 1.5
-        told = answer(simulation)["truth"]
-        assert told["outlier_index"] == np.flatnonzero(outlier).tolist()
-        assert np.allclose(told["outlier_time_s"], stamps_s(simulation)[outlier])
+        truth_values = answer(simulation)["truth"]
+        assert truth_values["outlier_index"] == np.flatnonzero(outlier).tolist()
+        assert np.allclose(truth_values["outlier_time_s"], stamps_s(simulation)[outlier])
 
     @pytest.mark.parametrize(
         ("text", "start", "end"), [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)]
     )
-    def test_dropout_silences_the_source(self, text, start, end):
-        gone = simulate(UNFILTERED, parse([text]))
-        middle = gone.motion.duration_s / 2.0
+    def test_dropout_removes_source_samples(self, text, start, end):
+        with_gap = simulate(UNFILTERED, parse([text]))
+        middle = with_gap.motion.duration_s / 2.0
         start, end = start or middle - 3.0, end or middle + 3.0
         clean = self.CLEAN.positions.measured_s
-        kept = clean[(clean <= start) | (clean >= end)]
-        assert np.array_equal(gone.positions.measured_s, kept)
+        remaining = clean[(clean <= start) | (clean >= end)]
+        assert np.array_equal(with_gap.positions.measured_s, remaining)
 
     @pytest.mark.parametrize("rate", [2.0, 4.0])
-    def test_thinning_keeps_samples_as_they_are(self, rate):
+    def test_decimation_keeps_remaining_samples(self, rate):
         mistakes = parse([f"decimate={rate}Hz", f"imu-rate={10 * rate}", "imu-dropout=2s,10s"])
-        thin, clean = (to_flight(s) for s in (simulate(AISLE, mistakes), self.CLEAN))
-        samples = thin.positions[0].samples
-        assert len(samples) / thin.log.duration_s == pytest.approx(rate, rel=0.1)
+        decimated, clean = (to_flight(s) for s in (simulate(AISLE, mistakes), self.CLEAN))
+        samples = decimated.positions[0].samples
+        assert len(samples) / decimated.log.duration_s == pytest.approx(rate, rel=0.1)
         assert samples.index.isin(clean.positions[0].samples.index).all()
-        pd.testing.assert_frame_equal(thin.imu, clean.imu.loc[thin.imu.index])
-        intervals = np.diff(thin.imu.index)
+        pd.testing.assert_frame_equal(decimated.imu, clean.imu.loc[decimated.imu.index])
+        intervals = np.diff(decimated.imu.index)
         assert np.median(intervals) == pytest.approx(0.1 / rate, rel=0.05)
         assert intervals.max() == pytest.approx(2.0, abs=0.1 / rate)
-        assert len(thin.attitude) == len(clean.attitude)
+        assert len(decimated.attitude) == len(clean.attitude)
 
-    def test_smoothed_lags_and_correlates(self):
+    def test_smoothed_positions_lag_by_time_constant(self):
         scenario = Scenario(seed=4, sigma_uwb_m=0.0, uwb_rate_hz=50.0, wander_m=0.0)
         simulation = simulate(scenario, parse(["smoothed=0.5s"]))
         truth = simulation.motion.at(simulation.positions.measured_s)
         along = truth.velocity_m_s @ direction(30.0)
         lag = -(simulation.positions.error_m @ direction(30.0))
         fast = np.abs(np.abs(along) - 1.0) < 1e-9
-        settled = fast & np.roll(fast, 150)  # 3 s, six time constants
+        settled = fast & np.roll(fast, 150)  # 3 s are six time constants
         assert np.any(settled)
         assert np.allclose(lag[settled] / along[settled], 0.5, atol=0.02)
         noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"])).positions.error_m
-        assert np.std(noisy[:25]) < 0.07  # on the ground: 0.10 without
+        assert np.std(noisy[:25]) < 0.07  # on the ground; 0.10 m without the filter
 
-    def test_no_vvo_leaves_no_source(self):
-        kept = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
-        assert [round(track.rate_hz) for track in kept] == [2, 2]
+    def test_no_vvo_removes_position_source(self):
+        remaining = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
+        assert [round(track.rate_hz) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
         assert flight.positions == ()
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):
@@ -273,19 +273,19 @@ class TestMistakes:
     ("accel-bias=.5m/s²", "accel_bias_m_s2", 0.5),
     ("no-motion", "no_motion", True),
 ])  # fmt: skip
-def test_values_have_units(text, field, value):
+def test_parse_mistake_converts_units(text, field, value):
     assert getattr(parse([text]), field) == pytest.approx(value)
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_every_default_is_a_mistake_and_can_be_typed_again(name):
+def test_format_mistake_default_is_parsed_again(name):
     parsed = parse([name])
     assert active_mistakes(parsed) == (name,)
     assert parse([format_mistake(name, parsed)]) == parsed
     assert active_mistakes(parse(["clock-offset=0", "nlos=0"])) == ()
 
 
-@pytest.mark.parametrize(("text", "said"), [
+@pytest.mark.parametrize(("text", "expected"), [
     ("fog", "Choose from clock-offset, clock-drift"),
     ("dropout = 8s", "not a known mistake"),
     ("nlos=5s", "give percent"),
@@ -296,8 +296,8 @@ def test_every_default_is_a_mistake_and_can_be_typed_again(name):
     ("clock-offset=", "give seconds"),
     ("no-motion=1", "give no-motion"),
 ])  # fmt: skip
-def test_bad_mistakes_are_one_line(text, said):
-    with pytest.raises(SettingsError, match=said) as error:
+def test_parse_mistake_invalid_text_raises_one_line(text, expected):
+    with pytest.raises(SettingsError, match=expected) as error:
         parse([text])
     assert "\n" not in str(error.value)
 
@@ -306,39 +306,40 @@ def test_bad_mistakes_are_one_line(text, said):
     {"kind": "spiral"}, {"yaw": "spin"}, {"passes": 0}, {"speed_m_s": float("nan")},
     {"length_m": 2.0, "speed_m_s": 4.0}, {"seed": -1},
 ])  # fmt: skip
-def test_impossible_scenarios_are_refused(changes):
+def test_scenario_invalid_values_raise_error(changes):
     with pytest.raises(SettingsError):
         Scenario(**changes)
 
 
-@pytest.mark.parametrize(("scenario", "texts", "said"), [
+@pytest.mark.parametrize(("scenario", "texts", "expected"), [
     (AISLE, ["open-end"], "requires --kind loop"), (UNFILTERED, ["ekf2-noise"], "--no-ekf2"),
-    (LOOP, ["open-end=7"], "at most 6 m"),
-    (Scenario(passes=100, length_m=100.0), [], "at most 3600 s"),
-    (AISLE, ["dropout=600s,0s"], "nothing is left of vehicle_visual_odometry"),
+    (LOOP, ["open-end=7"], "Use at most 6 m"),
+    (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
+    (AISLE, ["dropout=600s,0s"], "no data in vehicle_visual_odometry"),
 ])  # fmt: skip
-def test_what_does_not_fit_is_refused(scenario, texts, said):
-    with pytest.raises(SettingsError, match=said):
+def test_simulate_unsuitable_mistake_raises_error(scenario, texts, expected):
+    with pytest.raises(SettingsError, match=expected):
         simulate(scenario, parse(texts))
 
 
-# --- as ULog and in memory
+# --- ULog and memory
 
 
-def test_log_does_not_give_the_mistakes_away():
+def test_to_ulog_contains_no_mistake_names():
     texts = [name for name, one in MISTAKES.items() if "aisle" in one.kinds and name != "no-vvo"]
     content = to_ulog(simulate(AISLE, parse(texts)))
     for name in (*MISTAKES, *(field for mistake in MISTAKES.values() for field in mistake.fields)):
-        if name not in ("yaw", "scale", "jump", "heading", "mag"):  # of the log's own words
+        # these names occur in the log for other reasons
+        if name not in ("yaw", "scale", "jump", "heading", "mag"):
             assert name.encode() not in content
     assert b"mistake" not in content.lower()
 
 
-# --- through our filter
+# --- KF on simulated flights
 
 
 def nis(scenario, names=("north", "east", "down")):
-    """Mean NIS per axis at the true noises, by the fast filter, and its 95 % band."""
+    """Return mean NIS per axis at the true noises, from the fast filter, and its 95 % band."""
     flight = simulate_flight(replace(scenario, ekf2=False))
     (start, end) = flight.airborne[0]
     settings = Settings(sigma_a_m_s2=scenario.sigma_a_m_s2, sigma_z_m=scenario.sigma_uwb_m)
@@ -352,7 +353,7 @@ def nis(scenario, names=("north", "east", "down")):
 @pytest.mark.parametrize(("errors", "off", "share"), [
     ({}, np.inf, 0.75), (IDEAL, 0.03, 0.88),
 ], ids=["usual", "ideal"])  # fmt: skip
-def test_flights_are_consistent_at_their_true_noises(errors, off, share):
+def test_kf_true_noises_is_consistent(errors, off, share):
     values, inside = [], []
     for seed in range(14):
         found, (low, high) = nis(Scenario(seed=seed, passes=4, **errors))
@@ -363,8 +364,8 @@ def test_flights_are_consistent_at_their_true_noises(errors, off, share):
 
 
 @pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
-def test_clean_flight_has_no_mistake(scenario):
-    """A loop's VIO drifts, which is no mistake; that filters follow it is said."""
+def test_findings_clean_flight_are_notes_only(scenario):
+    """The VIO of a loop drifts, which is not a mistake; its effect on the filters is reported."""
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))
@@ -378,11 +379,11 @@ def test_clean_flight_has_no_mistake(scenario):
 # --- the command
 
 
-def test_command_writes_log_and_answer_the_same_again(tmp_path):
-    log, told, again = (tmp_path / name for name in ("s07.ulg", "s07.json", "again.ulg"))
+def test_simulate_command_is_reproducible_with_answer(tmp_path):
+    log, answer_path, again = (tmp_path / name for name in ("s07.ulg", "s07.json", "again.ulg"))
     options = ("--seed", 7, "--passes", 1, "--mistake", "nlos=5%", "--mistake", "clock-offset=80ms")
-    assert "nlos=5%,2m" in done("simulate", "-o", log, *options, "--answer", told).output
-    content = json.loads(told.read_text(encoding="utf-8"))
+    assert "nlos=5%,2m" in done("simulate", "-o", log, *options, "--answer", answer_path).output
+    content = json.loads(answer_path.read_text(encoding="utf-8"))
     assert set(content["mistakes"]) == {"nlos", "clock-offset"}
     assert content["scenario"]["seed"] == 7
     done("simulate", "-o", again, *options)

@@ -1,4 +1,4 @@
-"""EKF2 of simulated flights against the truth, against its replay, and what it shows."""
+"""EKF2 of simulated flights: against the truth, against its replay, and in the findings."""
 
 import numpy as np
 import pandas as pd
@@ -31,7 +31,7 @@ def flown(*texts: str, scenario: Scenario = AISLE) -> Flight:
 
 
 def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
-    """Innovations while airborne."""
+    """Return innovations while airborne."""
     frame = flight.ekf2.innovations[axis]
     start, end = flight.airborne[0]
     return frame.loc[start:end]
@@ -43,7 +43,7 @@ def agreement(flight: Flight) -> Agreement:
 
 
 def rmse(flight: Flight, start_s: float, end_s: float, column: str = "north_m") -> float:
-    """Of the published position, to the truth."""
+    """Return the RMSE of the published position."""
     track, truth = flight.ekf2.state.loc[start_s:end_s, column], flight.truth.samples[column]
     return float(np.sqrt(np.mean((track - np.interp(track.index, truth.index, truth)) ** 2)))
 
@@ -58,10 +58,10 @@ def clean() -> Flight:
     return flown()
 
 
-# --- the model, from take-off
+# --- the model from take-off on
 
 
-def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean):
+def test_simulated_ekf2_clean_flight_agrees_with_replay(clean):
     found = agreement(clean)
     assert found.good
     assert found.decisions_same == 1.0
@@ -70,7 +70,7 @@ def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean):
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
         assert (axis.s_ratio_p5, axis.s_ratio_p95) == pytest.approx((1.0, 1.0), abs=0.01)
         assert axis.position_rms_difference_m < 0.012
-        assert axis.velocity_rms_difference_m_s < 0.03  # vehicle_attitude is not EKF2's
+        assert axis.velocity_rms_difference_m_s < 0.03  # vehicle_attitude is not that of EKF2
 
 
 @pytest.mark.parametrize(("texts", "scenario"), [
@@ -78,7 +78,7 @@ def test_a_clean_flight_agrees_with_its_replay_from_the_log(clean):
     (("ekf2-delay=175ms",), AISLE),
     ((), Scenario(kind="loop", passes=1, seed=5)),
 ], ids=["outliers", "delay", "loop"])  # fmt: skip
-def test_flights_with_mistakes_agree_too(texts, scenario):
+def test_simulated_ekf2_mistakes_agree_with_replay(texts, scenario):
     found = agreement(flown(*texts, scenario=scenario))
     assert found.good
     assert found.decisions_same > 0.99
@@ -87,7 +87,7 @@ def test_flights_with_mistakes_agree_too(texts, scenario):
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
 
 
-def test_clean_flights_are_consistent_and_near_the_truth():
+def test_simulated_ekf2_clean_flights_are_consistent():
     values, inside, errors, stated = [], [], [], []
     for seed in range(8):
         flight = flown(scenario=Scenario(passes=2, seed=seed))
@@ -100,15 +100,15 @@ def test_clean_flights_are_consistent_and_near_the_truth():
             errors.append(rmse(flight, 10.0, 50.0, f"{axis}_m"))
         variance = flight.ekf2.variance
         stated.append(float(np.sqrt(variance["north_m2"].median())))
-    # the heading has an error of 1° that EKF2 takes to be white
+    # EKF2 treats the 1° heading error as white noise
     assert np.mean(values) == pytest.approx(1.0, abs=0.08)
     assert np.mean(inside) >= 0.85
-    assert np.max(errors) < 0.14  # the UWB alone: 0.10 m, and EKF2 publishes 0.23 s ahead of it
+    assert np.max(errors) < 0.14  # m; UWB noise is 0.10 m, and EKF2 predicts 0.23 s ahead
     assert np.median(stated) == pytest.approx(0.06, abs=0.01)
 
 
-def test_the_horizon_state_is_as_good_as_it_says(clean):
-    """Position and velocity at the horizon, their variances, and the biases that it learns."""
+def test_simulated_ekf2_delayed_state_is_consistent(clean):
+    """Position and velocity at the fusion horizon, their variances, and the estimated biases."""
     record, truth = clean.ekf2.record, clean.truth.samples
     later = record.delayed[record.delayed.index > 15.0]
     error = later["north_m_s"] - np.interp(later.index, truth.index, truth["north_m_s"])
@@ -120,13 +120,13 @@ def test_the_horizon_state_is_as_good_as_it_says(clean):
     assert last["accelerometer_bias_down_m_s2"] == pytest.approx(bias[2], abs=0.05)
 
 
-def test_where_it_stands_still_the_attitude_is_levelled():
+def test_initial_state_at_rest_levels_attitude():
     tilt = Rotation.from_euler("x", 0.1).as_matrix()
     gravity = np.array([0.0, 0.0, 9.80665])
     bias, rate = np.array([0.03, -0.02, 0.05]), np.array([0.002, -0.001, 0.003])
     x, P = ekf2._initial_state_at_rest(tilt, tilt.T @ -gravity + bias, rate, 0.01)
     assert x[9:12] == pytest.approx(rate, rel=1e-3)
-    # what is left of the horizontal bias is a tilt that makes up for it
+    # the remaining horizontal bias is compensated by a tilt
     force = tilt @ (tilt.T @ -gravity + bias - x[12:15])
     assert np.cross(x[:3], force) + force == pytest.approx(-gravity, abs=0.01)
     assert x[14] == pytest.approx(bias[2], abs=0.01)
@@ -135,12 +135,12 @@ def test_where_it_stands_still_the_attitude_is_levelled():
     assert abs(P[0, 13]) / deviation[0] / deviation[13] > 0.95
 
 
-def test_fusion_needs_ten_hertz_stops_and_resets_as_ekf2_does():
+def test_simulated_ekf2_slow_source_stops_and_resets():
     slow = flown("decimate=2Hz")
     fusing = slow.ekf2.fusing
     assert not fusing["horizontal"].any()
     assert "ekf2_not_fusing" in named(slow)
-    # it stays where it is, instead of drifting away on the IMU
+    # EKF2 holds its position instead of drifting on the IMU
     assert slow.ekf2.state[["north_m", "east_m"]].abs().max().max() < 5.0
     gap = flown("dropout=8s,30s")
     fusing = gap.ekf2.fusing
@@ -149,40 +149,41 @@ def test_fusion_needs_ten_hertz_stops_and_resets_as_ekf2_does():
     resets = [reset for reset in gap.ekf2.resets if reset.time_s > 10.0]
     assert len(resets) == 1
     assert 38.2 < resets[0].time_s < 39.2
-    # the step in what is published is the reset that is logged
+    # the step of the published position equals the logged reset
     state = gap.ekf2.state["north_m"]
     at = int(np.searchsorted(state.index, resets[0].time_s))
     moved = state.iloc[at] - state.iloc[at - 1]
     assert moved == pytest.approx(resets[0].delta[0], abs=0.3)
 
 
-def test_samples_that_come_too_late_are_never_fused_and_that_is_said():
+def test_simulated_ekf2_late_samples_are_not_fused():
     early = flown("clock-offset=-350ms")
     compared = compare(early, RIGHT, axes=("north",))
     (finding,) = (f for f in find(unexplained(compared)) if f.id == "ekf2_not_fusing")
-    assert "arrive 0.38 s after their timestamps, but EKF2 buffers only 0.23 s" in finding.message
+    assert "0.38 s" in finding.message
+    assert "0.23 s" in finding.message
     assert "EKF2_DELAY_MAX" in finding.remedy
 
 
-def test_a_step_is_the_nearest_number_of_samples():
+def test_samples_per_step_rounds_to_nearest():
     found = [samples_per_step(0.01, t) for t in (0.00375, 0.004, 0.005, 0.0021, 0.05)]
     assert found == [3, 3, 2, 5, 1]
-    # a median of stamps is never exactly 4 ms
+    # a median of timestamps is never exactly 4 ms
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
-def test_a_half_is_rounded_as_the_log_shows_it():
-    """EKF2 rounds a mean that it measures: two and a half samples are two, or three."""
+def test_samples_per_step_half_follows_log():
+    """EKF2 rounds a measured mean: 2.5 samples become two or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]
     assert [samples_per_step(0.01, 0.004, each) for each in ends] == [2, 3, 3, 3]
-    # steps that an IMU with dropouts makes differ now and then
+    # IMU dropouts change single steps
     assert samples_per_step(0.01, 0.004, np.append(3 * np.arange(30), [91])) == 3
-    # far from a half the log is not asked
+    # the log is not used if the ratio is not close to a half
     assert samples_per_step(0.01, 0.00375, by_two) == 3
 
 
-def test_samples_with_older_stamps_than_the_last_are_not_taken():
+def test_simulated_ekf2_ignores_older_timestamps():
     simulation = simulate(Scenario(passes=4, seed=5), parse(["clock-jump=400ms"]))
     topics = {topic.name: topic.fields for topic in simulation.topics}
     sent = topics["vehicle_visual_odometry"]["timestamp_sample"].astype(np.int64)
@@ -194,27 +195,27 @@ def test_samples_with_older_stamps_than_the_last_are_not_taken():
     assert np.all(np.diff(rows.stamp_s) > 0)
 
 
-# --- mistakes of EKF2's own
+# --- mistakes in EKF2 parameters
 
 
-def test_ekf2_that_is_not_told_to_fuse_only_looks(clean):
+def test_simulated_ekf2_disabled_fusion_holds_position(clean):
     flight = flown("ekf2-off")
     assert flight.log.parameters["EKF2_EV_CTRL"] == 0.0
     assert flight.ekf2.fusing["horizontal"].max() == 0.0
     assert clean.ekf2.fusing["horizontal"].max() == 1.0
-    # as in PX4 samples are compared with the state all the same, and nothing comes of it
+    # as in PX4, samples are compared with the state but not fused
     record, plain = flight.ekf2.record, clean.ekf2.record
     assert len(record.vision_age_s) == len(plain.vision_age_s)
-    # told nothing for 5 s it stays where it is, while the vehicle flies to and fro over 12 m
+    # EKF2 holds its position after 5 s, while the vehicle flies 12 m back and forth
     assert rmse(flight, 10.0, 50.0) > 2.0 > 10.0 * rmse(clean, 10.0, 50.0)
-    (finding,) = (one for one in find(compare(flight, RIGHT)) if one.id == "ekf2_not_fusing")
-    assert "EKF2_EV_CTRL is 0" in finding.message
+    (finding,) = (item for item in find(compare(flight, RIGHT)) if item.id == "ekf2_not_fusing")
+    assert "EKF2_EV_CTRL" in finding.message
 
 
 # --- the log
 
 
-def test_the_log_says_that_it_is_a_model_and_one_without_ekf2_has_no_note(clean, tmp_path):
+def test_simulated_log_notes_ekf2_model(clean, tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(to_ulog(simulate(AISLE)))
     assert read_log(path).log.notes == clean.log.notes == (MODEL_NOTE,)

@@ -1,7 +1,7 @@
-"""External vision besides GNSS in the model of EKF2.
+"""External vision besides GNSS in the EKF2 model.
 
-Oracles are an EKF written down plainly, which fuses both one after the other at their own steps,
-and the scalar equations of PX4's bias estimator.
+References are a plain EKF that fuses both one after the other at their own steps, and the scalar
+equations of PX4's bias estimator.
 """
 
 import json
@@ -47,7 +47,7 @@ OF_VISION = {
     "EKF2_EV_NOISE_MD": 0.0, "EKF2_EV_POS_X": 0.0, "EKF2_EV_POS_Y": 0.0, "EKF2_EV_POS_Z": 0.0,
 }  # fmt: skip
 SETTINGS = {name: value for name, value in OF_VISION.items() if name != "EKF2_EV_CTRL"}
-FRAME_M = np.array([5.0, -3.0, 0.0])  # where vision's origin is
+FRAME_M = np.array([5.0, -3.0, 0.0])  # origin of the vision frame
 
 
 @cache
@@ -58,7 +58,7 @@ def on_gnss() -> Model:
 def sent(
     rate_hz: float = 15.0, sigma_m: float = 0.3, late_s: float = 0.0, seed: int = 1
 ) -> ReceivedPositions:
-    """Positions of vision: the truth in a frame of its own, which wanders."""
+    """Return vision positions: the truth in an offset frame with a random walk."""
     truth = on_gnss().flight.truth
     rng = np.random.default_rng(seed)
     stamp = np.arange(1.0, truth.samples.index[-1] - 1.0, 1.0 / rate_hz)
@@ -74,7 +74,7 @@ def sent(
     )  # fmt: skip
 
 
-# ---------------------------------------------------------------- the plain filter
+# ------------------------------------------------------------------ plain filter
 
 
 @dataclass
@@ -104,10 +104,10 @@ class PlainBias:
 def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     inputs: Inputs, stretch: Stretch, events: Events
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As PX4 has it: a prediction at a time, each fix and then each sample of vision at its step.
+    """Run a plain EKF: one prediction at a time, each fix and each vision sample at its step.
 
-    Every axis is fused by innovation and S of before the first (fuseDirectStateMeasurement).
-    Returns a row per fix, and one per sample of vision.
+    All axes are fused with the initial innovation and S (fuseDirectStateMeasurement). Returns a row
+    per fix, and a row per vision sample.
     """
     settings, received, vision = inputs.settings, inputs.received, inputs.vision
     assert vision is not None
@@ -161,7 +161,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
         )
         R0 = max(vision.variance_m2[has_sample[k], 0], settings["EKF2_EVP_NOISE"] ** 2, gps2)
         if not biases:
-            biases = [PlainBias(float(one), 0.5 * R0, R0) for one in off]
+            biases = [PlainBias(float(value), 0.5 * R0, R0) for value in off]
             continue
         nu = position - [bias.bias for bias in biases] - x[6:8]
         R = np.array([R0 + bias.variance for bias in biases])
@@ -176,7 +176,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
 
 
 def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: float) -> Inputs:
-    """The flight's first part, with nothing to tell of tilt and height but GNSS and vision."""
+    """Return the start of the flight, with only GNSS and vision correcting tilt and height."""
     inputs = on_gnss().inputs
     (whole,) = inputs.stretches
     count = int(np.searchsorted(whole.time_s, whole.time_s[0] + seconds))
@@ -185,7 +185,8 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
         whole, time_s=whole.time_s[:count], step_s=whole.step_s[: count - 1],
         rotation=whole.rotation[:count], correction_rad=whole.correction_rad[: count - 1],
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
-        heights=None, state=whole.state[:15], variance=whole.variance[:15], distrusted_share=None,
+        heights=None, state=whole.state[:15], variance=whole.variance[:15],
+        bad_acceleration_share=None,
         correlation=np.eye(15), attitude_variance_rad2=unknown, down_variance_m2=unknown[:, 0],
         attitude_error_rad=whole.attitude_error_rad[:count],
     )  # fmt: skip
@@ -208,7 +209,7 @@ def update_log(done: StretchRun, at: int = 0) -> pd.DataFrame:
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
     (30.0, 0.0, {}), (12.0, 0.1, {"EKF2_EV_DELAY": 100.0}), (30.0, 0.0, {"EKF2_EVP_NOISE": 0.8}),
 ])  # fmt: skip
-def test_the_recursion_is_the_plain_filter(
+def test_recursion_matches_plain_filter(
     rate_hz: float, late_s: float, settings: dict[str, float]
 ) -> None:
     inputs = flying(sent(rate_hz, late_s=late_s), **settings)
@@ -217,11 +218,11 @@ def test_the_recursion_is_the_plain_filter(
     fixes, rows = plain_both(inputs, done.stretch, events)
     used = events.action > 0
     nu, S = done.innovation[used, 0, :5], done.innovation_variance[used, 0, :5]
-    late = slice(30, None)  # the start of the bias is forgotten
-    apart = np.sqrt(np.mean((nu - fixes[:, :5])[late] ** 2, axis=0))
+    late = slice(30, None)  # after the transient of the bias
+    difference = np.sqrt(np.mean((nu - fixes[:, :5])[late] ** 2, axis=0))
     without = np.sqrt(np.mean((alone.innovation[used, 0, :5] - fixes[:, :5])[late] ** 2, axis=0))
-    assert apart.max() < 0.006
-    assert np.all(without[3:] > 8.0 * apart[3:])
+    assert difference.max() < 0.006
+    assert np.all(without[3:] > 8.0 * difference[3:])
     np.testing.assert_allclose(S[10:], fixes[10:, 5:], rtol=2e-3)
     found = update_log(done)
     found = found.loc[rows[0, 0] + 3.0 :]
@@ -234,8 +235,8 @@ def test_the_recursion_is_the_plain_filter(
     assert found["fused"].all()
 
 
-def test_while_gnss_is_fused_vision_is_no_more_exact_than_a_fix() -> None:
-    """R is the largest of EKF2_EVP_NOISE, EKF2_GPS_P_NOISE and what the sender states."""
+def test_vision_noise_with_gnss_is_at_least_gnss_noise() -> None:
+    """R is the largest of EKF2_EVP_NOISE, EKF2_GPS_P_NOISE and the reported variance."""
     inputs = flying(sent(), EKF2_GPS_P_NOISE=0.5)
     noises = ({**inputs.settings, "EKF2_EVP_NOISE": noise_m} for noise_m in (0.01, 0.5, 0.7))
     alone = Variant(inputs.settings, without={"gnss_pos": 0.0})
@@ -247,8 +248,8 @@ def test_while_gnss_is_fused_vision_is_no_more_exact_than_a_fix() -> None:
     assert np.abs(update_log(done, 2) - update_log(done, 1)).max(axis=None) > 0.01
 
 
-def test_positions_of_a_sensor_beside_the_imu_are_those_of_the_imu() -> None:
-    """EKF2_EV_POS, in the body, turned by the attitude at each sample."""
+def test_vision_lever_arm_is_subtracted() -> None:
+    """EKF2_EV_POS is in the body frame, rotated by the attitude at each sample."""
     inputs, vision, lever_arm_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
     (stretch,) = inputs.stretches
     step = np.searchsorted(stretch.time_s, vision.stamp_s - 0.5 * inputs.step_s - 1e-9)
@@ -262,7 +263,7 @@ def test_positions_of_a_sensor_beside_the_imu_are_those_of_the_imu() -> None:
     )
 
 
-def test_the_bias_follows_visions_frame_and_gnss_says_where_the_vehicle_is() -> None:
+def test_vision_bias_estimates_frame_offset() -> None:
     done = ran(flying(sent(sigma_m=0.05)))
     assert done.vision is not None
     np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.5)
@@ -274,8 +275,8 @@ def test_the_bias_follows_visions_frame_and_gnss_says_where_the_vehicle_is() -> 
         assert done.state[-1, 0, 6 + axis] == pytest.approx(true, abs=0.5)
 
 
-def test_samples_beyond_the_gate_are_rejected_and_after_a_second_the_bias_begins_anew() -> None:
-    """A jump of vision by 20 m moves EKF2 nowhere."""
+def test_vision_jump_is_rejected_until_bias_reset() -> None:
+    """A jump of vision by 20 m does not move EKF2."""
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.stretches[0].time_s[0]) + 20.0
     jumped = replace(vision, position_m=vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None])
@@ -287,27 +288,27 @@ def test_samples_beyond_the_gate_are_rejected_and_after_a_second_the_bias_begins
     assert found.loc[rejected[-1] + 0.01 :, "fused"].all()
     assert not found["reset"].any()
     assert not done.moved_m.any()
-    apart = done.state[-1, 0, 6:8] - smooth.state[-1, 0, 6:8]
-    assert np.abs(apart).max() < 0.05
+    difference = done.state[-1, 0, 6:8] - smooth.state[-1, 0, 6:8]
+    assert np.abs(difference).max() < 0.05
     without_gate = ran(flying(jumped), Variant(flying(jumped).settings, gated=False))
     assert not update_log(without_gate)["rejected"].any()
 
 
-def test_after_silence_vision_starts_with_another_bias() -> None:
+def test_vision_gap_restarts_bias() -> None:
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.stretches[0].time_s[0]) + 20.0
-    for silent_s, anew in ((0.9 * STOP_S, False), (1.5 * STOP_S, True)):
-        kept = (vision.stamp_s < at_s) | (vision.stamp_s > at_s + silent_s)
+    for gap_s, anew in ((0.9 * STOP_S, False), (1.5 * STOP_S, True)):
+        remaining = (vision.stamp_s < at_s) | (vision.stamp_s > at_s + gap_s)
         moved = vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None]
         fields = ("stamp_s", "arrival_s", "variance_m2", "rejected", "reset")
-        parts = {name: getattr(vision, name)[kept] for name in fields}
-        found = update_log(ran(flying(replace(vision, position_m=moved[kept], **parts))))
-        after = found.loc[at_s + silent_s :]
+        parts = {name: getattr(vision, name)[remaining] for name in fields}
+        found = update_log(ran(flying(replace(vision, position_m=moved[remaining], **parts))))
+        after = found.loc[at_s + gap_s :]
         assert bool(after["rejected"].any()) is not anew
 
 
-def test_without_gnss_ekf2_goes_to_where_vision_says_it_is() -> None:
-    """As ev_pos_control.cpp has it: a reset, without a bias, by vision's own noise."""
+def test_vision_without_gnss_resets_position() -> None:
+    """As in ev_pos_control.cpp: a reset without bias, with the noise of vision."""
     inputs = flying(sent(sigma_m=0.05))
     lost_s = float(inputs.stretches[0].time_s[0]) + 20.0
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), lost_s)
@@ -320,34 +321,34 @@ def test_without_gnss_ekf2_goes_to_where_vision_says_it_is() -> None:
     np.testing.assert_allclose(moved.sum(axis=0), FRAME_M[:2], atol=0.6)
     assert done.vision is not None
     np.testing.assert_array_equal(done.vision.bias.value_m[1], 0.0)
-    apart = done.state[-1, 1, 6:8] - done.state[-1, 0, 6:8]
-    np.testing.assert_allclose(apart, FRAME_M[:2], atol=0.6)
+    difference = done.state[-1, 1, 6:8] - done.state[-1, 0, 6:8]
+    np.testing.assert_allclose(difference, FRAME_M[:2], atol=0.6)
     after = found.loc[reset_s + 1.0 :]
-    # 0.1 m are EKF2_EVP_NOISE and what the sender states
+    # σ is 0.1 m in EKF2_EVP_NOISE and in the reported variance
     assert 0.01 < after["innovation_variance_north_m2"].median() < 0.02
     assert after["fused"].all()
 
 
-def test_a_reset_to_gnss_takes_the_bias_with_it() -> None:
-    """Position and bias move together (resetHorizontalPositionTo): vision goes on as before."""
+def test_vision_bias_follows_gnss_reset() -> None:
+    """Position and bias move together (resetHorizontalPositionTo): vision is fused as before."""
     inputs = flying(sent(sigma_m=0.05))
     for with_velocity in (False, True):
         rules = replace(inputs.rules, with_velocity=with_velocity)
         done = ran(replace(inputs, rules=rules, received=off_by(inputs.received, 30.0)))
-        # up to v1.16 a position that is fused, also of vision, holds GNSS off
+        # up to v1.16 any fused position, also from vision, prevents a reset to GNSS
         assert int(done.reset.sum()) == (not with_velocity)
         assert done.moved_m.sum() == pytest.approx(0.0 if with_velocity else 30.0, abs=3.0)
         assert update_log(done)["fused"].mean() > 0.999
 
 
 def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
-    """The same positions, off from 15 s on."""
+    """Return the positions with an offset from 15 s on."""
     start_s = float(on_gnss().inputs.stretches[0].time_s[0])
     far = (received.stamp_s > start_s + 15.0)[:, None] * np.array([north_m, 0.0, 0.0])
     return replace(received, position_m=received.position_m + far)
 
 
-def test_where_both_are_rejected_the_position_is_reset_to_vision_with_its_bias() -> None:
+def test_vision_both_rejected_resets_to_vision() -> None:
     inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
     done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
     found = update_log(done)
@@ -359,7 +360,7 @@ def test_where_both_are_rejected_the_position_is_reset_to_vision_with_its_bias()
     np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.7)
 
 
-def test_the_longest_delay_makes_the_horizon_also_where_it_is_visions() -> None:
+def test_variant_timing_vision_delay_sets_horizon() -> None:
     inputs = flying(sent())
     settings = inputs.settings
     flown = Variant(settings).timing(inputs)
@@ -369,7 +370,7 @@ def test_the_longest_delay_makes_the_horizon_also_where_it_is_visions() -> None:
     assert flown.horizon_s == inputs.horizon_s < later.horizon_s
 
 
-def test_samples_of_one_step_and_those_that_come_too_late() -> None:
+def test_vision_samples_same_step_or_late_are_dropped() -> None:
     vision = sent(rate_hz=25.0)
     doubled = {
         name: np.repeat(getattr(vision, name), 2, axis=0)
@@ -381,22 +382,22 @@ def test_samples_of_one_step_and_those_that_come_too_late() -> None:
         vision, replace(vision, stamp_s=stamps, **doubled)))  # fmt: skip
     assert len(once) <= len(twice) <= 1.1 * len(once)
     horizon_s = flying(vision).horizon_s
-    for age_s, kept in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):
+    for age_s, remaining in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):
         late = replace(vision, arrival_s=vision.stamp_s + age_s)
-        assert bool(len(update_log(ran(flying(late))))) is kept
+        assert bool(len(update_log(ran(flying(late))))) is remaining
 
 
-# ---------------------------------------------------------------- a flight with both
+# ------------------------------------------------------------- a flight with both
 
 
 @cache
 def flown(
     wrong_m: float = 0.0, flipped: bool = False, off_from_s: float = np.inf, **changed: float
 ) -> Flight:
-    """A flight whose EKF2, px4fuse's own model, fused both; its log has two innovations a second.
+    """Simulate a flight whose EKF2 model fuses both; two innovations per second are logged.
 
-    ``wrong_m`` is noise that EKF2 was sent and the log does not have; ``flipped`` is vision with
-    the other sign in EKF2; from ``off_from_s`` on EKF2 did without vision.
+    ``wrong_m``: noise that EKF2 received and the log does not contain; ``flipped``: vision with the
+    opposite sign in EKF2; ``off_from_s``: EKF2 does not fuse vision from then on.
     """
     vision, runs = sent(), []
     usual, usual_run = simulated.parameters, run_variants
@@ -441,7 +442,7 @@ def model() -> Model:
     return opened(flown())
 
 
-def test_a_flight_on_both_agrees_aid_by_aid() -> None:
+def test_model_gnss_and_vision_agree_with_log() -> None:
     agreement = model().agreement
     assert agreement.good
     assert agreement.doubtful == {}
@@ -454,7 +455,7 @@ def test_a_flight_on_both_agrees_aid_by_aid() -> None:
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
-def test_what_if_predicts_the_flight_with_the_other_noise_of_vision() -> None:
+def test_what_if_other_vision_noise_matches_real_flight() -> None:
     other = opened(flown(EKF2_EVP_NOISE=1.0))
     for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
         found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])
@@ -463,13 +464,13 @@ def test_what_if_predicts_the_flight_with_the_other_noise_of_vision() -> None:
         assert next(of_vision) == pytest.approx(next(of_vision), rel=0.01)
         assert predicted.nis_mean == pytest.approx(replayed.nis_mean, rel=0.01)
     assert found.logged.others["ev_pos"].nis_mean < 0.5 * predicted.others["ev_pos"].nis_mean
-    # which R is of GNSS, whatever this is
+    # R is then the noise of GNSS
     update_log = what_if(model(), [{"EKF2_EVP_NOISE": 0.2}])
-    assert "no position of vision to be more exact than EKF2_GPS_P_NOISE" in update_log.notes[-1]
+    assert "at least EKF2_GPS_P_NOISE (0.4 m) as noise of vision" in update_log.notes[-1]
     assert update_log.whatif[0].others == update_log.replayed.others
 
 
-def test_a_smaller_gate_rejects_more_of_vision() -> None:
+def test_what_if_smaller_vision_gate_rejects_more() -> None:
     request = WhatIfRequest(log="flight.ulg", changes={"EKF2_EVP_GATE": 1.0})
     made_of = run_what_if(request, flight=flown())
     found, update_log = made_of.whatif, {label: cells for label, *cells in rows(made_of)}
@@ -481,36 +482,38 @@ def test_a_smaller_gate_rejects_more_of_vision() -> None:
     assert found.whatif[0].others["ev_pos"].rejected_share > 0.2
 
 
-def test_without_one_of_both_the_other_goes_on() -> None:
-    gone = what_if(model(), [{}], {"ev_pos": 40.0})
-    assert gone.whatif[0].others == {}
+def test_what_if_without_vision_or_gnss_uses_other() -> None:
+    without_vision = what_if(model(), [{}], {"ev_pos": 40.0})
+    assert without_vision.whatif[0].others == {}
     lost = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0))
     (after,) = lost.whatif
     assert after.resets == 1
-    # in vision's frame, 5 m north and 3 m west of the truth
+    # vision frame: 5 m north and 3 m west of the truth
     assert after.position_rmse_to_truth_m == pytest.approx(np.hypot(5.0, 3.0), abs=0.5)
-    assert "gives its position up" not in lost.notes[-1]
+    assert "EKF2_NOAID_TOUT" not in lost.notes[-1]
     none = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel", "ev_pos"), 40.0))
-    assert "gives its position up" in none.notes[-1]
-    with pytest.raises(SettingsError, match="of this log the model fuses gnss_pos, gnss_vel, mag"):
+    assert "EKF2_NOAID_TOUT" in none.notes[-1]
+    with pytest.raises(
+        SettingsError, match="in this log the replay fuses only gnss_pos, gnss_vel, mag"
+    ):
         what_if(on_gnss(), [{}], {"ev_pos": 40.0})
 
 
 @pytest.mark.parametrize("wrong", [{"wrong_m": 1.0}, {"flipped": True}])
-def test_vision_that_does_not_agree_is_named_and_left_out(wrong: dict[str, Any]) -> None:
+def test_model_disagreeing_vision_is_excluded(wrong: dict[str, Any]) -> None:
     found = opened(flown(**wrong))
     assert "external vision" in format_agreement(found.agreement)
     assert "ev_pos" in found.agreement.doubtful
     assert found.agreement.ev_pos["north"].innovation_correlation < 0.5
-    # GNSS alone is not what EKF2 had
+    # a replay with GNSS only differs from EKF2
     assert not found.agreement.good
     assert found.inputs.vision is None
     assert "ev_pos" not in modelled_aids(found.inputs)
-    with pytest.raises(SettingsError, match="EKF2_EVP_NOISE changes nothing here"):
+    with pytest.raises(SettingsError, match="EKF2_EVP_NOISE has no effect in this log"):
         replay_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
 
 
-def test_samples_that_come_while_ekf2_does_without_vision_are_not_fused() -> None:
+def test_model_vision_while_disabled_is_not_fused() -> None:
     found = opened(flown(off_from_s=60.0))
     assert found.inputs.vision is not None
     update_log = np.isfinite(found.inputs.vision.position_m[:, 0])
@@ -519,30 +522,32 @@ def test_samples_that_come_while_ekf2_does_without_vision_are_not_fused() -> Non
     assert found.agreement.doubtful == {}
 
 
-def test_an_older_release_and_a_log_without_all_of_vision_are_refused() -> None:
+def test_model_incomplete_vision_is_unavailable() -> None:
     flight = flown()
     gnss_alone = replace(flight, positions=flight.positions[1:])
     lacking = open_model(gnss_alone)
     assert isinstance(lacking, Unavailable)
     assert "no vehicle_visual_odometry" in lacking.reason
     record = flight.ekf2.record
-    kept = {name: v for name, v in record.parameters.items() if name != "EKF2_EV_CTRL"}
-    older = replace(record, parameters={**kept, "EKF2_AID_MASK": 9.0})
+    remaining = {name: v for name, v in record.parameters.items() if name != "EKF2_EV_CTRL"}
+    older = replace(record, parameters={**remaining, "EKF2_AID_MASK": 9.0})
     refused = open_model(replace(flight, ekf2=replace(flight.ekf2, record=older)))
     assert isinstance(refused, Unavailable)
-    assert "the movement of vision" in refused.reason
+    assert "relative vision positions" in refused.reason
 
 
-def test_the_walk_has_a_step_of_vision_and_findings_stay_with_the_source() -> None:
+def test_steps_contain_vision_and_causes_only_kf() -> None:
     found = walk.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]
-        assert names.index(walk.SPEED) < names.index(walk.VISION) < names.index(walk.GATE)
+        assert (
+            names.index(walk.VELOCITY_STEP) < names.index(walk.VISION_STEP) < names.index(walk.GATE)
+        )
         assert why.position_left_share < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
-        assert min(moved_m[walk.SPEED], moved_m[walk.VISION]) > 0.05
+        assert min(moved_m[walk.VELOCITY_STEP], moved_m[walk.VISION_STEP]) > 0.05
     analysis = explain(compare(flown(), Settings(0.27, 0.4)))
-    # what vision's noise is, is no word on that of the fixes
+    # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"
-    assert {one.filter for one in analysis.causes} == {"kf"}
-    assert not [one for one in find(analysis) if "EKF2_GPS_P_NOISE" in one.remedy]
+    assert {cause.filter for cause in analysis.causes} == {"kf"}
+    assert not [item for item in find(analysis) if "EKF2_GPS_P_NOISE" in item.remedy]

@@ -71,7 +71,7 @@ class WithMistakes(click.Command):
                 [
                     (
                         f"{name}{mistake.usage}",
-                        mistake.help + (f" [{mistake.usual:g}]" if mistake.sizes else ""),
+                        mistake.help + (f" [{mistake.default:g}]" if mistake.sizes else ""),
                     )
                     for name, mistake in MISTAKES.items()
                 ]

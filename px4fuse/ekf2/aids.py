@@ -1,7 +1,7 @@
-"""Every aid of EKF2 judged by its own innovations: was it fused, and does S say how large they are.
+"""Consistency of each EKF2 aid, tested with its logged innovations.
 
-Definitions as in :mod:`px4fuse.filter.consistency`; what PX4 logs and where it misleads: PX4's
-``EKF/aid_sources`` and ``EKF/ekf_helper.cpp``, v1.13 to main.
+Definitions: :mod:`px4fuse.filter.consistency`. Logged fields: PX4's ``EKF/aid_sources`` and
+``EKF/ekf_helper.cpp``, v1.13 to main.
 """
 
 import math
@@ -26,11 +26,11 @@ AidVerdict = Literal[
     "idle",
     "too few samples",
 ]
-# An aid pulls EKF2 to one side where the mean is half of what the innovations are, root mean
-# square, and a fifth of √S: then averaging does not take it away, and EKF2 follows
+# Limits for a biased aid: |mean ν| / RMS ν, and |mean ν| / √S. Above both, the mean does not
+# average out and EKF2 follows it
 MIN_BIAS_SHARE, MIN_BIAS_IN_SIGMA = 0.5, 0.2
-# A change in flight: in windows of so many seconds the mean moves by half of √S, and by six times
-# what those before scatter
+# Change of mean ν/√S in flight: window length (s), minimum samples per window, windows before the
+# change, minimum change in √S, minimum change over the scatter of the earlier window means
 WINDOW_S, IN_WINDOW, WINDOWS_BEFORE, MIN_CHANGE_IN_SIGMA, MIN_CHANGE_SCATTER_RATIO = (
     10.0,
     5,
@@ -38,35 +38,35 @@ WINDOW_S, IN_WINDOW, WINDOWS_BEFORE, MIN_CHANGE_IN_SIGMA, MIN_CHANGE_SCATTER_RAT
     0.5,
     6.0,
 )
-# Longest time (s) without a sample fused while EKF2 means to fuse it. EKF2 itself resets to an aid
-# after 7 s (reset_timeout_max); rates of 2 Hz are the slowest of the default profile
+# s; limit of the time without a fused sample while the aid is enabled. EKF2 resets to an aid after
+# 7 s (reset_timeout_max). The default logging profile records at least 2 Hz
 NOT_FUSED_LIMIT_S = 5.0
-NOT_FUSED_INTERVALS = 10.0  # of its samples that were logged
-# Within this of a parameter, R is formed by it
+NOT_FUSED_INTERVALS = 10.0  # the same limit in intervals between logged fused samples
+# relative difference below which √R counts as equal to a noise parameter
 NOISE_TOLERANCE = 0.02
-# Height (m) from which a flight is judged, of low ones half of the highest: below, the rotors' wash
-# moves the barometer, and motors that run on the ground count as flight for the land detector
+# m above ground from which aids are evaluated; for low flights half of the maximum height. Below,
+# rotor downwash disturbs the barometer, and the land detector may report flight on the ground
 MIN_HEIGHT_M = 2.0
 
 
 class AidAxis(Record, frozen=True, kw_only=True):
-    """Innovations of one aid along one axis, in the aid's unit.
+    """Innovation statistics of one aid along one axis, in the unit of the aid.
 
     Attributes
     ----------
     samples : int
-        Innovations judged: fused, or rejected while meant to be fused.
+        Fused samples and those rejected while the aid was enabled.
     innovation_mean, innovation_std : float
     s_sqrt_median : float
         Median of √S.
     nis_mean, nis_band, sigma_factor
-        As :class:`~px4fuse.filter.consistency.NisVerdict` has them.
+        As in :class:`~px4fuse.filter.consistency.NisVerdict`.
     rejected_share : float
-        Outside the gate along this axis.
+        Share of samples outside the gate along this axis.
     lag1_autocorrelation, ljung_box_p, bias_p : float
-        As :class:`~px4fuse.filter.consistency.Consistency` has them.
+        As in :class:`~px4fuse.filter.consistency.Consistency`.
     change : (float, float) or None
-        When (s), and by how many √S, its mean moved farthest in flight, where it clearly did.
+        Time (s) and size (√S) of the largest significant change of the mean in flight.
     """
 
     samples: Count
@@ -84,38 +84,37 @@ class AidAxis(Record, frozen=True, kw_only=True):
 
     @property
     def mean_normalised_innovation(self) -> float:
-        """Mean innovation over √S: how far the aid pulls EKF2, and to which side."""
+        """Mean innovation divided by the median √S; the sign is that of the innovation."""
         return self.innovation_mean / self.s_sqrt_median
 
 
 class AidResult(Record, frozen=True, kw_only=True):
-    """What EKF2 did with one aid in flight, and whether its variance was right.
+    """Fusion and consistency of one aid in flight.
 
     Attributes
     ----------
     label, unit, topic : str
     intended_share : float or None
-        Of the flight, meant to be fused; None where the log does not tell.
+        Share of the flight in which EKF2 enabled the aid; None if not logged.
     fused_share : float
-        Of the samples while it was meant.
+        Share of the samples received while enabled.
     fused_logged : bool
-        Whether the log tells of each sample if it was fused; else the gate was applied here.
+        True if the log states for each sample if it was fused; False if the gate is applied here.
     rejected_share : float
-        Of the samples while it was meant, by any axis.
+        Share of the samples received while enabled that were rejected along any axis.
     longest_without_s : (float, float)
-        From when to when was the longest time without a fused sample that began while it was
-        meant to be fused.
+        Start and end of the longest time without a fused sample that began while enabled.
     resets : int
-        Times that EKF2 took the aid's value as its own; these rows are not judged.
+        Resets of EKF2 to the aid; these samples are excluded.
     gate : float
-        In standard deviations.
+        In √S.
     noise : float or None
-        Median of √R, where R is logged.
+        Median √R; None if R is not logged.
     noise_from : str
-        What set it: a parameter's name, or what is reported; empty where R is not logged.
+        Origin of R: a parameter name, or the reported accuracy; empty if R is not logged.
     verdict : str
     axes : mapping from axis to AidAxis
-        Empty where there are too few samples.
+        Empty if there are too few samples.
     """
 
     label: str
@@ -135,25 +134,25 @@ class AidResult(Record, frozen=True, kw_only=True):
 
     @property
     def longest_without(self) -> float:
-        """How long (s) the longest time without a fused sample was."""
+        """Longest time without a fused sample (s)."""
         return self.longest_without_s[1] - self.longest_without_s[0]
 
     @property
     def is_bad(self) -> bool:
-        """Whether EKF2 went without it, is misled by it or trusts it too much.
+        """Return True for an aid that is not fused although enabled, biased or overconfident.
 
-        One that is overstated is no fault: stock settings are.
+        An underconfident aid is not a fault: PX4's default settings are underconfident.
         """
         return self.verdict in ("starved", "biased", "variance understated")
 
     @property
     def nis_mean(self) -> float:
-        """Mean NIS of all axes (NaN without any)."""
+        """Mean NIS over all axes; NaN without axes."""
         return _mean_nis(self.axes)
 
 
 def flight_span(flight: Flight) -> tuple[float, float] | Unavailable:
-    """When the vehicle flew (s), away from the ground where its height is known."""
+    """Return start and end of the flight (s), without the parts close to the ground."""
     if isinstance(flight.airborne, Unavailable):
         return 0.0, flight.log.duration_s
     if not flight.airborne:
@@ -169,19 +168,19 @@ def flight_span(flight: Flight) -> tuple[float, float] | Unavailable:
 
 
 def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
-    """Judge everything that EKF2 could fuse, in flight.
+    """Evaluate all logged aids of EKF2 in flight.
 
     Returns
     -------
-    mapping from PX4's name to AidResult, in the order of :data:`~px4fuse.ekf2_parameters.AIDS`; or
-    Unavailable without EKF2, without innovations, or without a flight.
+    mapping from PX4's name to AidResult, in the order of :data:`~px4fuse.ekf2_parameters.AIDS`;
+    or Unavailable without EKF2, without innovations, or without a flight.
     """
     if isinstance(flight.ekf2, Unavailable):
         return flight.ekf2
     if not flight.ekf2.aids:
         return Unavailable(
             "EKF2 aids",
-            ("no estimator_aid_src topic, estimator_innovations or ekf2_innovations in flight"),
+            "no estimator_aid_src topic, estimator_innovations or ekf2_innovations in flight",
             "Record a ULog with SDLOG_PROFILE bit 0 (default).",
         )
     span = flight_span(flight)
@@ -215,7 +214,7 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
     if fused_logged:
         fused, rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
-        # after a reset to the aid the row says innovation 0 and S = R
+        # after a reset to the aid, EKF2 logs innovation 0 and S = R
         reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
         noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
     else:
@@ -266,9 +265,11 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
 
 
 def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
-    """From which window on the mean of ν/√S is farthest from all before, in the two after; how far.
+    """Return time (s) and size (√S) of the largest significant change of mean ν/√S, or None.
 
-    The window in between counts where it has moved by a third of that.
+    Compares the mean of the two windows after each candidate window with the mean of all windows
+    before. The change begins in the candidate window if its mean has moved by a third of the
+    change.
     """
     window = np.floor((time_s - time_s[0]) / WINDOW_S)
     window_statistics = (
@@ -300,7 +301,7 @@ def _fraction(selected: BoolArray, whole_set: BoolArray) -> float:
 
 
 def _gate_in_force(aid: Aid, log: AidLog) -> float:
-    """The gate in force: as the log's test ratios have it, or else by its parameter."""
+    """Return the gate in √S, from the logged test ratios or else from the parameter."""
     axis = log.axes[0]
     if f"ratio_{axis}" in log.samples:
         evaluated = log.samples[log.samples[f"ratio_{axis}"] > 0.0]
@@ -311,23 +312,24 @@ def _gate_in_force(aid: Aid, log: AidLog) -> float:
 
 
 def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
-    """What set R: the parameter where they are alike (or R is its root), else what is reported."""
+    """Return the parameter that R is derived from, or the reported accuracy."""
     value = log.parameters.get(aid.noise)
     if noise is None or value is None:
         return "" if noise is None else aid.reported
-    for expected in (value, 1.5 * value, np.sqrt(value)):  # the factor of GNSS heights
+    # EKF2 multiplies the noise of GNSS heights by 1.5
+    for expected in (value, 1.5 * value, np.sqrt(value)):
         if abs(noise - expected) <= NOISE_TOLERANCE * expected:
             return aid.noise
     return aid.reported or aid.noise
 
 
 def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, end_s: float) -> Span:
-    """Longest time without a fused sample, of those that begin while it was meant to be fused."""
+    """Return the longest time (s) without a fused sample that began while the aid was enabled."""
     ends = np.concatenate([[start_s], times[fused], [end_s]])
     starts = ends[:-1]
     enabled = np.ones(len(starts), bool)
     if log.enabled is not None:
-        # an aid that is given up when its last sample was fused is no longer meant a second later
+        # EKF2 disables an aid up to 1 s after its last fused sample
         enabled = step_values_at(log.enabled, pd.Index(starts + 1.0)) > 0.0
     longest = int(np.argmax(np.diff(ends) * enabled))
     if not enabled[longest]:
@@ -336,7 +338,7 @@ def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, en
 
 
 def _verdict(axes: dict[str, AidAxis], longest_without: float, fused_s: Array) -> AidVerdict:
-    # rows that EKF2's aids share are thinned, and zero where they fell between two samples
+    # the older topics repeat samples at a reduced rate and contain zeros between fusions
     interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
     if longest_without > max(NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s):
         return "starved"

@@ -1,4 +1,4 @@
-"""The offset of a sensor from EKF2's reference, which EKF2 estimates beside its filter.
+"""Bias of a sensor relative to EKF2's reference, as EKF2 estimates it besides its filter.
 
 Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.15
 ``EKF/bias_estimator.cpp``).
@@ -8,63 +8,66 @@ import numpy as np
 
 from px4fuse.arrays import Array, BoolArray
 
-# Of the bias: noise density (m/s/√Hz; bias_nsd, common.h), least variance, least one of a
-# measurement, gate; where innovations keep to one side its noise is raised (isOffsetDetected)
+# m/s/√Hz, random walk of the bias (bias_nsd, common.h); m², lower limits of the variances of bias
+# and measurement; gate in √S
 BIAS_DENSITY, MIN_VARIANCE_M2, MIN_NOISE_M2, BIAS_GATE = 0.13, 1e-8, 1e-4, 3.0
-MAX_ONE_SIDED, NOISE_FACTOR, FILTER_S = 0.2, 1e3, 10.0
+# Mean signed test ratio above which the random walk is increased (isOffsetDetected), the factor on
+# its variance, and the averaging time (s)
+MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, FILTER_S = 0.2, 1e3, 10.0
 
 
 class BiasEstimator:
-    """The bias of one sensor in S variants, sample by sample.
+    """Bias of one sensor in S filter variants, updated with each sample.
 
     Parameters
     ----------
     value_m, variance_m2 : ndarray, shape (S,) or (S, k)
-        What is added to innovations, and its variance.
+        Initial bias, added to innovations, and its variance.
     start_s : float
     step_s : float
-        Of a prediction.
+        Prediction step of EKF2.
     """
 
     def __init__(self, value_m: Array, variance_m2: Array, start_s: float, step_s: float) -> None:
         self.value_m, self.variance_m2 = value_m, variance_m2
-        self.one_sided, self.last_s = np.zeros_like(value_m), np.full_like(value_m, start_s)
-        self.share = step_s / (FILTER_S + step_s)
+        self.mean_signed_ratio, self.last_s = np.zeros_like(value_m), np.full_like(value_m, start_s)
+        self.filter_weight = step_s / (FILTER_S + step_s)
 
     def remove_bias(
         self,
         nu: Array,
-        spread: Array,
+        predicted_variance: Array,
         noise_m2: Array,
         time_s: Array,
         has_sample: BoolArray,
         learning: BoolArray,
         weight: float = 1.0,
     ) -> tuple[Array, Array]:
-        """Innovation and R with the bias as it was, which learns of them before they are fused.
+        """Return innovation and R with the current bias, then update the bias.
 
         Parameters
         ----------
-        nu, spread, noise_m2 : ndarray
-            Innovation without a bias, HPH' and R.
+        nu, predicted_variance, noise_m2 : ndarray
+            Innovation without bias, HPH' and R.
         time_s, has_sample, learning : ndarray
-            Time of the sample, whether there is one, and whether the bias learns of it.
+            Sample time, True for variants with a sample, True for variants that update the bias.
         weight : float
-            Samples that EKF2 had for it.
+            Number of samples of EKF2 that the logged sample represents.
         """
         is_learning, bounded_noise = has_sample & learning, np.maximum(noise_m2, MIN_NOISE_M2)
-        raised = np.where(np.abs(self.one_sided) > MAX_ONE_SIDED, NOISE_FACTOR, 1.0)
+        raised = np.where(np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, 1.0)
         variance_growth = BIAS_DENSITY**2 * (time_s - self.last_s) * raised * is_learning
         variance = np.minimum(self.variance_m2 + variance_growth, bounded_noise)
         nu, R = nu + self.value_m, noise_m2 + variance
-        S = variance + np.maximum((noise_m2 + spread) / weight, MIN_NOISE_M2)
+        S = variance + np.maximum((noise_m2 + predicted_variance) / weight, MIN_NOISE_M2)
         ratio = nu * nu / (BIAS_GATE**2 * S)
         K = variance / S * (is_learning & (ratio < 1.0))
         self.value_m = self.value_m - K * nu
         self.variance_m2 = np.maximum(variance * (1.0 - K), MIN_VARIANCE_M2)
         signed = np.minimum(ratio, 1.0) * np.sign(-nu)
-        self.one_sided = self.one_sided + self.share * weight * is_learning * (
-            signed - self.one_sided
+        self.mean_signed_ratio = (
+            self.mean_signed_ratio
+            + self.filter_weight * weight * is_learning * (signed - self.mean_signed_ratio)
         )
         self.last_s = np.where(has_sample, time_s, self.last_s)
         return nu, R

@@ -1,11 +1,11 @@
-"""The earth as EKF2 takes it: how it turns, and the radii by which metres become degrees.
+"""Earth rotation rate and curvature radii as used by EKF2.
 
-From v1.16 on EKF2 keeps latitude and longitude, and moves and measures them by radii of curvature,
-while what PX4 publishes in metres, as every track here, is by a sphere.
+From v1.16 on EKF2 stores latitude and longitude and converts with curvature radii, while positions
+in metres are published on a sphere.
 
-Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature: that of the
-meridian is by q to the power of 2.5, where the ellipsoid has 1.5), ``EKF/ekf_helper.cpp``
-(calcEarthRateNED), ``EKF/ekf.cpp`` (predictState).
+Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature; its meridian
+radius uses q to the power 2.5, an ellipsoid has 1.5), ``EKF/ekf_helper.cpp`` (calcEarthRateNED),
+``EKF/ekf.cpp`` (predictState).
 """
 
 import numpy as np
@@ -14,22 +14,24 @@ from px4fuse.arrays import Array
 from px4fuse.flight import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 
-SPIN_RAD_S = 7.292115e-5
-EQUATOR_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
+EARTH_RATE_RAD_S = 7.292115e-5
+EQUATORIAL_RADIUS_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
 
 
 def earth_rate_rad_s(record: FusionRecord) -> Array:
-    """Rate at which EKF2 takes the earth to turn, NED, shape (3,); 0 where it knows no latitude."""
+    """Return the earth rotation rate in EKF2 (rad/s, NED, shape (3,)); 0 without a latitude."""
     latitude = np.radians(record.latitude_deg)
-    return np.nan_to_num(SPIN_RAD_S * np.array([np.cos(latitude), 0.0, -np.sin(latitude)]))
+    return np.nan_to_num(EARTH_RATE_RAD_S * np.array([np.cos(latitude), 0.0, -np.sin(latitude)]))
 
 
-def metres_of(record: FusionRecord) -> tuple[float, float, float]:
-    """EKF2's metres north, east and down in one metre of a track."""
+def ekf2_metres_per_metre(record: FusionRecord) -> tuple[float, float, float]:
+    """Return metres in EKF2's state per published metre: north, east, down."""
     if np.isnan(record.latitude_deg) or not record.keeps_latitude:
         return 1.0, 1.0, 1.0
     squared = ECCENTRICITY**2
     q = 1.0 - squared * np.sin(np.radians(record.latitude_deg)) ** 2
-    radii_m = EQUATOR_M * np.array([(1.0 - squared) / q**2.5, q**-0.5]) + record.altitude_m
+    radii_m = (
+        EQUATORIAL_RADIUS_M * np.array([(1.0 - squared) / q**2.5, q**-0.5]) + record.altitude_m
+    )
     north, east = (radii_m / EARTH_RADIUS_M).tolist()
     return north, east, 1.0

@@ -1,11 +1,12 @@
-"""Height as EKF2 fuses it: by GNSS and the barometer, with a bias of the one that is no reference.
+"""Fusion of GNSS and barometer heights in the EKF2 replay.
 
-Samples of the barometer between two events are fused at the later one, as measurements of height
-and vertical velocity then: where the vehicle was before is known from both and the IMU.
+EKF2 estimates a bias for the sensor that is not the height reference. Barometer samples between two
+events are fused at the later event; the vertical motion in between follows from the state and the
+IMU.
 
-Sources: PX4-Autopilot ``EKF/aid_sources``
-(``barometer/baro_height_control.cpp``, ``gnss/gnss_height_control.cpp``), before v1.16
-``EKF/baro_height_control.cpp`` and ``EKF/gnss_height_control.cpp``.
+Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
+``gnss/gnss_height_control.cpp``), before v1.16 ``EKF/baro_height_control.cpp`` and
+``EKF/gnss_height_control.cpp``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,41 +30,42 @@ from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_value
 SPEED_DOWN, DOWN = 5, 8
 SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHTS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
-DEAD_ZONE_M = 4.0  # EKF2_GND_EFF_DZ
-REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # EKF2_HGT_REF
-# Biases are logged twice a second
+DEAD_ZONE_M = 4.0  # m; default of EKF2_GND_EFF_DZ
+REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # values of EKF2_HGT_REF
+# s; height biases are logged at 2 Hz
 BIAS_LATE_S = 1.0
-# EKF2 has so many samples of the barometer a second, since v1.15 and before; one of fewer that are
-# in the log stands for several, down to the last rate
+# Hz; barometer rate in EKF2 from v1.15 and before, and the lowest logged rate that can be replayed.
+# One logged sample represents several if the log has fewer
 BAROMETER_HZ, OLD_BAROMETER_HZ, LEAST_HZ = 10.0, 15.0, 4.0
-MIN_GATE, MIN_SD = 1.0, 0.01  # the latter of position and height (m), and of a velocity (m/s)
+# lower limits of gates (√S) and of the noise of position (m) and velocity (m/s)
+MIN_GATE, MIN_SD = 1.0, 0.01
 
 
 def add_heights(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
 ) -> tuple[Stretch, ...] | str:
-    """The same stretches with what EKF2's height rests on, or why the log does not tell it."""
-    parameters, times = record.parameters, np.concatenate([one.time_s for one in stretches])
+    """Return the stretches with height samples, or the reason why the log is not sufficient."""
+    parameters, times = record.parameters, np.concatenate([stretch.time_s for stretch in stretches])
     if fuses_by_mask(parameters):
-        return "before PX4 v1.14 EKF2 keeps to one sensor of height"
+        return "EKF2 before PX4 v1.14 fuses only one height sensor"
     enabled = {name: log.enabled for name, log in ekf2.aids.items() if log.enabled is not None}
     enabled_shares = {
         name: float(np.mean(step_values_at(on, times) > 0.0)) for name, on in enabled.items()
     }
     fused = [aid.name for aid in SENSORS if enabled_shares.get(aid.name) == 1.0]
     if more := [aid for aid in HEIGHTS if enabled_shares.get(aid.name) and aid.name not in fused]:
-        return f"EKF2 fused {more[0].label} in a part of the flight"
+        return f"EKF2 also fused {more[0].label} in part of the flight"
     reference = REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
-    if len(fused) == 1:  # the one that there is takes its place
+    if len(fused) == 1:  # a single sensor is the reference
         (reference,) = fused
     if reference not in fused:
-        return "its reference is neither GNSS nor the barometer, as far as the log tells"
+        return "the height reference is neither GNSS nor barometer, or not logged"
     taken_s, down_m = np.zeros((2, 0))
     if BAROMETER.name in fused and flight.barometer is not None:
         taken_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
         down_m = flight.barometer["down_m"].to_numpy() + record.altitude_m
-    dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
-    dead_m = np.where(record.was_in_state(GROUND_EFFECT, taken_s), dead_zone_m, 0.0)
+    effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
+    dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, taken_s), effect_height_m, 0.0)
     ekf2_rate_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
     new_stretches, delayed = [], record.delayed["down_m"]
     for stretch in stretches:
@@ -74,15 +76,15 @@ def add_heights(
                 logged_bias is None
                 or not logged_bias.index[0] - BIAS_LATE_S < start_s < logged_bias.index[-1]
             ):
-                return f"the log does not hold EKF2's bias of the {AIDS[other].label}"
+                return f"EKF2's bias of the {AIDS[other].label} is not logged"
             value, variance = (
                 np.interp(start_s, logged_bias.index, logged_bias[name]) for name in logged_bias
             )
             bias = float(value), float(variance)
-        samples = samples_inside(stretch, taken_s, down_m, dead_m)
+        samples = barometer_samples_inside(stretch, taken_s, down_m, dead_zone_m)
         rate_hz = len(samples[0]) / float(stretch.time_s[-1] - start_s)
         if BAROMETER.name in fused and rate_hz < LEAST_HZ:
-            return f"the log holds {rate_hz:.1f} samples of the barometer a second"
+            return f"the barometer is logged at {rate_hz:.1f} Hz"
         weight = max(ekf2_rate_hz / rate_hz, 1.0) if rate_hz else 1.0
         state = stretch.state.copy()
         state[DOWN] = np.interp(start_s, delayed.index, delayed)
@@ -91,23 +93,24 @@ def add_heights(
     return tuple(new_stretches)
 
 
-def samples_inside(
-    stretch: Stretch, taken_s: Array, down_m: Array, dead_m: Array
+def barometer_samples_inside(
+    stretch: Stretch, taken_s: Array, down_m: Array, dead_zone_m: Array
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Samples of the barometer in a stretch, behind the step at the end of which each is taken."""
+    """Return the barometer samples inside a stretch, preceded by the prediction step of each."""
     step, is_inside = sample_steps(stretch, taken_s)
-    return step, taken_s[is_inside], down_m[is_inside], dead_m[is_inside]
+    return step, taken_s[is_inside], down_m[is_inside], dead_zone_m[is_inside]
 
 
 def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]:
-    """Samples by the event at which they are fused, for several sets of events by their steps.
+    """Return barometer samples by fusion event, one array per set of event steps.
 
-    Each of shape (5, k, E), for the k that come in one interval at most: height at the event, as if
-    the vehicle had stood still since, age then, time, dead zone, and 1; all 0 where there is none.
+    Each array has shape (5, k, E), with k the maximum number of samples in one interval. Rows:
+    height at the event without the motion of the state (m, down), sample age (s), sample time (s),
+    dead zone (m), and 1; all 0 without a sample.
     """
     heights = stretch.heights
     assert heights is not None
-    sample_columns = heights.down_m[:, None], slice(2, 3), heights.taken_s, heights.dead_m
+    sample_columns = heights.down_m[:, None], slice(2, 3), heights.taken_s, heights.dead_zone_m
     return pad_samples(
         [
             samples_by_event(stretch, event_steps, heights.step, *sample_columns)
@@ -117,25 +120,26 @@ def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]
 
 
 class HeightFilter:
-    """The heights of S variants through one stretch, event by event.
+    """Height fusion of S variants through one stretch, event by event.
 
     Parameters
     ----------
     stretch : Stretch
     barometer : ndarray, shape (5, k, E, S) or (5, k, E, 1)
-        As :func:`barometer_samples` has them.
-    fix_s, fixed : ndarray, shape (E, S) or (E, 1)
-        When the fix of each event was measured, and whether there is one.
-    on : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
-        Whether it is still there.
-    knob : mapping from PX4's name to ndarray, shape (S,)
+        From :func:`barometer_samples`.
+    fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
+        Measurement time of the GNSS fix of each event; True if there is a fix.
+    enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
+        True while the aid is fused.
+    parameters : mapping from PX4's name to ndarray, shape (S,)
     gated : ndarray of bool, shape (S,)
+        True for variants that apply the gate.
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k + 1, 3, S)
-        Of the barometer's samples and of GNSS at each event: innovation (m, measurement minus
-        state), its variance, and whether it was fused.
+        For the barometer samples and GNSS at each event: innovation (m, measurement minus state),
+        its variance (m²), and 1 if fused.
     """
 
     def __init__(
@@ -143,44 +147,44 @@ class HeightFilter:
         stretch: Stretch,
         barometer: Array,
         fix_s: Array,
-        fixed: BoolArray,
-        on: Mapping[str, BoolArray],
-        knob: Mapping[str, Array],
+        has_fix: BoolArray,
+        enabled: Mapping[str, BoolArray],
+        parameters: Mapping[str, Array],
         gated: BoolArray,
     ) -> None:
         heights, size = stretch.heights, len(gated)
         assert heights is not None
         self.fused = heights.fused
-        self.down_m, self.age_s, taken_s, self.dead_m, there = barometer
+        self.down_m, self.age_s, taken_s, self.dead_zone_m, is_sample = barometer
         self.time_s = [*taken_s, fix_s]
         self.update_log = np.full((len(fix_s), len(self.time_s), 3, size), np.nan)
-        fixed = fixed & on[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
-        self.has_sample = [*((there > 0.0) & on[BAROMETER.name]), fixed]
+        has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
+        self.has_sample = [*((is_sample > 0.0) & enabled[BAROMETER.name]), has_fix]
         self.any = [np.any(each, axis=1).tolist() for each in self.has_sample]
-        self.near = self.dead_m.any(axis=2)
-        gates = [np.maximum(knob.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
+        self.in_ground_effect = self.dead_zone_m.any(axis=2)
+        gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
         self.gate2 = [np.where(gated, gate**2, np.inf) for gate in gates]
-        self.noise_m2 = np.maximum(knob.get(BAROMETER.noise, MIN_SD), MIN_SD) ** 2
+        self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SD), MIN_SD) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
-        self.weight, self.learning = (heights.weight, 1.0), on[heights.reference]
+        self.weight, self.learning = (heights.weight, 1.0), enabled[heights.reference]
         value_m, variance_m2 = (np.full(size, part) for part in heights.bias)
         start_s, step_s = float(stretch.time_s[0]), float(np.median(stretch.step_s))
         self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)
 
     def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
-        """What one variant did with each sample of a sensor; ``end_s`` is the time of each event.
+        """Return the updates of one variant with a sensor; ``end_s`` is the time of each event.
 
-        By the time of measurement as EKF2 takes it.
+        The index is the measurement time in EKF2.
         """
         rows, slots = [], len(self.down_m)
-        for place in [slots] if sensor == GNSS_HGT.name else range(slots):
-            times, has_sample = self.time_s[place], self.has_sample[place][:, variant]
+        for slot in [slots] if sensor == GNSS_HGT.name else range(slots):
+            times, has_sample = self.time_s[slot], self.has_sample[slot][:, variant]
             measured_s = times[has_sample, min(variant, times.shape[1] - 1)]
             rows.append(
                 np.vstack(
                     [
                         measured_s,
-                        self.update_log[has_sample, place, :, variant].T,
+                        self.update_log[has_sample, slot, :, variant].T,
                         end_s[has_sample],
                     ]
                 )
@@ -193,14 +197,17 @@ class HeightFilter:
     def fuse(
         self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array
     ) -> tuple[Array, Array]:
-        """State and covariance after both at one event; height of GNSS and its R are given."""
-        for place in range(len(self.down_m)):
-            if self.any[place][e]:
-                age_s = self.age_s[place, e]
+        """Return state and covariance after fusing both heights at one event.
+
+        ``gnss_m`` and ``gnss_m2`` are the GNSS height (m, down) and its R.
+        """
+        for slot in range(len(self.down_m)):
+            if self.any[slot][e]:
+                age_s = self.age_s[slot, e]
                 column = P[:, :, DOWN] - age_s[:, None] * P[:, :, SPEED_DOWN]
                 spread = column[:, DOWN] - age_s * column[:, SPEED_DOWN]
-                nu = self.down_m[place, e] - x[:, DOWN] + age_s * x[:, SPEED_DOWN]
-                x, P = self._fuse_innovation(e, place, 0, x, P, column, spread, nu, self.noise_m2)
+                nu = self.down_m[slot, e] - x[:, DOWN] + age_s * x[:, SPEED_DOWN]
+                x, P = self._fuse_innovation(e, slot, 0, x, P, column, spread, nu, self.noise_m2)
         if self.any[-1][e]:
             column, nu = P[:, :, DOWN], gnss_m - x[:, DOWN]
             x, P = self._fuse_innovation(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
@@ -209,8 +216,8 @@ class HeightFilter:
     def _fuse_innovation(
         self,
         e: int,
-        place: int,
-        at: int,
+        slot: int,
+        sensor_index: int,
         x: Array,
         P: Array,
         column: Array,
@@ -218,16 +225,16 @@ class HeightFilter:
         nu: Array,
         R: Array,
     ) -> tuple[Array, Array]:
-        """Fuse an innovation; ``column`` is PH', ``spread`` HPH'."""
-        if self.biased[at]:
-            has_sample, time_s = self.has_sample[place][e], self.time_s[place][e]
+        """Fuse one innovation with the gain ``column`` (PH') and its variance ``spread`` (HPH')."""
+        if self.biased[sensor_index]:
+            has_sample, time_s = self.has_sample[slot][e], self.time_s[slot][e]
             nu, R = self.bias.remove_bias(
-                nu, spread, R, time_s, has_sample, self.learning[e], self.weight[at]
+                nu, spread, R, time_s, has_sample, self.learning[e], self.weight[sensor_index]
             )
-        if at == 0 and self.near[place, e]:
-            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_m[place, e], 0.0), nu)
+        if sensor_index == 0 and self.in_ground_effect[slot, e]:
+            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
         S = spread + R
-        is_fused = self.has_sample[place][e] & (nu * nu <= self.gate2[at] * S)
-        self.update_log[e, place] = nu, S, is_fused
-        K = column * (is_fused / (spread + R / self.weight[at]))[:, None]
+        is_fused = self.has_sample[slot][e] & (nu * nu <= self.gate2[sensor_index] * S)
+        self.update_log[e, slot] = nu, S, is_fused
+        K = column * (is_fused / (spread + R / self.weight[sensor_index]))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]

@@ -1,4 +1,4 @@
-"""Flight → what the model of EKF2 runs on, or why its log cannot carry the model.
+"""Inputs of the EKF2 replay from a flight, or the reason why the log is not sufficient.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` and, before v1.15,
 ``EKF/ev_pos_control.cpp`` (frames), ``logged_topics.cpp`` (logging rates).
@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import one_line_repr
-from px4fuse.ekf2.earth import metres_of
+from px4fuse.ekf2.earth import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.output_predictor import corrections
@@ -48,24 +48,24 @@ from px4fuse.readers.px4_topics import DEFAULT_PROFILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
 ANALYSIS_NAME = "EKF2 replay"
-# Where a log's EKF2 is this model (simulated flights), the log says so in these words
+# Note in simulated logs, whose EKF2 is this model
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
-# Logger limits of the topics that hold a copy of the vision samples (logged_topics.cpp)
+# s, logging interval of the topics with a copy of the vision samples (logged_topics.cpp)
 COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_ev_pos": 0.5}
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
-# The aid-source topics carry the time of measurement, as EKF2 takes it, to about a millisecond
+# s; aid-source topics contain EKF2's measurement time within about 1 ms
 SAME_SAMPLE_S = 0.006
-GNSS_VELOCITY_BIT = 4  # of EKF2_GPS_CTRL; before v1.14 both are always fused
+GNSS_VELOCITY_BIT = 4  # bit in EKF2_GPS_CTRL; before v1.14 GNSS velocity is always fused
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
-# vehicle_local_position is logged every 0.1 s
+# s; vehicle_local_position is logged every 0.1 s
 RESET_SHOWS_S = 0.2
-# Predictions of more than this lose turns and vibration inside a step; EKF2's own are 8 to 13 ms
+# s; longer steps lose rotation and vibration, EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
-# Of the IMU's samples, outside gaps: EKF2 had them
+# maximum fraction of IMU samples missing from the log outside gaps; EKF2 received them
 MAX_LOST_SHARE = 0.1
-# The first release that stamps estimator_states with the time of the horizon
+# first release whose estimator_states have the timestamp of the fusion horizon
 STAMPED_AT_HORIZON = "PX4 v1.13"
 UNLIMITED_RESETS = 1_000_000
 MAX_INTERVAL_S = 0.25
@@ -73,7 +73,7 @@ MAX_INTERVAL_S = 0.25
 
 @dataclass(frozen=True)
 class ReceivedPositions:
-    """Position samples as EKF2 received them, shape (m,) or (m, ...), in time order.
+    """Position samples as received by EKF2, in time order; shape (m,) or (m, ...).
 
     Attributes
     ----------
@@ -81,20 +81,20 @@ class ReceivedPositions:
     position_m : ndarray, shape (m, 3)
         NED.
     variance_m2 : ndarray, shape (m, 3)
-        As reported; 0 where the sender gave none.
+        As reported by the sender; 0 if not reported.
     velocity_m_s, velocity_variance_m2_s2 : ndarray, shape (m, 3), or None
-        NED, where EKF2 fuses velocity with each position.
+        NED, if EKF2 fuses velocity with each position.
     rejected : ndarray, shape (m,)
-        Whether EKF2's gate rejected it, 1 or 0; NaN where the log does not tell.
+        1 if the gate of EKF2 rejected it, else 0; NaN if not logged.
     reset : ndarray of bool, shape (m,)
-        Whether EKF2 reset its position to it, where the log tells what it rejected.
+        True if EKF2 reset its position to it, if rejections are logged.
     source : str
         Name of the track.
     own_times : bool
-        Whether EKF2 takes the sender's times of measurement as they are, whatever the delay.
+        True if EKF2 uses the measurement times of the sender instead of the delay parameter.
     moved_m : ndarray, shape (m, 2), or None
-        By how much EKF2 moved its position to each, north and east, as far as what is published
-        tells; where it rejects some, and the log does not tell of each.
+        Position correction of EKF2 at each sample (m, north and east), estimated from the published
+        position. Only if some rejections are not logged.
     """
 
     stamp_s: Array
@@ -114,27 +114,28 @@ class ReceivedPositions:
 
 @dataclass(frozen=True)
 class FusionRules:
-    """What decides when EKF2 starts, stops and resets horizontal position, by release.
+    """Release-dependent rules for start, stop and reset of the horizontal position.
 
     Attributes
     ----------
     start_interval_s : float
-        Fusion starts on a sample that follows the one before it within this.
+        Fusion starts on a sample at most this long after the previous one.
     stop_s : float
         Fusion stops after this time without a sample.
     reset_s : float
         The position is reset to the sample after this time of rejections.
     resets : int
-        So many resets in a row, then fusion stops until a sample on which it may start.
+        Resets in a row, after which fusion stops until a sample on which it may start.
     reset_scale : float
-        Variance of the position after a reset, in that of the sample.
+        Position variance after a reset over the variance of the sample.
     with_velocity : bool
-        Whether velocity is reset with the position: when both, or for twice the time the position,
-        were rejected.
+        True if velocity is reset with position: when both were rejected for ``reset_s``, or
+        position for twice as long.
     bias_floor : float or None
-        Least variance of the accelerometer's bias (m²/s⁴), where the release has one.
+        Lower limit of the accelerometer bias variance (m²/s⁴), if the release has one.
     horizon_by_delay : bool
-        Whether the longest delay makes the horizon; else EKF2_DELAY_MAX does (from v1.15).
+        True if the largest delay parameter sets the fusion horizon; else EKF2_DELAY_MAX (from
+        v1.15).
     """
 
     start_interval_s: float
@@ -149,33 +150,33 @@ class FusionRules:
 
 @dataclass(frozen=True)
 class Inputs:
-    """All that the model needs of a flight.
+    """All inputs that the EKF2 replay needs of a flight.
 
     Attributes
     ----------
     settings : dict
-        The model's parameters as flown, by PX4 name.
+        Logged values of the parameters in the model, by PX4 name.
     stretches : tuple of Stretch
-    received : Received
+    received : ReceivedPositions
     aid : Aid
-        What EKF2 fused them as.
-    rules : Rules
+        Aid as which EKF2 fused the positions.
+    rules : FusionRules
     step_s : float
         Average prediction step.
     horizon_s : float
-        How far the fusion runs behind the output.
+        Age of the fusion horizon.
     predict_s : float
         EKF2_PREDICT_US.
     vision_height : bool
-        Whether EKF2 took its height from vision.
+        True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
         EKF2_IMU_POS, body FRD.
     max_interval_s : float
-        Height and heading are measured at least this often where vision is silent.
-    vision : Received or None
-        Positions of external vision that EKF2 fuses besides GNSS; NaN while it does without.
-    imposed : str
-        On GNSS, why the height is EKF2's own as flown; empty where it is fused.
+        Largest interval between height and heading measurements in a gap of the source.
+    vision : ReceivedPositions or None
+        External vision fused besides GNSS; NaN while disabled.
+    height_reason : str
+        Reason why the logged EKF2 height is used on GNSS; empty if heights are fused.
     """
 
     settings: dict[str, float]
@@ -189,23 +190,23 @@ class Inputs:
     imu_offset_m: Array
     aid: Aid = EV_POS
     max_interval_s: float = MAX_INTERVAL_S
-    imposed: str = ""
+    height_reason: str = ""
     vision: ReceivedPositions | None = None
 
     __repr__ = one_line_repr
 
 
-def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
+def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     flight: Flight, doubtful: Mapping[str, str] = MappingProxyType({})
 ) -> Inputs | Unavailable:
-    """What the model runs on, or why the log cannot carry it.
+    """Return the inputs of the replay, or the reason why the log is not sufficient.
 
     Parameters
     ----------
     flight : Flight
     doubtful : mapping from PX4's name of an aid to str
-        Why the height is to be EKF2's own as flown, why optical flow alone carries nothing, and why
-        vision besides GNSS is to be left out.
+        Aids whose replay disagrees with the log, with the reason. For a height sensor the logged
+        EKF2 height is used; optical flow does not bridge gaps; vision besides GNSS is not fused.
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):
@@ -221,7 +222,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
     record, horizon_s = ekf2.record, ekf2.horizon_s
     if isinstance(record, Unavailable):
         return record
-    if MODEL_NOTE in flight.log.notes:  # whose earth is a sphere that does not turn
+    if MODEL_NOTE in flight.log.notes:  # the simulated earth is a sphere without rotation
         record = replace(record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
@@ -230,10 +231,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
         fused, off = ("GNSS", "") if gnss else ("vision position", f", {GNSS_POS.switch} 0")
         return Unavailable(
             "EKF2 replay",
-            (
-                f"EKF2 fused horizontal aids besides {fused} that the model does not contain "
-                f"({', '.join(more)})"
-            ),
+            f"EKF2 fused horizontal aids besides {fused} that the model does not contain "
+            f"({', '.join(more)})",
             f"Fly with EKF2_OF_CTRL 0{off} and without bit 2 of {EV_POS.switch}.",
         )
     if missing := _missing_imu(imu.index.to_numpy()):
@@ -255,13 +254,13 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
     )
     if isinstance(vision, Unavailable):
         return vision
-    # since v1.17 each receiver has its own, which its messages carry
+    # since v1.17 each receiver has its lever arm, logged in its messages
     track = _gnss_track(flight) if gnss else None
     place = {} if track is None else dict(zip(aid.place, track.lever_arm_m, strict=True))
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        horizon_s = 0.0  # a buffer of one step: EKF2_EV_DELAY is at most EKF2_PREDICT_US
+        horizon_s = 0.0  # one-step buffer: EKF2_EV_DELAY is at most EKF2_PREDICT_US
     carrying_s, flow = position_samples.stamp_s, record.flow if gnss else record.flow.iloc[:0]
     if len(flow) and FLOW.name not in doubtful:
         carrying_s = np.union1d(carrying_s, flow.index)
@@ -270,27 +269,23 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
         fused = aid.label.removesuffix(", position")
         return Unavailable(
             "EKF2 replay",
-            (
-                f"{fused} was never fused for {MIN_STRETCH_S:g} s in flight without a gap in "
-                "it or in the IMU"
-            ),
-            (
-                "Record without dropouts (faster SD card, fewer topics) and with a steady "
-                "position source."
-            ),
+            f"{fused} was never fused for {MIN_STRETCH_S:g} s in flight without a gap in "
+            "it or in the IMU",
+            "Record without dropouts (faster SD card, fewer topics) and with a steady "
+            "position source.",
         )
     fusing = ekf2.fusing
     if len(flow):
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
         stretches = tuple(add_flow_samples(stretch, flow, gate) for stretch in stretches)
-    imposed = "; ".join(
+    height_reason = "; ".join(
         f"{AIDS[name].label}: {why}"
         for name, why in doubtful.items()
         if name not in (FLOW.name, EV_POS.name)
     )
-    if gnss and not imposed:
+    if gnss and not height_reason:
         new_stretches = add_heights(flight, ekf2, record, stretches)
-        stretches, imposed = (
+        stretches, height_reason = (
             (stretches, new_stretches) if isinstance(new_stretches, str) else (new_stretches, "")
         )
     other_aids = [EV_POS] if vision else []
@@ -310,20 +305,20 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (a reason each)
         and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
-        imposed=imposed,
+        height_reason=height_reason,
         vision=vision,
     )
 
 
 def _missing_imu(time_s: Array) -> Unavailable | None:
-    """Why IMU samples at these times are too few for predictions; None where they are not."""
+    """Return Unavailable if IMU samples at these times are too few for predictions."""
     intervals = np.diff(time_s)
     interval = float(np.median(intervals))
     if interval > MAX_IMU_INTERVAL_S:
         return Unavailable(
             "EKF2 replay",
             f"the IMU is logged at {1.0 / interval:.0f} Hz, below EKF2's prediction rate",
-            ("Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."),
+            "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
     regular_intervals = intervals[intervals <= IMU_GAP_S]
     lost_share = float((np.rint(regular_intervals / interval) - 1.0).clip(0.0).sum() / len(time_s))
@@ -339,23 +334,23 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
 
 
 def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> FusionRules:
-    """What decides on starts, stops and resets, by the release's own parameters."""
+    """Return the rules for starts, stops and resets of the release that wrote the log."""
     floor = 5e-8 / step_s**2 if record.per_step_biases else None
     by_delay = "EKF2_DELAY_MAX" not in record.parameters
     if gnss:
-        # resetHorizontalPositionTo, gps_control.cpp: from v1.16 on, which keeps latitude and
-        # longitude, with twice the variance; since main of 2026 each aid by itself
+        # resetHorizontalPositionTo, gps_control.cpp: variance doubled from v1.16 on; from main of
+        # 2026 on each aid is checked separately
         scale = 2.0 if record.keeps_latitude else 1.0
         both = GNSS_MODE not in record.parameters
         return FusionRules(np.inf, np.inf, 7.0, UNLIMITED_RESETS, floor, by_delay, scale, both)
-    # EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
+    # Limits: EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
     is_old_release = fuses_by_mask(record.parameters)
     intervals = (np.inf, 7.0, 7.0, UNLIMITED_RESETS) if is_old_release else (0.2, 0.4, 1.0, 5)
     return FusionRules(*intervals, floor, by_delay)
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:
-    """What EKF2's horizontal position rests on: external vision, or GNSS where it fused that."""
+    """Return the aid of EKF2's horizontal position: GNSS if it was fused, else external vision."""
     vision = ekf2.aids.get(EV_POS.name)
     is_vision_used = vision is not None and (vision.enabled is None or bool(vision.enabled.any()))
     has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
@@ -363,7 +358,7 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
-    """When EKF2 meant to fuse an aid; None where it never did, by what the log tells."""
+    """Return when EKF2 enabled an aid; None if never, or not logged."""
     log = ekf2.aids.get(aid.name)
     return (
         log.enabled if log is not None and log.enabled is not None and log.enabled.any() else None
@@ -375,7 +370,7 @@ def _gnss_track(flight: Flight) -> PositionTrack | None:
 
 
 def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPositions | Unavailable:
-    """The fixes that EKF2 received, as :func:`read_vision` gives positions of vision."""
+    """Return the GNSS fixes that EKF2 received, in the form of :func:`read_vision`."""
     track = _gnss_track(flight)
     if track is None or track.velocity is None:
         return Unavailable(ANALYSIS_NAME, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
@@ -388,16 +383,15 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
     samples, velocities = track.samples, track.velocity
-    if (
-        enabled := ekf2.aids[GNSS_POS.name].enabled
-    ) is not None:  # others came while EKF2 did without
+    # fixes while GNSS is disabled are not used
+    if (enabled := ekf2.aids[GNSS_POS.name].enabled) is not None:
         is_enabled = step_values_at(enabled, samples.index) > 0.0
         samples, velocities = samples[is_enabled], velocities[is_enabled]
-    # the stamp of a fix that has a time of its own is made up, so that its age is the delay
+    # add the delay to the measurement time, so that the replay subtracts it again
     flown = settings_in_force(parameters, GNSS_POS)
     flown_s = flown[GNSS_POS.delay] * 1e-3
     stamp = samples.index.to_numpy() + flown_s
-    # EKF2 believes no fix to be worse than without aiding (gps_control.cpp)
+    # m, upper limit of the GNSS position noise in EKF2 (gps_control.cpp)
     worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=worst_m**2)
     velocity = velocities[Columns.VELOCITY].to_numpy()
@@ -408,7 +402,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     return ReceivedPositions(
         stamp,
         stamp,
-        samples[Columns.POSITION].to_numpy() * metres_of(record),
+        samples[Columns.POSITION].to_numpy() * ekf2_metres_per_metre(record),
         reported_variance.to_numpy(),
         *decisions,
         track.name,
@@ -424,7 +418,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
 def _position_corrections(
     ekf2: Ekf2, measured_s: Array, rejected: Array, tau_s: float
 ) -> Array | None:
-    """By how much EKF2 moved its position to each sample; None where that tells nothing more."""
+    """Return EKF2's position correction at each sample; None if rejections are fully logged."""
     if not (rejected > 0.0).any() or np.isfinite(rejected).all():
         return None
     if isinstance(ekf2.horizon_s, Unavailable):
@@ -436,7 +430,7 @@ def _position_corrections(
     for reset in ekf2.resets:
         if reset.quantity == "position":
             position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
-    # EKF2 takes it half a step before, and the first part of what it does shows at once
+    # EKF2 uses the fix half a step earlier; its correction shows in the next published row
     before_sample_s = measured_s + ekf2.horizon_s - 1.5 * ekf2.step_s
     return corrections(times, velocity, position, before_sample_s, tau_s)
 
@@ -444,7 +438,7 @@ def _position_corrections(
 def read_vision(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable:
-    """The samples that EKF2 received, in NED, or why the log does not hold them all.
+    """Return the vision samples that EKF2 received (NED), or the reason why they are incomplete.
 
     Parameters
     ----------
@@ -452,7 +446,7 @@ def read_vision(
     ekf2 : Ekf2
     record : FusionRecord
     attitude : DataFrame
-        As published, to turn samples of a frame of their own.
+        Published attitude, to rotate samples in FRD.
     """
     track = _vision_track(flight)
     if isinstance(track, Unavailable):
@@ -468,10 +462,8 @@ def read_vision(
         if track.orientation is None:
             return Unavailable(
                 "EKF2 replay",
-                (
-                    f"{track.name} is in its own frame (FRD) and has no orientation to rotate it "
-                    "into NED"
-                ),
+                f"{track.name} is in its own frame (FRD) and has no orientation to rotate it "
+                "into NED",
                 "Send the position in NED, or with an orientation.",
             )
         published, sent = (
@@ -482,7 +474,7 @@ def read_vision(
         position = np.einsum("nij,nj->ni", turn, position)
         variance = np.einsum("nij,nj->ni", turn**2, variance)
     age = record.vision_age_s
-    arrival = np.full(len(stamp), -np.inf)  # unknown: never taken to be late
+    arrival = np.full(len(stamp), -np.inf)  # unknown: never late
     if len(age) and "vehicle_visual_odometry" in track.topics:
         arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
     decisions = _logged_decisions(ekf2, record, stamp)
@@ -492,30 +484,28 @@ def read_vision(
 def _read_vision_besides_gnss(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable | None:
-    """The samples of vision that EKF2 received besides fixes; None where it fused none."""
+    """Return the vision samples that EKF2 received besides GNSS; None if it fused none."""
     if (enabled := _enabled_log(ekf2, EV_POS)) is None:
         return None
     if fuses_by_mask(record.parameters):
         return Unavailable(
             "EKF2 replay",
-            (
-                f"{flight.log.firmware} fuses relative vision positions besides GNSS, which "
-                "the model does not contain"
-            ),
+            f"{flight.log.firmware} fuses relative vision positions besides GNSS, which "
+            "the model does not contain",
             "Use PX4 v1.14 or newer, or fly with only one of the two.",
         )
     received = read_vision(flight, ekf2, record, attitude)
     if isinstance(received, Unavailable):
         return received
     is_disabled = step_values_at(enabled, received.stamp_s) == 0.0
-    position_m = received.position_m * metres_of(record)
+    position_m = received.position_m * ekf2_metres_per_metre(record)
     return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
 
 
 def _logged_decisions(
     ekf2: Ekf2, record: FusionRecord, stamp: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
-    """What EKF2 rejected and reset to, where its aid-source topic tells, by time of measurement."""
+    """Return logged rejections and resets of each sample, matched by measurement time."""
     rejected, reset = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
     innovations, horizon_s = ekf2.innovations["north"], ekf2.horizon_s
     has_own_topic = aid_source(aid) in ekf2.innovation_topics
@@ -529,7 +519,7 @@ def _logged_decisions(
     measured_s = stamp - delay_s - 0.5 * ekf2.step_s
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
     rejected[sample_row >= 0] = innovations["rejected"].to_numpy()[sample_row[sample_row >= 0]]
-    # a reset shows in the first published sample after it, the horizon after the measurement
+    # a reset shows in the first published row after it, one horizon after the measurement
     published = measured_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         earlier_rows = np.flatnonzero((published <= reset_s) & (rejected != 0.0))
@@ -539,25 +529,25 @@ def _logged_decisions(
 
 
 def aid_source(aid: Aid) -> str:
-    """The topic that has the innovations of an aid."""
+    """Return the topic with the innovations of an aid."""
     return f"estimator_aid_src_{aid.name}"
 
 
 def same_sample(known_s: Array, wanted_s: Array) -> IntArray:
-    """Row of the sample of each time of measurement; -1 where there is none."""
+    """Return the row of the sample at each measurement time; -1 without one."""
     at = np.clip(np.searchsorted(known_s, wanted_s - SAME_SAMPLE_S), 0, len(known_s) - 1)
     return np.where(np.abs(known_s[at] - wanted_s) <= SAME_SAMPLE_S, at, -1)
 
 
 def horizontal_resets_s(ekf2: Ekf2) -> Array:
-    """When resets of EKF2's horizontal position show in what it publishes."""
+    """Return the times (s) of horizontal position resets in the published state."""
     return np.array(
-        [one.time_s for one in ekf2.resets if one.quantity == "position" and any(one.delta[:2])]
+        [r.time_s for r in ekf2.resets if r.quantity == "position" and any(r.delta[:2])]
     )
 
 
 def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
-    """The track that EKF2 received, complete."""
+    """Return the complete track that EKF2 received."""
     why = ["no vehicle_visual_odometry"]
     for track in sorted(flight.positions, key=lambda t: t.origin == POSITION_FILE):
         if track.origin.is_vision and track.origin.has_all_samples:
@@ -567,13 +557,11 @@ def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
             if interval < 0.9 * COPY_INTERVAL_S[track.name] and interval <= 0.25:
                 return track
             why.append(
-                f"{track.name} holds one sample in {interval:.2g} s, fewer than EKF2 may have fused"
+                f"{track.name} has a sample interval of {interval:.2g} s, more than EKF2 may have "
+                "received"
             )
     return Unavailable(
         "EKF2 replay",
-        f"{'; '.join(why)}",
-        (
-            "Set SDLOG_PROFILE to 129 (default and vision), or add the MAVLink "
-            "recording (--mavlink)."
-        ),
+        "; ".join(why),
+        "Set SDLOG_PROFILE to 129 (default and vision), or add the MAVLink recording (--mavlink).",
     )

@@ -1,13 +1,13 @@
-"""Intervals between position samples: how state and variance go from one to the next, made once.
+"""Intervals between position samples: state transition and process noise, computed once.
 
-Attitude and biases of what-if replays hardly differ from those of the log, so that transition and
-noise of an interval, taken about the nominal attitude, serve every setting. All intervals are made
-together, step by step from their beginnings.
+The attitude and biases of a replay with changed parameters hardly differ from the logged ones. The
+transition about the nominal attitude is therefore used for all settings. All intervals are
+integrated together, one prediction step at a time.
 
 Error state: attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity, position,
 errors of gyro bias b_g and accelerometer bias b_a. Equations as in PX4-Autopilot
 ``EKF/python/ekf_derivation/derivation.py`` (predict_covariance), ``EKF/covariance.cpp`` and
-``EKF/ekf.cpp`` (predictState); Δt the step, a = R f the specific force in NED:
+``EKF/ekf.cpp`` (predictState); Δt is the step, a = R f the specific force in NED:
 
     δθ ← δθ - R Δt δb_g            v ← v - [a]× Δt δθ - R Δt δb_a + (a + g) Δt
     p ← p + (v_before + v_after) Δt / 2
@@ -33,37 +33,37 @@ from px4fuse.ekf2.stretches import (
 )
 from px4fuse.trajectory.rotation import skew
 
-# A sample that is this much older than the horizon when it arrives is never fused
-# (RingBuffer.h, pop_first_older_than)
+# s; EKF2 never fuses a sample that arrives this long behind the fusion horizon (RingBuffer.h,
+# pop_first_older_than)
 MAX_LATE_S = 0.1
-# From this on a sample is called late: 3 cm at 1 m/s
+# s; a sample this long behind the fusion horizon counts as late (3 cm at 1 m/s)
 LATE_S = 0.03
-# What a sample does when it is fused: nothing, correct the state, or start with a reset
+# Action of a sample: none, update of the state, or start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Columns of what acts within an interval: attitude error, gyro bias and accelerometer bias at its
-# beginning, the correction of the nominal attitude, and gravity with the specific force
+# Columns of the effects within an interval: initial attitude error, gyro bias, accelerometer bias,
+# correction of the nominal attitude, and gravity plus specific force
 EFFECT_COLUMNS = 11
 TURN, INPUT = 9, 10
 
-# What happens at the end of each interval, in order of time
+# Events at the ends of the intervals, in time order
 Events = np.recarray[Any, Any]
 EVENT = np.dtype(
     [
-        ("end", np.intp),  # step after which it is
-        ("sample", np.intp),  # its position sample, -1 where there is none
-        ("action", np.intp),  # IDLE, FUSE or START
-        ("usable", bool),  # has a sample that is on time, whatever EKF2 does with it
-        ("startable", bool),  # fusion may start on it, had it stopped
-        ("late", bool),  # arrived after the horizon had passed it, and is fused late
-        ("lost", bool),  # and is never fused
-        ("time_s", float),  # of measurement as EKF2 takes it: stamp - delay - half a step
+        ("end", np.intp),  # index of the prediction step after which the event occurs
+        ("sample", np.intp),  # index of its position sample, -1 without a sample
+        ("action", np.intp),
+        ("usable", bool),  # sample received in time, fused or not
+        ("startable", bool),  # fusion may start on it after a stop
+        ("late", bool),  # arrived behind the fusion horizon, fused late
+        ("lost", bool),  # too late, never fused
+        ("time_s", float),  # s, measurement time in EKF2: timestamp - delay - half a step
     ]
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """The intervals of one stretch, each ending in one of E events.
+    """Intervals of one stretch, each ending in one of E events.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Intervals:
         With the fields of :data:`EVENT`.
     transition : ndarray, shape (E, 15, 15)
     turn, drive : ndarray, shape (E, 15)
-        What is added to the state.
+        Input to the state: by the correction of the nominal attitude, and by acceleration.
     gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
         Covariance of attitude, velocity and position added for unit noise.
     """
@@ -88,14 +88,14 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Timing:
-    """What the events depend on: age of a position at its stamp, and horizon (s)."""
+    """Age of a position at its timestamp, and fusion horizon (s)."""
 
     delay_s: float
     horizon_s: float
 
 
 def make_intervals(inputs: Inputs, stretch: Stretch, timing: Timing) -> Intervals:
-    """Intervals of a stretch; those of two delays are the same in number and order."""
+    """Compute the intervals of a stretch; number and order are equal for all delays."""
     events = _events(inputs, stretch, timing)
     start, end = np.concatenate([[0], events.end[:-1]]), events.end
     count, duration_s = len(end), stretch.time_s[end] - stretch.time_s[start]
@@ -117,18 +117,18 @@ def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
     first, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
     stamp, last = received.stamp_s[first:last_row], len(time_s) - 1
     measured_s = stamp - timing.delay_s - 0.5 * inputs.step_s
-    # what arrives after the horizon has passed it is fused late, or not at all
+    # samples that arrive behind the horizon are fused late, or never
     due_s = np.maximum(measured_s, received.arrival_s[first:last_row] - timing.horizon_s)
     end = np.searchsorted(time_s, due_s - 1e-9)
     is_inside = (end > 0) & (end <= last)
     end = np.maximum.accumulate(np.minimum(end, last))
     is_in_time = time_s[end] < measured_s + MAX_LATE_S
     usable = is_inside & is_in_time
-    usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step the newer one is fused
+    usable[:-1] &= end[1:] > end[:-1]  # EKF2 fuses the newer of two samples in one step
     action, startable = _actions(inputs, stretch, measured_s, end, usable)
-    # further events where the source is silent, as many for every delay
-    silence = np.diff(np.concatenate([time_s[:1], stamp, time_s[-1:]]))
-    extra_events = np.maximum(np.ceil(silence / inputs.max_interval_s).astype(int) - 1, 0)
+    # additional events in gaps of the source, equally many for every delay
+    gap_s = np.diff(np.concatenate([time_s[:1], stamp, time_s[-1:]]))
+    extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
     sample_places, total = (
         np.cumsum(extra_events[:-1] + 1) - 1,
         len(stamp) + int(extra_events.sum()),
@@ -151,22 +151,20 @@ def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
 def _actions(
     inputs: Inputs, stretch: Stretch, taken_s: Array, end: IntArray, usable: BoolArray
 ) -> tuple[IntArray, BoolArray]:
-    """What each sample does, and whether fusion may start on it (ev_control.cpp)."""
+    """Return the action of each sample, and True if fusion may start on it (ev_control.cpp)."""
     rules = inputs.rules
     action = np.full(len(taken_s), IDLE)
     startable = np.zeros(len(taken_s), dtype=bool)
     usable_rows = np.flatnonzero(usable)
     interval = np.diff(taken_s[usable_rows], prepend=-np.inf)
     startable[usable_rows] = interval < rules.start_interval_s
-    # the last step before this sample was fused, and how old the sample before was then
-    silence = stretch.time_s[end[usable_rows] - 1] - np.concatenate(
+    # s, age of the previous sample in the last step before this fusion
+    gaps_s = stretch.time_s[end[usable_rows] - 1] - np.concatenate(
         [[np.inf], taken_s[usable_rows[:-1]]]
     )
     is_fusing = stretch.fusing
-    for row, (interval_s, silence_s) in enumerate(
-        zip(interval.tolist(), silence.tolist(), strict=True)
-    ):
-        is_fusing = is_fusing and not silence_s > rules.stop_s
+    for row, (interval_s, gap_s) in enumerate(zip(interval.tolist(), gaps_s.tolist(), strict=True)):
+        is_fusing = is_fusing and not gap_s > rules.stop_s
         if is_fusing:
             action[usable_rows[row]] = FUSE
         elif interval_s < rules.start_interval_s:
@@ -176,12 +174,12 @@ def _actions(
 
 
 def _effects(stretch: Stretch, start: IntArray, end: IntArray) -> Array:
-    """What the causes have done to attitude, velocity and position at the end of each interval.
+    """Return the effects on attitude, velocity and position at the end of each interval.
 
-    Of shape (E, 9, 11). One step of every interval at a time, from its first on.
+    The shape is (E, 9, 11). All intervals advance together by one step.
     """
     length = end - start
-    # the first steps of all intervals, then their second ones and so on, longer before shorter
+    # process step 1 of all intervals, then step 2, ..., with longer intervals first
     longest_first = np.argsort(-length, kind="stable")
     first = start[longest_first]
     attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMNS))
@@ -191,9 +189,9 @@ def _effects(stretch: Stretch, start: IntArray, end: IntArray) -> Array:
     for at, count in zip(steps, np.searchsorted(-length[longest_first], -steps), strict=True):
         step, rows = first[:count] + at, slice(count)
         dt, force = stretch.step_s[step][:, None, None], force_m_s2[step]
-        rotation_step = -stretch.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of a step
+        rotation_step = -stretch.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of one step
         position[rows] += 0.5 * dt * velocity[rows]
-        velocity[rows] += (-skew(force) * dt) @ attitude[rows]  # by ∂v/∂δθ of the step
+        velocity[rows] += (-skew(force) * dt) @ attitude[rows]  # ∂v/∂δθ of one step
         velocity[rows, :, 6:9] += rotation_step
         velocity[rows, :, INPUT] += (force + GRAVITY_M_S2) * dt[:, :, 0]
         position[rows] += 0.5 * dt * velocity[rows]
@@ -204,15 +202,15 @@ def _effects(stretch: Stretch, start: IntArray, end: IntArray) -> Array:
 
 
 def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
-    """Covariance at the end of each interval for unit noise of gyro and of accelerometer.
+    """Return covariances at the end of each interval for unit gyro and accelerometer noise.
 
-    In closed form, for n equal steps under the interval's mean specific force; unit noise adds dt²
-    to the variance of attitude or velocity in each step. What gyro noise does to velocity and
-    position within an interval is small, so that leading terms do.
+    Closed form for n equal steps with the mean specific force of the interval. Unit noise adds dt²
+    to the variance of attitude or velocity in each step. The effect of gyro noise on velocity and
+    position is small, so only leading terms are used.
     """
     n = np.maximum(steps, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    m = tilt / n  # mean ∂v/∂δθ of a step
+    m = tilt / n  # mean ∂v/∂δθ of one step
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
     gyro, accelerometer = np.zeros((2, len(steps), IMU_STATE_COUNT, IMU_STATE_COUNT))

@@ -1,10 +1,10 @@
-"""The magnetometer as EKF2 fuses it: all three axes, with the fields of earth and body as states.
+"""Magnetometer fusion of all three axes, with earth and body fields as states.
 
-Samples between two events are fused together at the later one, as their mean: the attitude error
-hardly changes in between. So they make no intervals of their own.
+Samples between two events are fused as their mean at the later event: the attitude error hardly
+changes in between.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
-``mag_control.cpp``: R and its floor), ``EKF/covariance.cpp`` (process noise of the fields).
+``mag_control.cpp``: R and its lower limit), ``EKF/covariance.cpp`` (process noise of the fields).
 """
 
 from typing import NamedTuple
@@ -15,16 +15,16 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
 from px4fuse.trajectory.rotation import skew
 
-MIN_SD_GAUSS = 0.01
+MIN_SD_GAUSS = 0.01  # lower limit of EKF2_MAG_NOISE
 EYE = np.eye(3)
-CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is [v]×
+CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is the cross product matrix [v]×
 
 
 class EventSamples(NamedTuple):
     """Means of the samples that are fused at each event; shape (E, ...), or (E, S, ...).
 
-    ``value`` and ``turn`` are as :class:`~px4fuse.ekf2.stretches.SensorSamples` has them, a velocity as of
-    the event; ``number`` is how many EKF2 had, and ``noise`` R of one.
+    ``value`` and ``turn`` as in :class:`~px4fuse.ekf2.stretches.SensorSamples`, with velocities at
+    the event. ``number``: samples that EKF2 received; ``noise``: R of one sample.
     """
 
     value: Array
@@ -34,11 +34,11 @@ class EventSamples(NamedTuple):
 
 
 def mean_by_event(
-    sensed: SensorSamples, end: IntArray, gained_m_s: Array | None = None
+    sensed: SensorSamples, end: IntArray, imu_velocity_m_s: Array | None = None
 ) -> EventSamples:
-    """Samples by the event at which they are fused; ``end`` is the step of each event.
+    """Return means of the samples fused at each event; ``end`` is the step of each event.
 
-    ``gained_m_s`` is of :class:`~px4fuse.ekf2.stretches.Stretch`, for a velocity.
+    Pass ``imu_velocity_m_s`` of :class:`~px4fuse.ekf2.stretches.Stretch` for velocity samples.
     """
     event = np.searchsorted(end, sensed.step)
     is_inside, size = event < len(end), len(end)
@@ -51,8 +51,8 @@ def mean_by_event(
         return np.asarray((total.T / count).T)
 
     value, turn, noise = map(mean, (sensed.value, sensed.turn, sensed.noise))
-    if gained_m_s is not None:
-        value = value + np.einsum("eab,eb->ea", turn, gained_m_s[end])
+    if imu_velocity_m_s is not None:
+        value = value + np.einsum("eab,eb->ea", turn, imu_velocity_m_s[end])
     number = np.bincount(event, sensed.samples[is_inside], size)
     return EventSamples(value, turn, np.asarray(number, float), noise)
 
@@ -60,10 +60,10 @@ def mean_by_event(
 def fuse_field(
     x: Array, P: Array, field_samples: EventSamples, noise_gauss: Array, gate: Array
 ) -> tuple[Array, Array, Array]:
-    """State and covariance of S variants after the field samples of one event.
+    """Return state, covariance and innovations after fusing the field samples of one event.
 
-    And innovation (gauss), its variance for a single sample and whether it was fused, of shape
-    (3, S, 3); NaN where there was no sample.
+    The innovations have shape (3, S, 3): innovation (gauss), its variance for one sample, and 1 if
+    fused; NaN without a sample.
     """
     R = np.maximum(noise_gauss, MIN_SD_GAUSS) ** 2
     return fuse_mean(x, P, field_samples, R, gate, EARTH_FIELD, BODY_FIELD)
@@ -78,18 +78,18 @@ def fuse_mean(
     rows: slice,
     bias_rows: slice | None = None,
 ) -> tuple[Array, Array, Array]:
-    """State and covariance of S variants after the mean of some samples, as :func:`fuse_field`.
+    """Return state, covariance and innovations after fusing a mean, as :func:`fuse_field`.
 
     Parameters
     ----------
-    sample_mean : Samples
+    sample_mean : EventSamples
         Of one event.
     R, gate : ndarray, shape (S,)
-        Variance of one sample, and its gate in standard deviations.
+        Variance of one sample, and gate in √S.
     rows : slice
-        States that are measured in the body (NED).
+        NED vector states that the sensor measures in the body frame.
     bias_rows : slice, optional
-        States that are the body's own, and are measured with them.
+        Body-frame states that add to the measurement.
     """
     state, number = x[:, rows], sample_mean.number
     cross_state, cross_turn = (
@@ -104,7 +104,7 @@ def fuse_mean(
         predicted += x[:, bias_rows]
     nu, HP = sample_mean.value - predicted, H @ P
     S = HP @ H.transpose(0, 2, 1)
-    diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # a view
+    diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # a view of the diagonal of S
     innovation_record = np.empty((3, *nu.shape))
     innovation_record[0], innovation_record[1] = nu, diagonal + R[:, None]
     has_sample = number > 0.0

@@ -1,10 +1,10 @@
-"""EKF2 replayed from an ordinary log, as it flew and with other parameters.
+"""Replay of EKF2 from an ordinary log, as flown and with other parameters.
 
-The model is the part of EKF2 that horizontal positions move: 15 error states about the published
-attitude, started from the log's own ``estimator_states`` and fed with IMU and positions as logged,
-of GNSS with their velocities, and with the magnetometer (21 states) where the log holds it.
-It is not EKF2: what else EKF2 fuses (height, else the heading) is taken from its own output. How
-far it can be believed is measured on each log, see :mod:`px4fuse.ekf2.replay`.
+The model contains the part of EKF2 that horizontal positions affect: 15 error states about the
+published attitude, started from the logged ``estimator_states``. Inputs are the logged IMU and
+positions, with velocities on GNSS and the magnetometer (21 states) if logged. Other measurements of
+EKF2 (height, else the heading) are replaced by its published values. :mod:`px4fuse.ekf2.replay`
+tests on each log how well the model agrees with EKF2.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -64,9 +64,9 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 
-MAX_HORIZON_S = 1.0  # EKF2_DELAY_MAX
+MAX_HORIZON_S = 1.0  # s, upper limit of EKF2_DELAY_MAX
 
-# What an agreement says of an aid by another name
+# Fields of Agreement that are not named after the aid
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
 
 RequestVariants = Callable[[Inputs], Sequence[Variant]]
@@ -74,21 +74,21 @@ RequestVariants = Callable[[Inputs], Sequence[Variant]]
 
 @dataclass(frozen=True)
 class Model:
-    """A flight made ready for replays.
+    """Flight prepared for replays.
 
     Attributes
     ----------
     flight : Flight
     inputs : Inputs
     intervals : mapping from Timing to tuple of Intervals
-        Of each stretch, for the delay as flown; empty where they are yet to be made.
+        Intervals of each stretch for the delay as flown; empty if not yet computed.
     flown : Ekf2Replay
-        With the parameters of the log.
+        Replay with the logged parameters.
     agreement : Agreement
-        Of ``flown`` with what the log holds.
-    runs : list of Run
-        Through each stretch, of these inputs: as flown, the same rejecting and resetting where EKF2
-        did, and the variants that were asked for besides. What is not there is run when needed.
+        Agreement of ``flown`` with the log.
+    runs : list of StretchRun
+        One run per stretch with the variants already computed: as flown, with logged rejections,
+        and those of ``besides``.
     """
 
     flight: Flight
@@ -102,13 +102,13 @@ class Model:
 
 
 def open_model(flight: Flight, besides: RequestVariants = lambda _: ()) -> Model | Unavailable:
-    """Make a flight ready for replays and replay it as flown, or say why the log cannot carry it.
+    """Prepare a flight for replays and replay it as flown, or return Unavailable.
 
     Parameters
     ----------
     flight : Flight
     besides : callable
-        Gives the variants that will be asked for, which cost little when they run along.
+        Returns variants that are needed later; running them together saves time.
     """
     doubted: dict[str, Agreement] = {}
     while not isinstance(model := _open_without(flight, besides, doubted), Unavailable):
@@ -121,7 +121,7 @@ def open_model(flight: Flight, besides: RequestVariants = lambda _: ()) -> Model
 def _open_without(
     flight: Flight, besides: RequestVariants, doubted: Mapping[str, Agreement]
 ) -> Model | Unavailable:
-    """The model without the aids that are doubted, each by an agreement that says why."""
+    """Open the model without the aids in ``doubted`` (aid name to the agreement that failed)."""
     doubtful = {name: doubt.doubtful[name] for name, doubt in doubted.items()}
     inputs = prepare_inputs(flight, doubtful)
     if isinstance(inputs, Unavailable):
@@ -147,11 +147,11 @@ def _open_without(
         return agreement
     share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
-        obedient_agreement = agreement_with_log(flight, _make_replay(inputs, runs, variants[1], {}))
-        if isinstance(obedient_agreement, Agreement):
+        logged_agreement = agreement_with_log(flight, _make_replay(inputs, runs, variants[1], {}))
+        if isinstance(logged_agreement, Agreement):
             has_all_decisions = inputs.received.moved_m is not None
             agreement = with_logged_rejections(
-                agreement, obedient_agreement, has_all_decisions=has_all_decisions
+                agreement, logged_agreement, has_all_decisions=has_all_decisions
             )
     of_doubted = {AGREEMENT_FIELDS.get(name, name): name for name in doubted}
     agreement = structs.replace(
@@ -166,7 +166,7 @@ def _open_without(
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
-    """EKF2 as flown, rejecting and resetting where it did itself, as far as the log tells."""
+    """Replay EKF2 as flown with the logged rejections and resets instead of the model's gate."""
     variant = Variant(model.inputs.settings, as_logged=True)
     return _make_replay(model.inputs, _run_model(model, [variant]), variant, {})
 
@@ -177,48 +177,52 @@ def replay_settings(
     left_out_s: Array | None = None,
     without: Mapping[str, float] | None = None,
 ) -> tuple[Ekf2Replay, ...]:
-    """Replay with several settings at once, each a change of what was flown.
+    """Replay several changes of the logged parameters at once.
 
     Parameters
     ----------
     model : Model
     settings : sequence of mapping
-        What each changes, by PX4 name and in PX4's units.
+        Changed parameters of each replay, by PX4 name and in PX4's units.
     left_out_s : ndarray, optional
-        Stamps of samples that are not fused, and not among the updates.
+        Timestamps of samples that are neither fused nor listed as updates.
     without : mapping from PX4's name of an aid to float, optional
-        From when on (s) it is not fused.
+        Time (s) from which the aid is not fused.
 
     Raises
     ------
     SettingsError
-        A parameter or an aid that the model does not have, or a value outside PX4's range.
+        Unknown parameter or aid, or a value outside PX4's range.
     """
     changes, inputs = [check_parameters(change) for change in settings], model.inputs
     unmodelled = PARAMETERS.keys() - inputs.settings.keys()
     unused_parameters = dict.fromkeys(unmodelled, f"EKF2 fused {inputs.aid.label} in this log")
-    height = f"the height is EKF2's own as flown ({inputs.imposed})"
+    height = f"the replay uses the logged EKF2 height ({inputs.height_reason})"
     if inputs.aid == GNSS_POS:
-        no_field = "the log does not hold what EKF2 fused of a magnetometer"
+        no_field = "the log does not contain all fused magnetometer samples"
         unused_parameters |= dict.fromkeys(
             unmodelled & {*MAG.own_parameters, *FIELD_NOISES}, no_field
         )
         unused_parameters |= dict.fromkeys(
             unmodelled & BAROMETER.own_parameters,
-            height if inputs.imposed else "EKF2 fused no barometer",
+            height if inputs.height_reason else "EKF2 fused no barometer height",
         )
     if inputs.rules.horizon_by_delay:
         firmware = model.flight.log.firmware
-        unused_parameters["EKF2_DELAY_MAX"] = f"in {firmware} the longest delay makes the horizon"
+        unused_parameters["EKF2_DELAY_MAX"] = (
+            f"in {firmware} the fusion horizon follows from the largest delay parameter"
+        )
     if inputs.received.own_times:
-        unused_parameters[GNSS_POS.delay] = "EKF2 takes the receiver driver's own times"
+        unused_parameters[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
     for name in [name for change in changes for name in change if name in unused_parameters]:
-        raise SettingsError(f"{name} changes nothing here: {unused_parameters[name]}.")
+        raise SettingsError(f"{name} has no effect in this log: {unused_parameters[name]}.")
     without = without or {}
     for name in without:
         if name not in (known := modelled_aids(inputs)):
-            why = f"; {height}" if inputs.imposed else ""
-            raise SettingsError(f"{name}: of this log the model fuses {', '.join(known)}{why}.")
+            why = f"; {height}" if inputs.height_reason else ""
+            raise SettingsError(
+                f"{name}: in this log the replay fuses only {', '.join(known)}{why}."
+            )
     if not changes:
         return ()
     as_logged = left_out_s is not None
@@ -244,7 +248,7 @@ def replay_settings(
 
 
 def modelled_aids(inputs: Inputs) -> list[str]:
-    """PX4's names of the aids that the model fuses."""
+    """Return PX4's names of the aids that the model fuses."""
     velocity = [GNSS_VEL.name] if inputs.received.velocity_m_s is not None else []
     magnetic = [MAG.name] if MAG.noise in inputs.settings else []
     flow = [FLOW.name] if inputs.stretches[0].flow is not None else []
@@ -255,7 +259,7 @@ def modelled_aids(inputs: Inputs) -> list[str]:
 
 
 def _without_updates(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> Ekf2Replay:
-    """A replay whose updates are not those of samples that were left out."""
+    """Remove the updates of excluded samples from a replay."""
     age_s = replay.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.step_s
     left_out_rows = same_sample(replay.updates.index.to_numpy(), left_out_s - age_s)
     remaining_rows = np.delete(np.arange(len(replay.updates)), left_out_rows[left_out_rows >= 0])
@@ -263,7 +267,7 @@ def _without_updates(inputs: Inputs, replay: Ekf2Replay, left_out_s: Array) -> E
 
 
 def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
-    """The same flight, with noise on every position that EKF2 was sent.
+    """Add noise to every position that EKF2 received.
 
     Parameters
     ----------
@@ -278,12 +282,12 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
         if samples is not None:
             noise = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             new_inputs[name] = replace(samples, position_m=samples.position_m + noise)
-    # the intervals between samples hang on their times alone
+    # the intervals between samples depend on their times only
     return replace(model, inputs=replace(inputs, **new_inputs))
 
 
 def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
-    """The same flight, with every position that EKF2 was sent turned, and stamped later.
+    """Rotate every position that EKF2 received, and add a delay to its timestamp.
 
     Parameters
     ----------
@@ -308,9 +312,9 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
 
 
 def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.DataFrame]:
-    """Tracks of all at their horizon, one at a time.
+    """Yield the track of each variant at its fusion horizon.
 
-    What a filter publishes is as long again, and takes as long to make.
+    One at a time, without the output predictor, to limit memory and time.
     """
     runs = _run_model(model, variants)
     for at in map(runs[0].variants.index, variants):
@@ -318,7 +322,7 @@ def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.D
 
 
 def _run_model(model: Model, variants: Sequence[Variant]) -> list[StretchRun]:
-    """Runs that hold these variants: those of the model, where they are among them."""
+    """Return runs with these variants, from the model if it has them."""
     if model.runs and all(variant in model.runs[0].variants for variant in variants):
         return model.runs
     return run_variants(model.inputs, variants, model.intervals)
@@ -327,7 +331,7 @@ def _run_model(model: Model, variants: Sequence[Variant]) -> list[StretchRun]:
 def run_variants(
     inputs: Inputs, variants: Sequence[Variant], known: Mapping[Timing, Sequence[Intervals]]
 ) -> list[StretchRun]:
-    """Run variants through every stretch; ``known`` are the intervals that there are."""
+    """Run variants through every stretch; ``known`` contains intervals already computed."""
     timings = [variant.timing(inputs) for variant in variants]
     runs = []
     for at, stretch in enumerate(inputs.stretches):
@@ -341,7 +345,7 @@ def run_variants(
 
 
 def _track(part: StretchRun, state: Array) -> pd.DataFrame:
-    """Position and velocity of a state at each step's end."""
+    """Return position and velocity of a state at the end of each step."""
     index = pd.Index(part.stretch.time_s, name="time_s")
     position = state[:, POSITION] / part.stretch.metres
     return pd.DataFrame(np.hstack([position, state[:, VELOCITY]]), index, Columns.STATE)
@@ -374,14 +378,14 @@ def _make_replay(
 
 
 def _flow_only_spans_s(updates: pd.DataFrame, stretch: Stretch) -> list[tuple[float, float]]:
-    """Times between positions that are fused, where they are longer than the model goes without."""
+    """Return times between fused positions (s) that are longer than RESTART_GAP_S."""
     taken = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     ends = [*updates.loc[taken, "fused_at_s"], float(stretch.time_s[-1])]
     return [(a, b) for a, b in pairwise(ends) if b - a > RESTART_GAP_S]
 
 
 def _other_aid_updates(runs: Sequence[StretchRun], at: int) -> dict[str, pd.DataFrame]:
-    """What was done with each sample of what was fused besides, by PX4's name."""
+    """Return the updates of the aids fused besides the position, by PX4's name."""
     updates_by_aid: dict[str, list[pd.DataFrame]] = {}
     for part in runs:
         end_s = part.stretch.time_s[part.events[at].end]
@@ -411,13 +415,13 @@ def _position_updates(part: StretchRun, at: int) -> pd.DataFrame:
 def _delayed_and_published(
     inputs: Inputs, part: StretchRun, at: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The filter's state and what it publishes, at each step."""
+    """Return the state at the fusion horizon and the published state, at each step."""
     stretch, variant = part.stretch, part.variants[at]
     state, reset = delayed_states(part, at)
     horizon_s = min(variant.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag = max(round(horizon_s / inputs.step_s), 1)
     published_rotation = np.zeros((len(state), 3))
-    if variant.attitude:  # the published attitude followed that of EKF2 itself
+    if variant.attitude:  # the logged published attitude already follows EKF2's attitude
         attitude_difference = state[:, THETA] - stretch.attitude_error_rad
         published_rotation = follow_attitude(attitude_difference, lag, inputs.step_s, horizon_s)
     published = publish(stretch, state, reset, published_rotation, lag, variant.settings)
@@ -427,7 +431,7 @@ def _delayed_and_published(
 
 
 def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
-    """State of one variant at each step's end, and the position's resets up to then.
+    """Return the state of one variant at the end of each step, and the sum of position resets.
 
     Returns
     -------
@@ -442,16 +446,16 @@ def delayed_states(part: StretchRun, at: int) -> tuple[Array, Array]:
     state = event_states[np.concatenate([[0], interval])]
 
     def sum_since_event(increments: Array) -> Array:
-        """Sum of what each step adds, from the beginning of its interval on."""
+        """Return the sum of step increments since the begin of the interval."""
         total = np.cumsum(increments, axis=0)
         return np.asarray(total - (total - increments)[first])
 
     def value_before_step(after_step: Array, rows: slice) -> Array:
-        """What there was before each step."""
+        """Return the value before each step."""
         shifted = np.concatenate([after_step[:1], after_step[:-1]])
         return np.where((first == np.arange(count))[:, None], event_states[interval, rows], shifted)
 
-    # the equations of the intervals, for this state alone
+    # equations of px4fuse.ekf2.intervals, evaluated for this state only
     rotation_steps = -np.einsum("nij,nj->ni", rotation, state[1:, GYRO_BIAS]) * dt
     if variant.attitude:
         rotation_steps -= stretch.correction_rad

@@ -1,10 +1,9 @@
-"""From the fusion horizon to what EKF2 publishes: its output predictor.
+"""Output predictor of EKF2: from the state at the fusion horizon to the published state.
 
-The filter's state is as old as its horizon. The output predictor carries it to the present with the
-IMU and pulls towards it: each step the buffered output of the horizon's time is compared with the
-state, and velocity and position of the whole buffer are corrected by gain · error + 0.1 · gain² ·
-Σ error, gain = step / τ. All of it is linear and the same at every step, so it runs as recursive
-filters over the whole stretch.
+The output predictor propagates the delayed state to the present with the IMU. Each step it compares
+the buffered output at the fusion horizon with the state. It corrects velocity and position of the
+whole buffer by gain · error + 0.1 · gain² · Σ error, gain = step / τ. This is linear and equal in
+every step, so recursive filters compute it for the whole stretch.
 
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
@@ -27,12 +26,12 @@ from px4fuse.ekf2.stretches import (
 )
 
 INTEGRAL_SHARE = 0.1
-# What a correction does is followed for so many time constants
+# time constants after which the effect of a correction is neglected
 FOLLOWED_TIME_CONSTANTS = 5.0
-# Against what nothing tells apart: two corrections between the same rows
+# weight of a prior of 0, which separates two corrections between the same rows
 NO_CORRECTION = 1e-3
-# A row after so many usual intervals has others missing before it; so much of a correction must
-# show in rows that are there
+# Median row intervals after which rows count as missing; fraction of a correction that the
+# remaining rows must show
 MISSING_ROWS, MIN_SHOWN_SHARE = 3.0, 0.5
 ATTITUDE_SHARE = 0.5
 
@@ -41,44 +40,44 @@ def publish(
     stretch: Stretch,
     state: Array,
     reset_m: Array,
-    turned_rad: Array,
+    attitude_difference_rad: Array,
     lag: int,
     settings: Mapping[str, float],
 ) -> tuple[Array, Array]:
-    """Published velocity and position at each step's end.
+    """Return published velocity and position at the end of each step.
 
     Parameters
     ----------
     stretch : Stretch
     state : ndarray, shape (n + 1, 15) or more
-        The filter's, by the time that it is of.
+        State at the fusion horizon, by its time of validity.
     reset_m : ndarray, shape (n + 1, 3)
-        Sum of the position's resets up to each state.
-    turned_rad : ndarray, shape (n + 1, 3)
-        Published attitude against the nominal one.
+        Sum of position resets up to each state.
+    attitude_difference_rad : ndarray, shape (n + 1, 3)
+        Published minus nominal attitude.
     lag : int
-        Steps between the horizon and the present.
+        Steps between fusion horizon and present.
     settings : mapping
         With EKF2_TAU_VEL and EKF2_TAU_POS.
 
     Returns
     -------
     velocity_m_s, position_m : ndarray, shape (n + 1, 3)
-        Before the first comparison, at step ``lag``, dead reckoning from the first state.
+        Dead reckoning from the first state until step ``lag``.
     """
     step_s, mean_step = stretch.step_s[:, None], float(np.mean(stretch.step_s))
-    # the bias that the newest IMU samples are corrected with is the horizon's
+    # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     force = stretch.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
     force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
-    gain = (force + np.cross(turned_rad[1:], force) + GRAVITY_M_S2) * step_s
+    gain = (force + np.cross(attitude_difference_rad[1:], force) + GRAVITY_M_S2) * step_s
     dead_reckoned = np.cumsum(np.concatenate([state[:1, VELOCITY], gain]), axis=0)
     velocity_correction = _follow_offset(
         state[:, VELOCITY] - dead_reckoned, lag, mean_step, settings["EKF2_TAU_VEL"]
     )
     velocity = dead_reckoned + velocity_correction
-    # within a step the velocity grows by what the IMU gives; corrections come at its end
+    # the IMU changes the velocity within a step; corrections apply at its end
     position_increments = (velocity[:-1] + 0.5 * gain) * step_s
-    steady = state[:, POSITION] - reset_m  # the buffer is moved along with a reset
+    steady = state[:, POSITION] - reset_m  # EKF2 shifts the buffer with a reset
     dead_reckoned = np.cumsum(np.concatenate([steady[:1], position_increments]), axis=0)
     position = dead_reckoned + _follow_offset(
         steady - dead_reckoned, lag, mean_step, settings["EKF2_TAU_POS"]
@@ -87,7 +86,7 @@ def publish(
 
 
 def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
-    """Sum of the corrections up to each step that make the output follow the state.
+    """Return the sum of the corrections with which the output follows the state.
 
     With e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
@@ -103,25 +102,25 @@ def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Arra
 def corrections(
     time_s: Array, velocity_m_s: Array, position_m: Array, known_s: Array, tau_s: float
 ) -> Array:
-    """By how much the filter moved its position at each sample, by what was published after it.
+    """Estimate EKF2's position correction at each sample from the published position.
 
-    What is published moves beyond its own velocity by (1 - exp(-t / τ)) of a correction in the time
-    t.
+    After a time t the published position contains 1 - exp(-t / τ) of a correction, in addition to
+    its integrated velocity. Least squares over all corrections.
 
     Parameters
     ----------
     time_s : ndarray, shape (n,)
-        Of the rows of what was published.
+        Times of the published rows.
     velocity_m_s, position_m : ndarray, shape (n, a)
     known_s : ndarray, shape (m,)
-        A step before each correction begins to show; increasing.
+        One step before each correction starts to show; increasing.
     tau_s : float
         EKF2_TAU_POS.
 
     Returns
     -------
     ndarray, shape (m, a)
-        NaN where rows of the log are missing after it.
+        NaN if rows of the log are missing after it.
     """
     interval_s = np.diff(time_s)
     dead_reckoned = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
@@ -153,19 +152,20 @@ def corrections(
 
 
 def delay_by(values: Array, lag: int) -> Array:
-    """The same values ``lag`` steps later, the first one before them."""
+    """Delay values by ``lag`` steps; earlier values equal the first one."""
     return np.concatenate([np.repeat(values[:1], lag, axis=0), values])[: len(values)]
 
 
 def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
-    """How the published attitude follows a difference of the filter's attitude.
+    """Return the published attitude correction that follows an attitude error of the filter.
 
-    Each step the newest attitude is turned by 0.5 · step / horizon of the error at the horizon.
+    Each step corrects the newest attitude by 0.5 · step / horizon of the error at the fusion
+    horizon.
 
     Parameters
     ----------
     error_rad : ndarray, shape (n + 1, 3)
-        Rotation vectors, by the time that they are of.
+        Rotation vectors, by their time of validity.
     lag : int
     step_s, horizon_s : float
     """
@@ -177,7 +177,7 @@ def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float)
 
 
 def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
-    """Values through a recursive filter: a triangular system whose bands are the denominator."""
+    """Apply a recursive filter by solving a banded triangular system (LAPACK dtbtrs)."""
     count = len(values)
     driven_values = np.zeros((values.shape[1], count))
     for delay in np.flatnonzero(numerator[:count]).tolist():

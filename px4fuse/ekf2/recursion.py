@@ -1,4 +1,4 @@
-"""The recursion of the model: several settings of EKF2 through one stretch at once.
+"""Filter recursion of the EKF2 replay: several settings run through one stretch together.
 
 Sources: PX4-Autopilot ``EKF/covariance.cpp`` (limits of the biases), ``EKF/position_fusion.cpp``
 and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, resets).
@@ -33,61 +33,61 @@ from px4fuse.ekf2.stretches import (
 from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 
-# How long the first pass runs that gives the correlations at the start
+# s; length of the first pass, which estimates the initial correlations
 CORRELATION_PASS_S = 8.0
-MIN_VARIANCE = 1e-30
-# Of an innovation's square over that of its gate, either way: within, what is published after it
-# tells whether it was rejected, where the log does not
+MIN_VARIANCE = 1e-30  # lower limit of a variance before division
+# Range of NIS / gate² (1/2 to 2) in which an unlogged rejection is inferred from the published
+# position
 GATE_EDGE_RATIO = 2.0
-# Events whose intervals are stacked at once
+# number of events whose intervals are stacked together, to limit memory
 EVENT_BATCH_SIZE = 64
-# Variance by which a sample is not taken at all
+# m², variance of a measurement without effect
 IGNORED_VARIANCE = 1e9
-# Of an acceleration (m/s²) that EKF2 takes to be wrong, or that was clipped (BADACC_BIAS_PNOISE,
+# m/s², acceleration noise while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE = 4.9
-# EKF2 takes the vertical velocity of GNSS for half as exact again (gps_control.cpp)
+# Variance factors of GNSS velocity: EKF2 multiplies the vertical σ by 1.5 (gps_control.cpp)
 VERTICAL_SCALE = np.array([1.0, 1.0, 2.25])
-HEIGHT_SCALE = 1.5  # of EKF2_GPS_P_NOISE (gnss_height_control.cpp)
-# covariance.cpp: at most 0.1 g of bias, at most a ratio of 100 between the axes
+HEIGHT_SCALE = 1.5  # factor on EKF2_GPS_P_NOISE for GNSS height (gnss_height_control.cpp)
+# Bias limits in covariance.cpp: σ at most 0.1 g, variance ratio between axes at most 100
 MAX_BIAS_SD = 0.1 * 9.80665
 BIAS_RATIO = 0.01
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
-BIAS_NORTH, BIAS_EAST = 12, 13  # of the accelerometer, turned to the earth
+BIAS_NORTH, BIAS_EAST = 12, 13  # accelerometer bias rotated to NED
 GRAVITY = float(GRAVITY_M_S2[2])
 MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
-# Slices are views, where indices would be copies
+# Slices, because they are views; index arrays would copy
 OWN_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL = slice(NORTH, EAST + 1)
-# What a sample tells of: velocity and position. Among these, velocity, and north and east
+# Rows of velocity and position, which a sample can measure; columns of velocity and of horizontal
+# position among these
 MEASURED_STATES, VELOCITY_COLUMNS, POSITION_COLUMNS = slice(3, 9), slice(0, 3), slice(3, 5)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One filter to run.
+    """One filter configuration to run.
 
     Attributes
     ----------
     settings : dict
-        All of the model's parameters, by PX4 name.
+        All parameters of the model, by PX4 name.
     biases : bool
-        Whether the accelerometer's bias is a state; else there is none.
+        True if the accelerometer bias is a state; else it is 0.
     attitude : bool
-        Whether attitude and gyro bias are states; else the published attitude holds.
+        True if attitude and gyro bias are states; else the published attitude is used.
     velocity : bool
-        Whether velocity is fused too, where EKF2 does.
+        True if velocity is fused when EKF2 fuses it.
     reported : bool
-        Whether what the sender states of its noise is used, where EKF2 uses it.
+        True if the noise reported by the sender is used when EKF2 uses it.
     gated : bool
-        Whether samples are rejected and positions reset.
+        True if samples are rejected and positions reset.
     as_logged : bool
-        Whether samples are rejected and the position is reset where EKF2 itself did, as far as the
-        log shows.
+        True if logged rejections and resets replace the gate.
     without : mapping from PX4's name of an aid to float
-        From when on (s) it is not fused.
+        Time (s) from which the aid is not fused.
     stamp_offset_s : float or None
-        What is added to the stamps; None: samples count when EKF2 takes them to have been measured.
+        Added to the timestamps; None: EKF2's delay parameter is used.
     """
 
     settings: dict[str, float]
@@ -101,55 +101,55 @@ class Variant:
     stamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
-        """What is taken off the stamps, half a step besides, and how far fusion runs behind."""
+        """Return the total age of a position at its timestamp, and the fusion horizon (s)."""
         if self.stamp_offset_s is not None:
             return Timing(-self.stamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         known = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
         most_ms = max(self.settings[name] for name in known)
-        if inputs.rules.horizon_by_delay:  # the longest of the delays makes the buffer
+        if inputs.rules.horizon_by_delay:  # the IMU buffer covers the largest delay
             length = math.ceil(most_ms * 1e-3 / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
-        # EKF2 raises it to the longest delay when it starts (EKF2.cpp)
+        # at start EKF2 raises EKF2_DELAY_MAX to the largest delay (EKF2.cpp)
         longest_ms = max(self.settings["EKF2_DELAY_MAX"], most_ms)
         if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
-        # initialise_interface, estimator_interface.cpp: the length of the IMU buffer
+        # length of the IMU buffer (initialise_interface, estimator_interface.cpp)
         length = max(math.ceil(longest_ms * 1e-3 / inputs.predict_s), 2)
         return Timing(delay_s, (length - 1) * inputs.step_s)
 
 
 @dataclass(frozen=True)
 class StretchRun:
-    """What S variants did in one stretch of E events.
+    """Results of S variants in one stretch with E events.
 
     Attributes
     ----------
     stretch : Stretch
     variants : tuple of Variant
     events : tuple of recarray
-        Of each variant.
+        Events of each variant.
     innovation : ndarray, shape (E, S, 6)
-        Measurement minus state of velocity (m/s) and position (m), NED; NaN where the event has no
-        sample, or EKF2 fuses no velocity.
+        Measurement minus state of velocity (m/s) and position (m), NED; NaN without a sample or
+        without velocity fusion.
     innovation_variance : ndarray, shape (E, S, 6)
         S = P + R.
     noise : ndarray, shape (E, S, 6)
         R.
     rejected, fused, reset : ndarray of bool, shape (E, S)
     moved_m : ndarray, shape (E, S, 2)
-        By how much the position, north and east, was reset.
+        Position reset, north and east.
     state, variance : ndarray, shape (E + 1, S, n)
-        At the start and after each event; n is 15, or 21 where the magnetic fields are states.
+        At the start and after each event; n is 15, or 21 with magnetic fields as states.
     covariance : ndarray, shape (S, n, n)
         At the end.
     field : ndarray, shape (E, 3, S, 3)
-        Of the magnetometer (body FRD): innovation (gauss), its variance for one sample, and whether
-        it was fused; NaN where there was none. Without rows where the fields are no states.
+        Magnetometer (body FRD): innovation (gauss), its variance for one sample, and 1 if fused;
+        NaN without a sample. No rows if the fields are not states.
     heights : HeightFilter or None
-        Where heights are fused, and are not EKF2's own.
+        None if the logged EKF2 height is used.
     vision : VisionFilter or None
-        Where vision is fused besides GNSS.
+        Set if vision is fused besides GNSS.
     """
 
     stretch: Stretch
@@ -190,7 +190,7 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     )
 
     def stacked(name: str, rows: slice = slice(None)) -> Any:
-        """A part of the intervals, shape (E, S, ...): what all variants share is there once."""
+        """Stack a field of the distinct intervals per variant, shape (E, S, ...)."""
         return np.stack([getattr(one_interval, name)[rows] for one_interval in distinct], axis=1)[
             :, variant_intervals
         ]
@@ -199,17 +199,17 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     action = np.where(gated, event["action"], np.where(event["usable"], FUSE, IDLE))
     end, active = event["end"], action > IDLE
     event_s, sampled = stretch.time_s[end], np.any(active, axis=1).tolist()
-    on = {
+    enabled = {
         aid.name: event_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
         for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)
     }
-    with_velocity = (action == FUSE) & on[GNSS_VEL.name] & fuses_velocity
+    with_velocity = (action == FUSE) & enabled[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, stretch, sample, end, parameters, reported)
     is_sequential, has_speed = inputs.aid == GNSS_POS, inputs.received.velocity_m_s is not None
     gates = [parameters.get(GNSS_VEL.gate, np.ones(size)), parameters[inputs.aid.gate]]
     gate2 = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
-    # height, and without a magnetometer the heading, are measured by EKF2's own
+    # logged EKF2 values serve as measurements of height and, without a magnetometer, of heading
     logged_own = np.stack([stretch.attitude_error_rad[end, HEADING], stretch.down_m[end]], axis=-1)
     own_attitude = stretch.attitude_variance_rad2[end]
     own_variance = np.stack([own_attitude[:, :, HEADING], stretch.down_variance_m2[end]], axis=-1)
@@ -217,26 +217,30 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     has_field, has_flow = np.zeros((2, events), bool)
 
     def means(source_aid: Aid, samples_per_interval: Sequence[EventSamples]) -> EventSamples:
-        """What all variants were sent of an aid, while it is there."""
+        """Return the samples of an aid for all variants, without those after it was disabled."""
         stacked_fields = (
             np.stack(part, axis=1)[:, variant_intervals]
             for part in zip(*samples_per_interval, strict=True)
         )
         mean_samples = EventSamples(*stacked_fields)
-        return mean_samples._replace(number=np.where(on[source_aid.name], mean_samples.number, 0.0))
+        return mean_samples._replace(
+            number=np.where(enabled[source_aid.name], mean_samples.number, 0.0)
+        )
 
     ends = [one.events.end for one in distinct]
     if (field := stretch.field) is not None:
         field_samples = means(MAG, [mean_by_event(field, one) for one in ends])
         has_field = np.asarray(field_samples.number.any(axis=1))
     if (flow := stretch.flow) is not None:
-        flow_samples = means(FLOW, [mean_by_event(flow, one, stretch.gained_m_s) for one in ends])
+        flow_samples = means(
+            FLOW, [mean_by_event(flow, one, stretch.imu_velocity_m_s) for one in ends]
+        )
         has_flow = np.asarray(flow_samples.number.any(axis=1))
     if stretch.heights is not None:
         samples = barometer_samples(stretch, ends)
         barometer_arrays = np.stack(samples, axis=-1)[..., variant_intervals]
         heights = HeightFilter(
-            stretch, barometer_arrays, event["time_s"], active, on, parameters, gated
+            stretch, barometer_arrays, event["time_s"], active, enabled, parameters, gated
         )
     if inputs.vision is not None:
         timings = [variant.timing(inputs) for variant in variants]
@@ -244,21 +248,23 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             vision_samples(inputs, stretch, each.events.end, variant.settings, at.horizon_s)
             for each, variant, at in zip(intervals, variants, timings, strict=True)
         ]
-        vision = VisionFilter(stretch, vision_by_variant, on, parameters, gated, reported)
+        vision = VisionFilter(stretch, vision_by_variant, enabled, parameters, gated, reported)
     gyro2 = np.where(attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     drift, drift_limit = _variance_growth(inputs, stretch, parameters, biases, attitude)
     steps = np.diff(end, axis=0, prepend=0)[:, :, None]
     force2 = np.broadcast_to(parameters["EKF2_ACC_NOISE"] ** 2, active.shape)[:, :, None, None]
-    if stretch.distrusted_share is not None:  # in how much of each interval
+    if stretch.bad_acceleration_share is not None:  # share of each interval with a bad acceleration
         sums = np.diff(
-            np.cumsum(stretch.distrusted_share)[end], axis=0, prepend=stretch.distrusted_share[0]
+            np.cumsum(stretch.bad_acceleration_share)[end],
+            axis=0,
+            prepend=stretch.bad_acceleration_share[0],
         )
         share = (sums[:, :, None] / np.maximum(steps, 1))[..., None]
         force2 = (1.0 - share) * force2 + share * BAD_ACCELERATION_NOISE**2
     floor = inputs.rules.bias_floor
     x, P = _start_state(stretch, biases, attitude)
     logged = inputs.received.rejected[sample], inputs.received.reset[sample]
-    used = on[inputs.aid.name]
+    used = enabled[inputs.aid.name]
     moved = inputs.received.moved_m if as_logged.any() else None
     usable = np.where(used, action, IDLE), event["startable"] & used, event_s, gated, as_logged
     fusion = _Fusion(inputs.rules, stretch.time_s[0], *usable, *logged)
@@ -273,7 +279,7 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     taken = np.zeros((size, POSITION_COLUMNS.stop), bool)
     for e in range(events):
         block_index = e % EVENT_BATCH_SIZE
-        if not block_index:  # intervals are long: a few at a time
+        if not block_index:  # intervals are long: stack a few at a time
             block = slice(e, e + EVENT_BATCH_SIZE)
             transition = stacked("transition", block)
             inputs_moved = stacked("drive", block) + attitude[:, None] * stacked("turn", block)
@@ -334,7 +340,8 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 R[fused[e], 2:] = noise[e, fused[e], POSITION_COLUMNS]
         if heights is not None:
             x, P = heights.fuse(e, x, P, measured[e, :, 5], noise[e, :, 5])
-        elif field_samples is not None:  # only the height is EKF2's own, and held
+        # with magnetic fields only the height is set to the logged one
+        elif field_samples is not None:
             K, P = _reduce_variance_to(P, DOWN, own_variance[e, :, 1])
             x = x + K * (logged_own[e, :, 1] - x[:, DOWN])[:, None]
             x[:, DOWN] = logged_own[e, :, 1]
@@ -361,12 +368,11 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                     measured[e, :, VELOCITY_COLUMNS],
                     noise[e, :, VELOCITY_COLUMNS],
                 )
-            # measured position minus the state before
             moved_m[e, reset[e]] = nu[reset[e], POSITION_COLUMNS]
         if vision is not None:
             vision.bias.value_m = vision.bias.value_m + moved_m[e]
             x, P = vision.fuse(e, x, P, True, fusion.last_s)
-            if inputs.rules.with_velocity:  # either of them is a position that is fused
+            if inputs.rules.with_velocity:  # GNSS or vision counts as a fused position
                 fusion.last_s = np.maximum(fusion.last_s, vision.fused_s)
         states[e + 1], spreads[e + 1] = x, _diagonal(P)
     innovations[~active], variances[~active] = np.nan, np.nan
@@ -391,7 +397,7 @@ def run_stretch(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 
 
 def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> tuple[Array, Array]:
-    """Fuse what is measured all at once: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
+    """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
     HP = np.take(P, MEASURED, axis=1)
     HPH = np.take(HP, MEASURED, axis=2)
     HPH.reshape(len(x), -1)[:, :: len(MEASURED) + 1] += R
@@ -402,10 +408,10 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> tuple[Arra
 
 
 def _reduce_variance_to(P: Array, row: int, target: Array) -> tuple[Array, Array]:
-    """Bring one variance down to the logged one, and with it all that it bears on; and the gain.
+    """Apply a scalar update that reduces P[row, row] to ``target``; return gain and P.
 
-    The magnetometer tells EKF2 of the tilt too. What it tells is not always in the log, so that the
-    tilt itself stays as it is.
+    The magnetometer also corrects the tilt in EKF2. It is not always logged, so the tilt itself is
+    not changed.
     """
     variance = P[:, row, row]
     R = _noise_to_reach(variance, target)
@@ -416,11 +422,11 @@ def _reduce_variance_to(P: Array, row: int, target: Array) -> tuple[Array, Array
 def _sequential_update(
     x: Array, P: Array, nu: Array, S: Array, R: Array, part: slice, is_fused: BoolArray
 ) -> tuple[Array, Array]:
-    """Fuse a part of a sample one after the other, by innovations and S of before the first.
+    """Fuse the components of a sample one after the other, with the initial innovations and S.
 
-    As fuseDirectStateMeasurement (``ekf_helper.cpp``), in Joseph's form, which bears a gain that is
-    not the optimal one: with c = PH' and K = wc it is P - KHP - (KHP)' + K(HPH' + R)K' = P - bcc',
-    b = w(2 - w(HPH' + R)). ``is_fused`` is of shape (S, k) or (S, 1).
+    As fuseDirectStateMeasurement (``ekf_helper.cpp``), in Joseph form, which is valid for any gain.
+    With c = PH' and K = wc: P - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
+    ``is_fused`` has shape (S, k) or (S, 1).
     """
     nu, S, R = (each[:, part] for each in (nu, S, R))
     weight = is_fused / S
@@ -446,10 +452,10 @@ def _sequential_update(
 def _rejection_by_output(
     moved_m: Array, nu: Array, S: Array, R: Array, gate2: Array
 ) -> tuple[BoolArray, BoolArray]:
-    """Whether a sample lies on the edge of the gate, and then whether it was rejected.
+    """Return two flags: sample near the gate limit, and then rejected by EKF2.
 
-    As what was published after it moved, of shape (k,), to less than half of what its fusion does,
-    (1 - R/S)ν; the others are of shape (S, k).
+    Rejected if the published position moved (``moved_m``, shape (k,)) by less than half of the
+    correction (1 - R/S)ν. The other arrays have shape (S, k).
     """
     ratio = (nu * nu / (gate2 * S)).max(axis=1)
     edge = (ratio > 1.0 / GATE_EDGE_RATIO) & (ratio < GATE_EDGE_RATIO) & np.isfinite(moved_m).all()
@@ -459,11 +465,12 @@ def _rejection_by_output(
 
 @dataclass
 class _Fusion:
-    """Which variants reject a sample, fuse it or are reset to it, one event after the other.
+    """State machine for rejection, fusion and reset of each variant, event by event.
 
     As updateEvPosFusion and startEvPosFusion (``ev_pos_control.cpp``): after a time without fusion
-    a reset, some of them in a row, then a stop until a sample on which fusion may start. Arrays are
-    of shape (E, S), (S,) or (E,); ``rejected`` and ``reset`` are what the log tells of EKF2.
+    the position is reset; after several resets in a row fusion stops until a sample on which it may
+    start. Arrays have shape (E, S), (S,) or (E,); ``rejected`` and ``reset`` are the logged
+    decisions.
     """
 
     rules: FusionRules
@@ -478,24 +485,25 @@ class _Fusion:
 
     def __post_init__(self) -> None:
         size = len(self.gated)
-        # last fusion of position and of velocity, whether stopped, resets left
+        # time of the last fusion of position and of velocity; stopped; remaining resets
         self.last_s, self.velocity_s = np.full((2, size), self.began_s)
         self.stopped, self.left = np.zeros(size, bool), np.full(size, self.rules.resets)
-        # every variant fuses, unless its gate says otherwise
-        self.usual = (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
+        # shortcut if all variants fuse unless their gate rejects the sample
+        self.all_fuse = (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
 
     def decide(
         self, e: int, outside: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Whose sample is rejected, fused, reset to, and whose velocity is fused.
+        """Return for each variant: rejected, fused, reset, and velocity fused.
 
-        ``outside`` is outside the gate, ``is_velocity_fused`` has a velocity that is fused, within its own.
+        ``outside``: position innovation outside the gate. ``is_velocity_fused``: velocity
+        innovation inside its gate.
         """
         rules, now_s, action = self.rules, self.time_s[e], self.action[e]
         gated, follows_log = self.gated, self.as_logged
         fusing, is_decision_logged = action == FUSE, math.isfinite(self.rejected[e])
         self.velocity_s = np.where(is_velocity_fused, now_s, self.velocity_s)
-        if self.usual[e] and not (outside.any() or self.stopped.any()):
+        if self.all_fuse[e] and not (outside.any() or self.stopped.any()):
             self.last_s = now_s
             return outside, fusing, outside, is_velocity_fused
         is_rejected = (
@@ -505,11 +513,11 @@ class _Fusion:
         )
         is_fused = fusing & ~is_rejected & ~self.stopped
         is_starting = gated & ((action == START) | (self.stopped & self.startable[e]))
-        silent_s = now_s - self.last_s
-        is_failing = is_rejected & ~self.stopped & (silent_s > rules.reset_s)
+        gap_s = now_s - self.last_s
+        is_failing = is_rejected & ~self.stopped & (gap_s > rules.reset_s)
         if rules.with_velocity:
             both = now_s - self.velocity_s > rules.reset_s
-            is_failing &= both | (silent_s > 2.0 * rules.reset_s)
+            is_failing &= both | (gap_s > 2.0 * rules.reset_s)
         is_restarted = is_starting | (is_failing & (self.left > 0))
         if is_decision_logged or self.reset[e]:
             is_restarted = np.where(follows_log, gated & self.reset[e], is_restarted)
@@ -530,7 +538,7 @@ def _variance_growth(
     biases: BoolArray,
     attitude: BoolArray,
 ) -> tuple[Array, Array]:
-    """Variance that biases and fields gain per step, and at which variance they stop gaining."""
+    """Return the variance growth of biases and fields per step, and its upper limit."""
     field_parameters = ("MAG_E", "MAG_B") if stretch.field is not None else ()
     noise_density = np.stack(
         [parameters[f"EKF2_{of}_NOISE"] for of in ("GYR_B", "ACC_B", *field_parameters)], axis=-1
@@ -546,11 +554,11 @@ def _variance_growth(
 
 
 def with_correlation(inputs: Inputs, stretch: Stretch, intervals: Intervals) -> Stretch:
-    """The same stretch with the correlations at its start; the log holds variances only.
+    """Return the stretch with correlations of the initial state; the log has variances only.
 
-    Without them the first samples would share out anew between tilt and accelerometer bias what
-    EKF2 had long settled. They come of what was before; where the log has nothing of it, of the
-    first seconds.
+    Without correlations the first samples would divide the error between tilt and accelerometer
+    bias differently than EKF2. They are estimated from the flight before the stretch, or else from
+    its first seconds.
     """
     flown_variant, inputs = Variant(inputs.settings), replace(inputs, vision=None)
     if (earlier := stretch.history) is not None:
@@ -569,7 +577,8 @@ def with_correlation(inputs: Inputs, stretch: Stretch, intervals: Intervals) -> 
             run_stretch(inputs, stretch, [flown_variant], [first_intervals]).covariance[0]
         )
     if stretch.field is not None:
-        # EKF2 has just reset heading and fields, which parts them from all other states
+        # EKF2 has just reset heading and fields, which makes them uncorrelated with all other
+        # states
         correlation = block_diag(correlation[:STATES, :STATES], np.eye(len(stretch.state) - STATES))
         correlation[HEADING], correlation[:, HEADING] = 0.0, 0.0
         correlation[HEADING, HEADING] = 1.0
@@ -577,16 +586,16 @@ def with_correlation(inputs: Inputs, stretch: Stretch, intervals: Intervals) -> 
 
 
 def _correlation(P: Array) -> Array:
-    # a bias that EKF2 does not learn has no variance
+    # a bias that EKF2 does not estimate has no variance
     deviation = np.sqrt(np.maximum(np.diagonal(P), MIN_VARIANCE))
     return np.asarray(P / deviation[:, None] / deviation)
 
 
 def _settled_correlation(stretch: Stretch) -> Array:
-    """Correlations of a state whose velocity was measured for long.
+    """Return the correlations of a state after a long time of velocity fusion.
 
-    Errors of the tilt and of the accelerometer's bias are known together: what they do to the
-    acceleration cancels, θ x f = Rb, as far as both are as large.
+    Errors of tilt and accelerometer bias become correlated, because their effects on the
+    acceleration cancel: θ × f = Rb.
     """
     to_earth = np.eye(STATES)
     to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = stretch.rotation[0]
@@ -597,12 +606,12 @@ def _settled_correlation(stretch: Stretch) -> Array:
 
 
 def _diagonal(P: Array) -> Array:
-    """Its variances: a view, not a copy."""
+    """Return the variances as a view, not a copy."""
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
 def _start_state(stretch: Stretch, biases: BoolArray, attitude: BoolArray) -> tuple[Array, Array]:
-    """State and covariance at the start, without what a variant does not estimate."""
+    """Return initial state and covariance, without the states that a variant does not estimate."""
     x = np.tile(stretch.state, (len(biases), 1))
     deviation = np.sqrt(stretch.variance)
     P = np.tile(deviation[:, None] * stretch.correlation * deviation, (len(biases), 1, 1))
@@ -619,10 +628,10 @@ def _start_state(stretch: Stretch, biases: BoolArray, attitude: BoolArray) -> tu
 
 
 def _noise_to_reach(variance: Array, target: Array) -> Array:
-    """Noise of the measurement that brings a variance down to a target: 1/target - 1/variance.
+    """Return the measurement noise that reduces a variance to a target: 1/target - 1/variance.
 
-    Height and heading come from sensors that logs hold thinly. EKF2's own ones stand in for them as
-    measurements, so that their variances become the logged ones.
+    Height and heading sensors are logged at a reduced rate. EKF2's published values are fused
+    instead, with a noise that reproduces the logged variances.
     """
     surplus = variance - target
     noise = np.full(surplus.shape, IGNORED_VARIANCE)
@@ -631,7 +640,7 @@ def _noise_to_reach(variance: Array, target: Array) -> Array:
 
 
 def _limit_bias(P: Array, floor: float, biases: BoolArray) -> None:
-    """Keep the bias variance within PX4's limits (fixCovarianceErrors, up to v1.14)."""
+    """Limit the bias variance as PX4 up to v1.14 (fixCovarianceErrors)."""
     variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(BIAS_RATIO * variance.max(axis=1, keepdims=True), floor)
     variance[biases] = np.clip(variance, min_variance, MAX_BIAS_SD**2)[biases]
@@ -645,7 +654,7 @@ def _measurements(
     parameters: dict[str, Array],
     reported: BoolArray,
 ) -> tuple[Array, Array]:
-    """Measured velocity and position and their variances, both of shape (E, S, 6)."""
+    """Return measured velocity and position and their variances, both of shape (E, S, 6)."""
     received, aid = inputs.received, inputs.aid
     offset_m = (np.stack([parameters[name] for name in aid.place], -1) - inputs.imu_offset_m)[
         :, :, None
@@ -660,7 +669,7 @@ def _measurements(
         reported_variance, np.maximum(parameters[aid.noise], MIN_SD)[:, None] ** 2
     )
     if received.velocity_m_s is not None and received.velocity_variance_m2_s2 is not None:
-        # the antenna's own, as the vehicle turns
+        # velocity of the antenna relative to the IMU during rotation
         rotation_rate = (
             np.diff(stretch.rotation, axis=0)[end - 1] / stretch.step_s[end - 1, None, None]
         )

@@ -1,4 +1,4 @@
-"""What a replay of EKF2 gives, and whether it agrees with the log, so that it may be believed."""
+"""Result of an EKF2 replay, and its agreement with the log."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -42,40 +42,40 @@ VELOCITY_UPDATE_COLUMNS = [
     *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
 ]
 MIN_SAMPLES = 20
-CONSTANT = "its logged or replayed innovations are constant"
-# The older topics repeat a sample until the next fusion, with the time of a later step
+CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
+# s; the older topics repeat a sample until the next fusion, with later timestamps
 MAX_REPEAT_S = 0.5
-# Measured on simulated flights of v1.13 to main: where the log is complete the correlation is
-# above 0.997 and the median ratio of S within 0.3 %; with a decimated source or with an IMU with
-# dropouts S is off by more than 5 % or the correlation below 0.9 (tests/benchmarks/bench_ekf2.py)
+# Measured on simulated flights of v1.13 to main: for complete logs the correlation is above 0.997
+# and the median S ratio within 0.3 %. With a downsampled source or IMU dropouts S differs by more
+# than 5 % or the correlation is below 0.9 (tests/benchmarks/bench_ekf2.py)
 MIN_CORRELATION = 0.95
 MAX_S_DIFFERENCE = 0.05
-# Of the position that EKF2 publishes; there it is within 0.013 m
+# m RMS of the published position; complete logs are within 0.013 m
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
-# and where flow alone carries it, of which the log has a part
+# m; larger while optical flow is the only horizontal aid, because flow is logged at a reduced rate
 MAX_CARRIED_OFF_M = 0.5
-# Where EKF2 rejects much, one sample on the edge of the gate decides the next ones: then shares
-# and mean NIS must agree, and single samples when the model rejects what EKF2 rejected
+# With many rejections one sample near the gate limit changes the next ones. Then rejected shares
+# and mean NIS must agree, and single samples in a replay with the logged rejections
 REJECTING_SHARE = 0.1
 MAX_REJECTED_DIFFERENCE = 0.05
 MAX_NIS_DIFFERENCE = 0.25
-# What is published by a filter that rejects most of its samples wanders further
+# factor on MAX_PUBLISHED_DIFFERENCE_M while most samples are rejected
 REJECTING_TOLERANCE_FACTOR = 3.0
 
 
 class AxisAgreement(Record, frozen=True, kw_only=True):
-    """Replay as flown against log, along north or east.
+    """Agreement of the replay as flown with the log, along one axis.
 
     Attributes
     ----------
     innovation_correlation : float
     innovation_rms_difference : float
-        In the aid's unit: m for a position.
+        In the unit of the aid: m for a position.
     s_ratio_median, s_ratio_p5, s_ratio_p95 : float
         Replayed over logged innovation variance.
     nis_mean_logged, nis_mean_replayed : float
     position_rms_difference_m, velocity_rms_difference_m_s : float
-        Of what is published.
+        Published state, replay minus log.
     """
 
     innovation_correlation: Correlation
@@ -90,40 +90,39 @@ class AxisAgreement(Record, frozen=True, kw_only=True):
 
 
 class Agreement(Record, frozen=True, kw_only=True):
-    """How well the replay as flown agrees with what EKF2 logged.
+    """Agreement of the replay as flown with the log of EKF2.
 
     Attributes
     ----------
     north, east : AxisAgreement
-        Of the position that EKF2 fused.
+        Of the fused position.
     ev_pos, gnss_pos : mapping from "north" and "east" to AxisAgreement
-        The same by the name of the aid, and of vision that is fused besides GNSS.
+        The same by aid; also vision fused besides GNSS.
     gnss_vel : mapping from "north", "east" and "down" to AxisAgreement
-        Of the velocity that is fused with it; "down" where its height is fused too.
+        GNSS velocity; "down" only if GNSS height is fused too.
     gnss_hgt, baro_hgt : mapping from "down" to AxisAgreement
-        Of the heights, where the log holds what EKF2 fused of them.
+        Heights, if the log contains all fused samples.
     samples : int
-        Logged innovations compared, all but those of each stretch's first seconds
+        Logged innovations compared, without the first seconds of each stretch
         (:data:`~px4fuse.ekf2.stretches.SETTLING_S`).
     rejected_share_logged, rejected_share_replayed : float
-        Of those.
+        Share of these samples.
     decisions_same : float
-        Share of those that both reject or both do not.
+        Share of samples rejected in both or in neither.
     published_rms_difference_m : float
-        Of the horizontal position that is published, replay minus log.
+        Published horizontal position, replay minus log.
     heading_rms_difference_deg : float or None
-        Of the filter's heading; None where the replay takes it from the log.
+        Heading of the filter; None if the replay uses the logged heading.
     carried_difference_m : float or None
-        Of the same, the largest while optical flow alone carried the position, which is not in what
-        is said of it otherwise; None where positions never failed for long.
+        Largest horizontal difference while optical flow was the only aid, which the other numbers
+        exclude; None if there was no such time.
     doubtful : mapping from PX4's name of an aid to str
-        Of which nothing may be concluded, and why: heights, instead of which the replay has EKF2's
-        own as flown, optical flow, without which it begins again where positions do, and vision
-        besides GNSS, which the replay leaves out.
+        Aids whose replay does not agree, with the reason. The replay then uses the logged EKF2
+        height, does not bridge gaps with optical flow, and omits vision besides GNSS.
     good : bool
-        Whether anything may be concluded from a replay of this log.
+        True if the replay agrees with the log.
     reason : str
-        One sentence: why, or why not.
+        One sentence with the numbers.
     """
 
     north: AxisAgreement
@@ -146,34 +145,34 @@ class Agreement(Record, frozen=True, kw_only=True):
 
     @property
     def axes(self) -> Mapping[str, AxisAgreement]:
-        """Of the position, by axis."""
+        """Agreement of the position by axis."""
         return {"north": self.north, "east": self.east}
 
     def as_unavailable(self, what: str) -> Unavailable:
-        """What stands in for a conclusion where the replay is not good."""
+        """Return the Unavailable for a result that needs an agreeing replay."""
         profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
         return Unavailable(
-            f"{what}",
+            what,
             f"the EKF2 replay does not agree with the log: {self.reason}",
             f"Record without dropouts and with SDLOG_PROFILE {profile}.",
         )
 
 
 class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """EKF2 replayed from the log.
+    """EKF2 replay from the log, in the form that is serialised.
 
     Attributes
     ----------
     source : str
-        Position track that it was fed with.
+        Position track that was fused.
     stretches_s : tuple of (float, float)
-        Parts of the flight that were replayed, each started from the log.
+        Replayed parts of the flight, each started from the log.
     settings : mapping
-        All parameters of the model in force, by PX4 name, in PX4's units.
+        All parameters of the model, by PX4 name, in PX4's units.
     late, lost : int
-        Samples that arrived after the horizon had passed them: fused late, and never.
+        Samples that arrived behind the fusion horizon: fused late, and never fused.
     agreement : Agreement or None
-        Of the replay as flown with the log; None only while that is being made.
+        Agreement of the replay as flown with the log; None while it is computed.
     """
 
     source: str
@@ -185,30 +184,29 @@ class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
 
 
 class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
-    """EKF2 as the model replays it with one setting.
+    """Replay of EKF2 with one set of parameters.
 
     Attributes
     ----------
     changed : mapping
-        Parameters that differ from the log's on request.
-    updates : DataFrame, shape (m, 14), (m, 20) where velocity is fused too
-        Per sample, by the time of measurement as EKF2 takes it (stamp - delay - half a
-        step): innovation (measurement minus state) and its variance S, north and east; 1 or 0
-        whether it was rejected by the gate, fused, or the position reset to it; variances of
-        position and velocity after it, R, and the end of the step in which that happened; then
-        the same innovations of velocity.
+        Parameters changed on request.
+    updates : DataFrame, shape (m, 14), (m, 20) with velocity
+        One row per sample, at EKF2's measurement time (timestamp - delay - half a step): innovation
+        (measurement minus state) and its variance S, north and east; 1 or 0 for rejected, fused and
+        reset; variances of position and velocity after it, R, and the end of its prediction step;
+        then the velocity innovations.
     other_aid_updates : mapping from PX4's name to DataFrame, shape (k, 5), (k, 8) of vision
-        Per sample of GNSS height and barometer, and of vision besides GNSS, where they are fused:
-        innovation and S (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``,
-        ``fused`` and ``fused_at_s``; and of vision, north and east, ``reset``: whether the position
-        was reset to it. Where only the bias of vision begins anew there is no row.
+        One row per sample of GNSS height, barometer, and vision besides GNSS: innovation and S
+        (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``, ``fused`` and
+        ``fused_at_s``; for vision north and east, and ``reset``. No row if only the bias of vision
+        was reset.
     flow_only_spans_s : tuple of (float, float)
-        From the last position to the next ones, where optical flow alone carried the filter.
+        Times between positions in which optical flow was the only horizontal aid.
     delayed : DataFrame, shape (n, 7)
         Position and velocity at the fusion horizon at the end of each step (m, m/s, NED), and
         ``heading_rad``.
     published : DataFrame, shape (n, 6)
-        What EKF2 publishes then, by its output predictor.
+        State published by the output predictor at these times.
     """
 
     schema_type = Replayed
@@ -223,7 +221,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
 
     @property
     def judged_s(self) -> Spans:
-        """Parts that are judged: each stretch without its beginning and what flow carried."""
+        """Evaluated parts: each stretch without its start and without flow-only times."""
         spans = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -243,7 +241,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     ----------
     flight : Flight
     replay : Ekf2Replay
-        With the log's own parameters.
+        With the logged parameters.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
@@ -252,11 +250,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     if len(log) < MIN_SAMPLES:
         return Unavailable(
             "EKF2 replay",
-            (
-                f"only {len(log)} logged innovations to compare with (at least {MIN_SAMPLES} "
-                "are needed)"
-            ),
-            ("Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default)."),
+            f"only {len(log)} logged innovations to compare with (at least {MIN_SAMPLES} "
+            "are needed)",
+            "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
         )
     if _constant(log, model, HORIZONTAL):
         return Unavailable(
@@ -276,15 +272,14 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     other_agreements, doubtful = _other_agreements(ekf2, replay)
     velocity, constant = _velocity_agreement(ekf2, replay, own=own)
     if constant:
-        doubtful[GNSS_VEL.name] = CONSTANT
+        doubtful[GNSS_VEL.name] = CONSTANT_INNOVATIONS
     position = {GNSS_POS.name if on_gnss else EV_POS.name: axes}
     distance_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     carried_m = _flow_only_error_m(ekf2, replay)
     if carried_m is not None and carried_m > MAX_CARRIED_OFF_M:
         doubtful[FLOW.name] = (
-            "while it alone carried the position, what is published comes "
-            f"{_format_beyond(carried_m, MAX_CARRIED_OFF_M)} m off the log (at most "
-            f"{MAX_CARRIED_OFF_M:g} m)"
+            f"while {FLOW.label} was the only horizontal aid, the published position differs by "
+            f"{_format_beyond(carried_m, MAX_CARRIED_OFF_M)} m (limit {MAX_CARRIED_OFF_M:g} m)"
         )
     return Agreement(
         north=north,
@@ -305,7 +300,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
 
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """How far what is published comes off the log horizontally while flow alone carried it."""
+    """Return the largest horizontal difference (m) to the log in flow-only times, or None."""
     times = ekf2.state.index
     within = inside_spans(times, replay.flow_only_spans_s)
     if not within.any():
@@ -319,7 +314,7 @@ def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 
 
 def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Of a replay that fuses the magnetometer."""
+    """Return the RMS heading difference (deg) of a replay with the magnetometer, or None."""
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
     logged = ekf2.record.delayed
@@ -334,7 +329,7 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 
 
 def _constant(logged: pd.DataFrame, model: pd.DataFrame, axes: Iterable[AxisName]) -> bool:
-    """Return True if the innovations of an axis are all equal: they have no correlation."""
+    """Return True if the innovations of an axis are constant, so that no correlation exists."""
     columns = [f"innovation_{axis}_m" for axis in axes]
     return not all(np.ptp(one[columns], axis=0).all() for one in (logged, model))
 
@@ -342,9 +337,9 @@ def _constant(logged: pd.DataFrame, model: pd.DataFrame, axes: Iterable[AxisName
 def _velocity_agreement(
     ekf2: Ekf2, replay: Ekf2Replay, *, own: bool
 ) -> tuple[dict[str, AxisAgreement], bool]:
-    """Agreement of the velocity of GNSS, and whether there is none for constant innovations.
+    """Return the agreement of GNSS velocity, and True if its innovations are constant.
 
-    Empty where it is not fused or not logged.
+    The agreement is empty if velocity is not fused or not logged.
     """
     log = ekf2.aids.get("gnss_vel")
     if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
@@ -352,13 +347,13 @@ def _velocity_agreement(
     logged, model = _matched_samples(replay, replay.updates, log.samples, own=own)
     if len(logged) < MIN_SAMPLES:
         return {}, False
-    names: dict[str, str] = {}  # those of a position
+    names: dict[str, str] = {}  # map to the column names of a position
     for axis in AXIS_NAMES:
         nu, S = f"innovation_{axis}_m", f"innovation_variance_{axis}_m2"
         names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
     logged = logged.rename(columns=names)
     model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
-    # down where the height is no longer EKF2's own
+    # down only if the logged EKF2 height is not used
     axes = AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL
     if _constant(logged, model, axes):
         return {}, True
@@ -366,7 +361,7 @@ def _velocity_agreement(
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Agreement of what was fused besides, and which of these aids do not agree, and why."""
+    """Return the agreement of the other aids, and the reasons for those that disagree."""
     agreements: dict[str, dict[str, AxisAgreement]] = {}
     doubtful = {}
     for name, updates in replay.other_aid_updates.items():
@@ -375,10 +370,10 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
         rows = logged_aid_innovations(name, log)
         logged, model = _matched_samples(replay, updates, rows, own=own)
         if len(logged) < MIN_SAMPLES:
-            doubtful[name] = f"{len(logged)} logged innovations are too few to compare with"
+            doubtful[name] = f"only {len(logged)} logged innovations to compare with"
             continue
         if _constant(logged, model, axes_of(updates)):
-            doubtful[name] = CONSTANT
+            doubtful[name] = CONSTANT_INNOVATIONS
             continue
         agreements[name] = {
             axis: _axis_agreement(axis, logged, model, ekf2, replay) for axis in axes_of(updates)
@@ -391,28 +386,28 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
 
 
 def logged_aid_innovations(name: str, log: AidLog) -> pd.DataFrame:
-    """Innovations, variances and rejections of an aid that is fused besides, by PX4's name."""
+    """Return innovations, variances and rejections of an aid, given by PX4's name."""
     gate = log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in log.axes]
     return _columns_by_axis({axis: innovations_along(log, axis, gate) for axis in axes})
 
 
 def axes_of(updates: pd.DataFrame) -> list[AxisName]:
-    """Along which axes there are innovations of position."""
+    """Return the axes with position innovations."""
     return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
 
 
 def _matched_samples(
     replay: Ekf2Replay, updates: pd.DataFrame, logged: pd.DataFrame, *, own: bool
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The logged innovations that are judged, and the updates of the same samples."""
+    """Return the evaluated logged innovations and the updates of the same samples."""
     matched = match_updates(updates, logged.index.to_numpy(), own=own)
     is_used = (matched >= 0) & inside_spans(logged.index, replay.judged_s)
     return logged[is_used], updates.iloc[matched[is_used]]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
-    """Innovations, variances and rejections of north and east, one row per logged sample."""
+    """Return innovations, variances and rejections, north and east, one row per logged sample."""
     return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL})
 
 
@@ -428,7 +423,7 @@ def _columns_by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable])
 
 
 def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
-    """Which times lie in one of some spans."""
+    """Return True for each time inside one of the spans."""
     times = np.asarray(times_s)
     is_inside = np.zeros(times.shape, bool)
     for start, end in spans:
@@ -437,9 +432,9 @@ def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
 
 
 def match_updates(updates: pd.DataFrame, times: Array, *, own: bool) -> IntArray:
-    """Row of the updates of each logged innovation; -1 where there is none.
+    """Return the row of the update of each logged innovation; -1 without one.
 
-    ``own``: of the aid's own topic, which has the times of measurement.
+    ``own``: the times are EKF2's measurement times, from the topic of the aid.
     """
     if own:
         return same_sample(updates.index.to_numpy(), times)
@@ -476,13 +471,13 @@ def _axis_agreement(
 
 
 def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
-    """Columns of a time-indexed frame, interpolated, along a direction."""
+    """Interpolate the component of a time-indexed vector along a direction."""
     summed = signals.along(frame, columns, direction[: len(columns)])
     return np.asarray(np.interp(times, frame.index, summed))
 
 
 def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array) -> float | None:
-    """Error of a position (m, RMS) along a direction in the truth's span; None without truth."""
+    """Return the position RMSE against ground truth along a direction (m), or None."""
     if not isinstance(flight.truth, Truth):
         return None
     needed = Columns.POSITION[2:] if direction[2] else Columns.POSITION[:2]
@@ -495,7 +490,7 @@ def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array
 
 
 def rms(values: Array) -> float:
-    """Root of the mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -505,60 +500,59 @@ def _agreement_verdict(
     replayed_share: float,
     published_factor: float = 1.0,
 ) -> tuple[bool, str]:
-    """Whether a replay may be believed, and why or why not; ``published_factor`` is what it publishes."""
+    """Return True if the replay agrees with the log, and the reason with numbers.
+
+    ``published_factor`` multiplies the limit of the published position.
+    """
     ratio = max((axis.s_ratio_median for axis in axes.values()), key=lambda s: abs(s - 1.0))
     if abs(ratio - 1.0) > MAX_S_DIFFERENCE:
         return False, (
-            f"the replayed innovation variance is {ratio:.2f} of the logged one (at most "
-            f"{MAX_S_DIFFERENCE:.0%} off): EKF2 had other samples than the log holds"
+            f"S ratio replay / log is {ratio:.2f} (tolerance {MAX_S_DIFFERENCE:.0%}): EKF2 fused "
+            "samples that are not in the log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
-    correlated = f"replayed and logged innovations correlate by {min_correlation:.4f}"
+    correlated = f"correlation of replayed and logged innovations {min_correlation:.4f}"
     if min_correlation >= MIN_CORRELATION:
         off_m = max(axis.position_rms_difference_m for axis in axes.values())
         most_m = published_factor * MAX_PUBLISHED_DIFFERENCE_M
         if off_m > most_m:
             return False, (
-                "the innovations agree, but what is published is "
-                f"{_format_beyond(off_m, most_m)} m off the log (RMS; at most {most_m:g} m): EKF2's "
-                "output is not of this filter alone"
+                "the innovations agree, but the published position differs by "
+                f"{_format_beyond(off_m, most_m)} m RMS (limit {most_m:g} m): EKF2's output has "
+                "other inputs"
             )
         return True, f"{correlated} or better"
     if max(logged_share, replayed_share) < REJECTING_SHARE:
         return False, f"{correlated} only (at least {MIN_CORRELATION:g})"
     rejected_difference = abs(replayed_share - logged_share)
     nis = max(abs(a.nis_mean_replayed / a.nis_mean_logged - 1.0) for a in axes.values())
-    text = (
-        f"{replayed_share:.1%} of the samples are rejected, {logged_share:.1%} in the log, and "
-        f"mean NIS differs by {nis:.0%}"
-    )
+    text = f"rejected {replayed_share:.1%} (log {logged_share:.1%}); mean NIS differs by {nis:.0%}"
     if rejected_difference > MAX_REJECTED_DIFFERENCE or nis > MAX_NIS_DIFFERENCE:
-        return (
-            False,
-            f"{text} (at most {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%} are allowed)",
+        return False, (
+            f"{text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
         )
-    return True, f"{text}; single samples part, since each rejection decides the next"
+    return True, f"{text}; single innovations differ: each rejection changes the next ones"
 
 
 def _format_beyond(value: float, most: float) -> str:
-    """A value beyond what is allowed, with two decimals, or as many as it takes to show that."""
+    """Format a value above a limit with as many decimals as show the excess, at least two."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > most or n == 16)
 
 
 def with_logged_rejections(
     agreement: Agreement, logged_rejections_agreement: Agreement, *, has_all_decisions: bool
 ) -> Agreement:
-    """The verdict where EKF2 rejects much: of a replay that rejects what EKF2 rejected.
+    """Return the agreement with the verdict of the replay with logged rejections.
 
-    By its own gate the replay parts from the log where one sample lies on the edge, and each
-    rejection decides the next; that says nothing of the filter.
+    With many rejections one sample near the gate limit makes the replay differ from the log,
+    although the filter is the same.
 
     Parameters
     ----------
     agreement, logged_rejections_agreement : Agreement
-        Of the replay by its own gate, and of the other.
+        Of the replay with the model's gate, and with the logged rejections.
     has_all_decisions : bool
-        Whether what EKF2 did with every sample is known: then all else is of the other one too.
+        True if every decision of EKF2 is known: then the second agreement is returned.
     """
     good, reason = _agreement_verdict(
         logged_rejections_agreement.axes, 0.0, 0.0, REJECTING_TOLERANCE_FACTOR
@@ -568,5 +562,5 @@ def with_logged_rejections(
         rejected_share_replayed=agreement.rejected_share_replayed,
         decisions_same=agreement.decisions_same,
         good=good,
-        reason=f"with EKF2's own rejections, {reason}",
+        reason=f"with EKF2's logged rejections: {reason}",
     )

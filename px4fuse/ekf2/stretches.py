@@ -1,6 +1,6 @@
-"""The parts of a flight that the model replays in one go: prediction steps and where to start.
+"""Continuous parts of a flight for the EKF2 replay: prediction steps and initial state.
 
-Sources: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
+Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import one_line_repr
-from px4fuse.ekf2.earth import earth_rate_rad_s, metres_of
+from px4fuse.ekf2.earth import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.readers.px4_ekf2 import rows_of_stamps, samples_per_step
 from px4fuse.trajectory.rotation import (
@@ -27,62 +27,62 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-# Without source or IMU for longer than this the model starts again from the log: other things
-# then move EKF2 (gravity, fake position, zero velocity), which the model does not have
+# s; after a longer gap in the source or IMU the replay restarts from the log, because EKF2 then
+# fuses gravity, fake positions or zero velocity, which the model does not contain
 RESTART_GAP_S = 2.0
-# PX4 limits a prediction step to twice EKF2_PREDICT_US, so that a longer gap is lost motion
+# s; PX4 limits a prediction step to 2 EKF2_PREDICT_US, so motion in a longer gap is lost
 IMU_GAP_S = 0.05
-# Fusion must have run so long when the model starts, and the model so long before it is judged
+# s; minimum time of fusion before the replay starts
 START_AFTER_S = 1.0
-# and the vehicle so long off the ground: on it EKF2 fuses zero velocity and gravity, and taking off
-# settles what is tilt and what is accelerometer bias
+# s; minimum time in the air before the replay starts: on the ground EKF2 fuses zero velocity and
+# gravity, and take-off separates tilt from accelerometer bias
 AIRBORNE_S = 4.0
-SETTLING_S = 5.0
-# EKF2 resets heading and fields when the vehicle has taken off; what the log has is of after that
+SETTLING_S = 5.0  # s; time of the replay before it is evaluated
+# s; EKF2 resets heading and fields after take-off, and only later samples are logged
 FIELD_AFTER_S = 1.0
-# So long before the start begins what the correlations there come of, where the log has it
+# s; flight time before the start of the replay, used to estimate the initial correlations
 HISTORY_S = 20.0
-# EKF2 fuses 14 samples of the field a second (SENS_MAG_RATE is 15): one of fewer that are in the
-# log stands for several, down to this rate
+# Hz; EKF2 fuses the field at 14 Hz (SENS_MAG_RATE 15), a logged sample represents several; and the
+# lowest logged rate that can be replayed
 FIELD_HZ, MIN_FIELD_HZ = 14.0, 1.5
-# Time constant of EKF2's low pass of innovations (updateAidSourceStatus, ekf_helper.cpp)
+# s, time constant of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
 FILTER_S = 0.5
 MIN_STRETCH_S = 10.0
-# Resets are published up to the longest delay and a row of the log later
+# s; resets are published up to the largest delay plus one row of the log later
 MAX_RESET_DELAY_S = 0.5
-# Of the samples in a second: more clipped ones are lost motion
+# fraction of clipped samples within 1 s above which the motion is lost
 MAX_CLIPPED_SHARE = 0.05
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 
 
-# States, of Stretch.state
+# Row ranges in Stretch.state
 STATES = 15
-IMU_STATE_COUNT = 9  # of them, those that the IMU moves: all but the biases
+IMU_STATE_COUNT = 9  # states that the IMU propagates: all except the biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
-EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, where they are fused
+EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, if fused
 
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """What the magnetometer or optical flow measured in one stretch, in m means of some samples.
+    """Magnetometer or optical flow samples of one stretch, as m means of several samples.
 
     Attributes
     ----------
     step : ndarray of int, shape (m,)
-        At the end of which prediction step EKF2 takes the last sample of each.
+        Prediction step after which EKF2 fuses the last sample of each mean.
     value : ndarray, shape (m, k)
-        The field in the body (gauss, FRD); or the velocity forward and to the right (m/s), less
-        what the IMU gained of it since the stretch began.
+        Magnetic field (gauss, body FRD); or velocity forward and right (m/s) minus the velocity
+        change that the IMU measured since the start of the stretch.
     turn : ndarray, shape (m, k, 3)
-        Mean rotation from NED to these.
+        Mean rotation from NED to the body axes.
     samples : ndarray, shape (m,)
-        How many EKF2 had.
+        Number of samples that EKF2 received.
     noise : ndarray, shape (m,)
-        R of one sample, where the settings do not have it; else 0.
+        R of one sample; 0 if it follows from the parameters.
     gate : float
-        In standard deviations, where the settings do not have it.
+        In √S; infinite if it follows from the parameters.
     """
 
     step: IntArray
@@ -97,24 +97,24 @@ class SensorSamples:
 
 @dataclass(frozen=True)
 class HeightSamples:
-    """What EKF2's height rests on in one stretch.
+    """Height measurements of one stretch.
 
     Attributes
     ----------
     fused : tuple of str
-        PX4's names of its sensors: of the barometer, of GNSS, or of both.
+        PX4's names of the height sensors: barometer, GNSS, or both.
     reference : str
-        The one that has no bias.
+        Sensor without bias.
     bias : (float, float)
-        By how much the other one is too high at the start (m), and its variance (m²).
+        Initial bias of the other sensor (m, positive: too high), and its variance (m²).
     step : ndarray of int, shape (m,)
-        At the end of which prediction step EKF2 takes each sample of the barometer.
+        Prediction step after which EKF2 fuses each barometer sample.
     taken_s, down_m : ndarray, shape (m,)
-        When it takes it to have been measured, and what it is.
-    dead_m : ndarray, shape (m,)
-        By how much it may be below the state unheeded: in ground effect.
+        EKF2's measurement time, and the height.
+    dead_zone_m : ndarray, shape (m,)
+        Dead zone: in ground effect a height this far below the state is ignored.
     weight : float
-        Samples that EKF2 had for each one in the log.
+        Number of EKF2 samples per logged sample.
     """
 
     fused: tuple[str, ...]
@@ -123,7 +123,7 @@ class HeightSamples:
     step: IntArray
     taken_s: Array
     down_m: Array
-    dead_m: Array
+    dead_zone_m: Array
     weight: float
 
     __repr__ = one_line_repr
@@ -131,10 +131,10 @@ class HeightSamples:
 
 @dataclass(frozen=True)
 class Stretch:
-    """A part of the flight that the model replays in one go: n prediction steps.
+    """Continuous part of a flight that is replayed in one run of n prediction steps.
 
-    The nominal attitude is the published one; what the model estimates is its error, so that the
-    equations are linear. Vectors are NED unless they are said to be of the body.
+    The nominal attitude is the published one. The model estimates its error, so the equations are
+    linear. Vectors are in NED unless noted.
 
     Attributes
     ----------
@@ -144,42 +144,40 @@ class Stretch:
     rotation : ndarray, shape (n + 1, 3, 3)
         Nominal attitude, body FRD to NED.
     correction_rad : ndarray, shape (n, 3)
-        By how much the nominal attitude turns in each step beyond what the gyro measured of the
-        vehicle, less how the earth turned.
+        Rotation of the nominal attitude in each step minus the rotation measured by the gyro, plus
+        the rotation of the earth.
     force_m_s2 : ndarray, shape (n, 3)
-        Specific force of the body in each step, nominal bias removed, in the frame at its end.
+        Specific force in each step (body frame at its end), without the nominal bias.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
-        Nominal bias: the log's at the start.
+        Nominal bias: the logged one at the start.
     state : ndarray, shape (15,) or (21,)
-        At the start: attitude error, velocity, position, errors of both biases, magnetic fields.
+        Initial attitude error, velocity, position, errors of both biases, magnetic fields.
     variance : ndarray, shape (15,) or (21,)
-        At the start, in the same order.
+        Initial variances, in the same order.
     down_m : ndarray, shape (n + 1,)
         Published height.
     attitude_variance_rad2 : ndarray, shape (n + 1, 3)
     down_variance_m2 : ndarray, shape (n + 1,)
-        As the log has them.
+        Logged variances.
     attitude_error_rad : ndarray, shape (n + 1, 3)
-        Of EKF2's own filter at its horizon, against the nominal attitude.
+        Logged attitude at the fusion horizon minus the nominal attitude.
     correlation : ndarray, shape (n, n)
-        Of the state at the start; the log has variances only.
+        Of the initial state; estimated, because the log has variances only.
     fusing : bool
-        Whether EKF2 fuses the source when it begins.
-    field : Sensed or None
-        What the magnetometer measured: then the magnetic fields are states too, and there are 21;
-        None: the heading is EKF2's own as flown, whatever is changed.
-    heights : Heights or None
-        None: the height is EKF2's own as flown, or vision's.
-    distrusted_share : ndarray, shape (n + 1,), or None
-        Share of the accelerometer's axes that EKF2 relied on less in the step before: all while it
-        took the vertical acceleration to be wrong, else those at the end of their range (of the
-        axes together, as R turns them); None: never any.
-    flow : Sensed or None
-        What optical flow measured, where EKF2 fused it.
+        True if EKF2 fuses the source at the start.
+    field : SensorSamples or None
+        Magnetometer samples, then 21 states; None: the logged EKF2 heading is used.
+    heights : HeightSamples or None
+        None: the logged EKF2 height, or that of vision, is used.
+    bad_acceleration_share : ndarray, shape (n + 1,), or None
+        Share of accelerometer axes to which EKF2 gave a larger noise in the step before: all during
+        a bad vertical acceleration, else the clipped ones; None: never.
+    flow : SensorSamples or None
+        Optical flow samples, if EKF2 fused them.
     metres : (float, float, float)
-        What a metre of a track is in those of the state's position.
+        Metres in the state per published metre, north, east and down.
     history : Stretch or None
-        What came before, up to its start: the correlations at the start come of that.
+        Flight before the start, from which the initial correlations are estimated.
     """
 
     time_s: Array
@@ -198,7 +196,7 @@ class Stretch:
     fusing: bool = True
     field: SensorSamples | None = None
     heights: HeightSamples | None = None
-    distrusted_share: Array | None = None
+    bad_acceleration_share: Array | None = None
     flow: SensorSamples | None = None
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     history: "Stretch | None" = None
@@ -206,16 +204,16 @@ class Stretch:
     __repr__ = one_line_repr
 
     @cached_property
-    def gained_m_s(self) -> Array:
-        """Velocity gained since the start by the IMU alone, at each step's end, (n + 1, 3)."""
+    def imu_velocity_m_s(self) -> Array:
+        """Velocity change from the IMU since the start (m/s, NED), shape (n + 1, 3)."""
         force = np.einsum("nij,nj->ni", self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
         gained = np.cumsum(force * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), gained])
 
     @cached_property
-    def path_m(self) -> Array:
-        """Way since the start by the IMU alone, from rest, at each step's end, (n + 1, 3)."""
-        speed = self.gained_m_s
+    def imu_displacement_m(self) -> Array:
+        """Displacement from the IMU since the start, from rest (m, NED), shape (n + 1, 3)."""
+        speed = self.imu_velocity_m_s
         path = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), path])
 
@@ -223,7 +221,7 @@ class Stretch:
 def samples_by_event(
     stretch: Stretch, end: IntArray, step: IntArray, position_m: Array, axes: slice, *more: Array
 ) -> Array:
-    """Positions by the event at which they are fused, for the k that come in one interval at most.
+    """Return position samples by the event at which they are fused, in up to k slots per event.
 
     Parameters
     ----------
@@ -231,24 +229,25 @@ def samples_by_event(
     end : ndarray of int, shape (E,)
         Step of each event.
     step : ndarray of int, shape (m,)
-        At the end of which each position is taken; increasing.
+        Prediction step after which each position was measured; increasing.
     position_m : ndarray, shape (m, a)
     axes : slice
-        Which of north, east and down they are.
+        Its axes within north, east and down.
     *more : ndarray, shape (m,)
+        Further columns.
 
     Returns
     -------
     ndarray, shape (a + 2 + len(more), k, E)
-        Position at the event, as if the vehicle had stood still since, age then, ``more``, and 1;
-        all 0 where there is none.
+        Position at the event without the motion of the state, age, ``more``, and 1; all 0 in empty
+        slots.
     """
     event = np.searchsorted(end, step)
     event = event[event < len(end)]
     count = len(event)
     step, event_step = step[:count], end[event]
     age_s = stretch.time_s[event_step] - stretch.time_s[step]
-    path, speed = stretch.path_m[:, axes], stretch.gained_m_s[:, axes]
+    path, speed = stretch.imu_displacement_m[:, axes], stretch.imu_velocity_m_s[:, axes]
     position_m = (
         position_m[:count] + path[event_step] - path[step] - speed[event_step] * age_s[:, None]
     )
@@ -260,7 +259,7 @@ def samples_by_event(
 
 
 def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
-    """The same of :func:`samples_by_event` for several sets of events, with room for as many in each."""
+    """Pad the arrays of :func:`samples_by_event` to the same number of slots."""
     max_slots = max(samples.shape[1] for samples in sample_arrays)
     return [
         np.pad(each, ((0, 0), (0, max_slots - each.shape[1]), (0, 0))) for each in sample_arrays
@@ -277,20 +276,20 @@ def find_stretches(
     *,
     gnss: bool = False,
 ) -> tuple[Stretch, ...]:
-    """Parts of a flight without gaps in IMU and positions, from when EKF2 has fused for a while.
+    """Find the parts of a flight without gaps in IMU and positions, after EKF2 started to fuse.
 
     Parameters
     ----------
     flight : Flight
-        For when it is airborne.
+        Provides the times in the air.
     imu, attitude : DataFrame
     ekf2 : Ekf2
     record : FusionRecord
     source_s : ndarray
-        Stamps of what EKF2's position rests on.
+        Timestamps of the position samples.
     gnss : bool
-        Whether EKF2 fuses GNSS: then the magnetic fields are states, where the log allows it, and
-        an acceleration that is wrong or clipped is relied on less.
+        True if EKF2 fuses GNSS: magnetic fields are then states if the log permits, and a bad or
+        clipped acceleration gets a larger noise.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
@@ -306,7 +305,7 @@ def find_stretches(
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     field_span = _field_span(record) if gnss else None
     cuts += field_span[1:] if field_span else ()
-    # another instance has states of its own
+    # another EKF2 instance has different states
     cuts += [time_s for time_s, _ in ekf2.instances[1:]]
     stretches = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
@@ -347,14 +346,16 @@ def _gnss_stretch(
     start_row: int,
     end_s: float,
 ) -> Stretch:
-    """A stretch on an earth that turns, where bad accelerations are relied on less."""
+    """Return a stretch with earth rotation and a larger noise of bad accelerations."""
     stretch = _on_rotating_earth(_stretch(imu, attitude, ekf2, record, start_row, end_s), record)
-    return replace(stretch, distrusted_share=_distrusted_share(imu, record, stretch.time_s))
+    return replace(
+        stretch, bad_acceleration_share=_bad_acceleration_share(imu, record, stretch.time_s)
+    )
 
 
 def _on_rotating_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
-    """The same stretch on an earth that turns, its position in EKF2's own metres."""
-    metres, state = metres_of(record), stretch.state.copy()
+    """Add earth rotation, and convert the position to metres of EKF2's state."""
+    metres, state = ekf2_metres_per_metre(record), stretch.state.copy()
     state[POSITION] *= metres
     turned = earth_rate_rad_s(record) * stretch.step_s[:, None]
     return replace(
@@ -363,10 +364,10 @@ def _on_rotating_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
 
 
 def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
-    """Beginnings and ends of what the model cannot follow.
+    """Return the times (s) at which the replay must be interrupted.
 
-    Many clipped samples, which lose motion as a gap does, and resets of EKF2's height and vertical
-    velocity, which are published a while after.
+    These are the limits of times with many clipped samples, in which motion is lost, and of resets
+    of height and vertical velocity, which are published with a delay.
     """
     breaks = [
         time
@@ -385,10 +386,10 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     return breaks
 
 
-def _distrusted_share(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
-    """Share of the accelerometer's axes that are relied on less, at the end of each step."""
+def _bad_acceleration_share(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
+    """Return the share of accelerometer axes with a larger noise, at the end of each step."""
     share_by_step = record.was_in_state(BAD_ACCELERATION, time_s).astype(float)
-    if "clipped" in imu:  # a bit for each axis
+    if "clipped" in imu:  # one bit per axis
         clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
         clipped_share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
         np.maximum.at(share_by_step, np.searchsorted(time_s, clipped.index), clipped_share)
@@ -422,12 +423,12 @@ def _stretch(
     def attitude_beyond(
         frame: pd.DataFrame, early_s: float, end_stamps: Array
     ) -> tuple[Array, Array]:
-        """Times of a frame's attitudes, and what they have beyond the known ones at the steps."""
+        """Return times and rotations of a frame beyond the known attitudes."""
         inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
         at_s, own = frame.index[inside].to_numpy(), frame.loc[inside, Columns.QUATERNION].to_numpy()
         return at_s, multiply(own, conjugate(interpolate(at_s, times, end_stamps)))
 
-    # what the published attitude has beyond the gyro's, in the earth frame
+    # rotation of the published attitude beyond the gyro, earth frame
     extra_rotation = interpolate(times, *attitude_beyond(attitude, 0.0, gyro))
     nominal = multiply(extra_rotation, gyro)
     states, turned_states = attitude_beyond(record.delayed, 1e-4, nominal)
@@ -435,7 +436,7 @@ def _stretch(
     published = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION]
     position = start[Columns.POSITION].to_numpy()
     position = np.where(np.isfinite(position), position, published)
-    position[2] = published[2]  # altitude and height have different origins since v1.16
+    position[2] = published[2]  # altitude and height have different origins from v1.16 on
     return Stretch(
         time_s=times,
         step_s=step,
@@ -458,7 +459,7 @@ def _stretch(
 
 
 def _field_span(record: FusionRecord) -> tuple[float, float] | None:
-    """From when to when EKF2 fused all of the field, without a break, once it was settled."""
+    """Return start and end (s) of continuous three-axis magnetometer fusion, or None."""
     fused = record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
     times, is_fused = fused.index.to_numpy(), fused.to_numpy() > 0.0
     if not is_fused.any() or 1.0 / np.median(np.diff(times)) < MIN_FIELD_HZ:
@@ -470,7 +471,7 @@ def _field_span(record: FusionRecord) -> tuple[float, float] | None:
 
 
 def _add_field(stretch: Stretch, record: FusionRecord, start_row: int, step_s: float) -> Stretch:
-    """The same stretch with the magnetic fields among its states."""
+    """Return the stretch with the magnetic fields as states."""
     start, frame = record.delayed.iloc[start_row], record.field_gauss
     stamps = frame.index.to_numpy()
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
@@ -490,9 +491,9 @@ def _add_field(stretch: Stretch, record: FusionRecord, start_row: int, step_s: f
 def _mean_field(
     stretch: Stretch, delayed: pd.DataFrame, taken_s: Array, filtered_gauss: Array
 ) -> SensorSamples:
-    """Of the field, means of all samples between two rows, by EKF2's low pass of its innovations.
+    """Return means of the field between two rows, from EKF2's low-pass filtered innovations.
 
-    An innovation is what EKF2 expected minus what was measured, and what it expected is known.
+    An innovation is the predicted minus the measured field, and the prediction is known.
     """
     between_s = np.diff(taken_s)
     is_inside = (taken_s[:-1] > stretch.time_s[0]) & (taken_s[1:] <= stretch.time_s[-1])
@@ -519,19 +520,19 @@ def _mean_field(
 def low_passed(
     stretch: Stretch, newest_s: Array, count: Array, interval_s: Array, share: Array | float
 ) -> tuple[IntArray, Array]:
-    """Of the samples that a low pass has the mean of: at which steps, and for how much each counts.
+    """Return the steps of the samples behind a low-pass filtered mean, and their weights.
 
     Parameters
     ----------
     newest_s, count, interval_s : ndarray, shape (m,)
-        When the newest of each mean was taken, how many there are, and how far apart.
+        Time of the newest sample of each mean, number of samples, and their interval.
     share : float or ndarray, shape (m,)
-        Of a new sample in the low pass.
+        Weight of a new sample in the low-pass filter.
 
     Returns
     -------
     step, weight : ndarray, shape (m, k)
-        Newest first, for the k of the longest.
+        Newest first, with k the largest number of samples.
     """
     back = np.arange(int(count.max(initial=1.0)))
     weight = np.where(back < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** back, 0.0)
@@ -543,16 +544,16 @@ def low_passed(
 def add_field_states(
     stretch: Stretch, taken_s: Array, gauss: Array, weight: float, fields: Array, variance: Array
 ) -> Stretch:
-    """The same stretch with the fields of earth and body among its states, uncorrelated with them.
+    """Add the fields of earth and body to the states, uncorrelated with the others.
 
     Parameters
     ----------
     taken_s, gauss : ndarray, shape (m,) and (m, 3)
-        Samples of the magnetometer (body FRD), by the time that EKF2 takes them to be of.
+        Magnetometer samples (body FRD) at EKF2's measurement time.
     weight : float
-        Samples that EKF2 had for each.
+        Number of EKF2 samples per logged sample.
     fields, variance : ndarray, shape (6,)
-        At the start, of earth (NED) and body.
+        At the start: earth (NED) and body (FRD).
     """
     step, inside = sample_steps(stretch, taken_s)
     turn, count = stretch.rotation[step].transpose(0, 2, 1), len(step)
@@ -566,14 +567,14 @@ def add_field_states(
 
 
 def sample_steps(stretch: Stretch, taken_s: Array) -> tuple[IntArray, BoolArray]:
-    """Step at the end of which each sample in a stretch is taken, and which samples those are."""
+    """Return the prediction step after which each sample is fused, and True for samples inside."""
     step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
     is_inside = (step > 0) & (step < len(stretch.time_s))
     return step[is_inside], is_inside
 
 
 def predict_s(record: FusionRecord) -> float:
-    """EKF2_PREDICT_US (s)."""
+    """Return EKF2_PREDICT_US in seconds."""
     return record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
@@ -582,24 +583,24 @@ def _interpolate(series: pd.Series, times: Array) -> Array:
 
 
 def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
-    """Where EKF2's prediction steps end: after how many IMU intervals from the start.
+    """Return the ends of EKF2's prediction steps, as numbers of IMU intervals from the start.
 
-    A step is complete after :func:`samples_per_step`, or as soon as it is longer than the target.
-    Ends that the log shows set the count again.
+    A step ends after :func:`samples_per_step` samples, or when it is longer than the target. Logged
+    ends restart the count.
 
     Parameters
     ----------
     interval_s : ndarray, shape (n,)
-        Of the IMU samples after the start.
+        IMU intervals after the start.
     known : ndarray of int
-        Ends that are known, increasing; the start may be among them.
+        Logged ends, increasing; may include the start.
     target_s : float
         EKF2_PREDICT_US.
 
     Returns
     -------
     ndarray of int
-        The last is at most n.
+        The last one is at most n.
     """
     samples_needed = samples_per_step(target_s, float(np.median(interval_s)), known)
     known_ends = set(known.tolist())
@@ -614,7 +615,7 @@ def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
 
 
 def down_sampled(turn: Array, gain: Array, ends: IntArray) -> tuple[Array, Array]:
-    """Turn and velocity gained in each step, the gain in the body's frame at the step's end."""
+    """Return rotation and velocity change of each step, in the body frame at its end."""
     starts = np.concatenate([[0], ends[:-1]])
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(turn, axis=0)])
     total = turned[ends] - turned[starts]

@@ -1,12 +1,11 @@
-"""Positions of external vision as EKF2 fuses them besides GNSS: about a frame of their own.
+"""Fusion of external vision besides GNSS in the EKF2 replay, with a bias of the vision frame.
 
-How far that frame is from EKF2's is a bias, which follows within seconds, so that vision tells how
-the vehicle moves, and GNSS where it is. Without GNSS there is no bias: EKF2 then resets its
-position to vision's. Samples between two events are fused at the later one, as measurements of
-position and velocity then: where the vehicle was before is known from both and the IMU.
+The bias adapts within seconds, so vision determines the relative motion and GNSS the position.
+Without GNSS there is no bias: EKF2 then resets its position to that of vision. Samples between two
+events are fused at the later event; the motion in between follows from the state and the IMU.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp``; before v1.16
-``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision comes after GNSS and heights).
+``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,8 +22,8 @@ from px4fuse.ekf2.stretches import Stretch, pad_samples, samples_by_event
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 
 SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
-# After so long without a sample fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp); after so long
-# outside the gate the bias, or the position, begins anew (no_aid_timeout_max, common.h)
+# s; time without a sample after which fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp); time
+# outside the gate after which EKF2 resets the bias or the position (no_aid_timeout_max, common.h)
 STOP_S, FAILING_S = 0.4, 1.0
 COLUMNS = [
     "innovation_north_m",
@@ -40,10 +39,10 @@ COLUMNS = [
 def vision_samples(
     inputs: Inputs, stretch: Stretch, end: IntArray, settings: Mapping[str, float], horizon_s: float
 ) -> Array:
-    """Samples by the event at which they are fused, shape (8, k, E).
+    """Return vision samples by the event at which they are fused, shape (8, k, E).
 
-    North and east at the event as :func:`~px4fuse.ekf2.stretches.samples_by_event` has them, age then, time
-    of measurement, time of fusion, the variances that the sender states, and 1.
+    Rows: north and east as in :func:`~px4fuse.ekf2.stretches.samples_by_event`, age, measurement
+    time, fusion time, reported variances north and east, and 1.
     """
     vision, time_s = inputs.vision, stretch.time_s
     assert vision is not None
@@ -52,7 +51,7 @@ def vision_samples(
     step = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
     is_usable = (step > 0) & (step < len(time_s)) & (due_s < taken_s + MAX_LATE_S)
     is_usable &= np.isfinite(vision.position_m[:, 0])
-    is_usable[:-1] &= step[1:] > step[:-1]  # of two samples in one step the newer one is fused
+    is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses the newer of two samples in one step
     step = step[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.place]) - inputs.imu_offset_m
     position_m = (vision.position_m[is_usable] - stretch.rotation[step] @ lever_arm_m)[:, :2]
@@ -61,53 +60,53 @@ def vision_samples(
 
 
 class VisionFilter:
-    """The positions of vision in S variants through one stretch, event by event.
+    """Vision fusion of S variants through one stretch, event by event.
 
     Parameters
     ----------
     stretch : Stretch
-    sent : sequence of S ndarrays, shape (8, k, E)
-        As :func:`vision_samples` has them.
-    on : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
-        Whether it is still there.
-    knob : mapping from PX4's name to ndarray, shape (S,)
+    sample_arrays : sequence of S ndarrays, shape (8, k, E)
+        From :func:`vision_samples`.
+    enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
+        True while the aid is fused.
+    parameters : mapping from PX4's name to ndarray, shape (S,)
     gated, reported : ndarray of bool, shape (S,)
-        Whether there is a gate, and whether the sender's variances are used.
+        True if the gate is applied; True if reported variances are used.
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k, 7, S)
-        Of each sample innovation (m, measurement minus state) and its variance, north and east, and
-        whether it was rejected, fused, and the position reset to it; NaN where EKF2 did not try.
+        For each sample the innovation (m, measurement minus state) and its variance, north and
+        east; 1 if rejected, fused, reset; NaN if EKF2 did not evaluate it.
     moved_m : ndarray, shape (E, S, 2)
-        By how much the position was reset at each event.
+        Position reset at each event.
     fused_s : ndarray, shape (S,)
-        When the position was last fused or reset.
+        Time of the last position fusion or reset.
     """
 
     def __init__(
         self,
         stretch: Stretch,
-        sent: Sequence[Array],
-        on: Mapping[str, BoolArray],
+        sample_arrays: Sequence[Array],
+        enabled: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         gated: BoolArray,
         reported: BoolArray,
     ) -> None:
-        samples = np.stack(pad_samples(sent), axis=-1)
+        samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.taken_s, self.now_s = samples[2:5]
         _, count, events, size = samples.shape
         self.update_log = np.full((events, count, 7, size), np.nan)
         self.moved_m = np.zeros((events, size, 2))
-        has_sample = (samples[7] > 0.0) & on[EV_POS.name]
-        # those of the event's own step come after GNSS
+        has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
+        # samples of the event's step are fused after GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
-        self.gated, self.alone = gated, ~on[GNSS_POS.name]
+        self.gated, self.without_gnss = gated, ~enabled[GNSS_POS.name]
         self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (reported & (parameters[EV_POS.noise_mode] != 1.0))
         min_variance = np.maximum(parameters[EV_POS.noise], MIN_SD) ** 2
-        with_gnss_innovations = np.where(self.alone, 0.0, parameters[GNSS_POS.noise] ** 2)
+        with_gnss_innovations = np.where(self.without_gnss, 0.0, parameters[GNSS_POS.noise] ** 2)
         self.noise_m2 = np.moveaxis(
             np.maximum(reported_variance, np.maximum(min_variance, with_gnss_innovations)), 0, -1
         )
@@ -117,10 +116,10 @@ class VisionFilter:
             np.zeros((size, 2)), unknown_variance, start_s, float(np.median(stretch.step_s))
         )
         self.last_sample_s, self.last_attempt_s = np.full((2, size), -np.inf)
-        self.fused_s, self.was_alone = np.full(size, start_s), self.alone[0]
+        self.fused_s, self.was_without_gnss = np.full(size, start_s), self.without_gnss[0]
 
     def updates(self, variant: int, end_s: Array) -> pd.DataFrame:
-        """What one variant did with each sample, by the time of measurement as EKF2 takes it.
+        """Return the updates of one variant at EKF2's measurement times.
 
         ``end_s`` is the time of each event.
         """
@@ -130,56 +129,60 @@ class VisionFilter:
         frame = pd.DataFrame(update_log[event, place], index, COLUMNS)
         return frame.assign(fused_at_s=end_s[event])
 
-    def fuse(self, e: int, x: Array, P: Array, own_step: bool, fix_s: Array) -> tuple[Array, Array]:
-        """State and covariance after the samples of one event.
+    def fuse(
+        self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array
+    ) -> tuple[Array, Array]:
+        """Return state and covariance after the samples of one event.
 
         Parameters
         ----------
         e : int
         x, P : ndarray
-        own_step : bool
-            Of the event's own step, or those before.
-        fix_s : ndarray, shape (S,)
-            When a position was last fused otherwise.
+        at_event : bool
+            True: samples of the event's step; False: earlier ones.
+        gnss_fused_s : ndarray, shape (S,)
+            Time of the last position fusion from GNSS.
         """
-        for place, has_sample in enumerate(self.has_sample[own_step][:, e]):
+        for place, has_sample in enumerate(self.has_sample[at_event][:, e]):
             if has_sample.any():
-                x, P = self._fuse_sample(e, place, has_sample, x, P, fix_s)
+                x, P = self._fuse_sample(e, place, has_sample, x, P, gnss_fused_s)
         return x, P
 
     def _fuse_sample(
-        self, e: int, place: int, has_sample: BoolArray, x: Array, P: Array, fix_s: Array
+        self, e: int, place: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
     ) -> tuple[Array, Array]:
         age_s, now_s = self.age_s[place, e][:, None], self.now_s[place, e]
-        alone, noise_m2 = self.alone[e], self.noise_m2[place, e]
+        without_gnss, noise_m2 = self.without_gnss[e], self.noise_m2[place, e]
         HP = P[:, HORIZONTAL] - age_s[:, None] * P[:, SPEED]
         S = HP[:, :, HORIZONTAL] - age_s[:, None] * HP[:, :, SPEED]
-        diagonal = S.reshape(len(S), -1)[:, ::3]  # a view
+        diagonal = S.reshape(len(S), -1)[:, ::3]  # a view of the diagonal of S
         distance_m = self.position_m[place, e] - x[:, HORIZONTAL] + age_s * x[:, SPEED]
-        sample_state = now_s[:, None], has_sample[:, None], ~alone[:, None]
+        sample_state = now_s[:, None], has_sample[:, None], ~without_gnss[:, None]
         nu, R = self.bias.remove_bias(distance_m, diagonal.copy(), noise_m2, *sample_state)
         diagonal += R
-        has_restarted = (now_s - self.last_sample_s > STOP_S) | (alone != self.was_alone)
+        has_restarted = (now_s - self.last_sample_s > STOP_S) | (
+            without_gnss != self.was_without_gnss
+        )
         outside = (nu * nu > self.gate2 * diagonal).any(axis=1) & self.gated & ~has_restarted
         is_failing = outside & (now_s - self.last_attempt_s > FAILING_S)
         restart, is_fused = (
             has_sample & (has_restarted | is_failing),
             has_sample & ~outside & ~has_restarted,
         )
-        reset = restart & (alone | (is_failing & (now_s - fix_s > FAILING_S)))
+        reset = restart & (without_gnss | (is_failing & (now_s - gnss_fused_s > FAILING_S)))
         is_evaluated = has_sample & ~has_restarted | reset
-        # a reset leaves nothing of the innovation
+        # the innovation after a reset is 0
         update_log = *np.where(reset, 0.0, nu.T), *diagonal.T, outside & ~reset, is_fused, reset
         self.update_log[e, place] = np.where(is_evaluated, np.stack(update_log), np.nan)
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
         x, P = x + (K @ nu[:, :, None])[:, :, 0], P - K @ HP
         if reset.any():
-            moved_m = np.where(alone[:, None], distance_m, nu) * reset[:, None]
-            variance = np.where(alone[:, None], noise_m2, R)
+            moved_m = np.where(without_gnss[:, None], distance_m, nu) * reset[:, None]
+            variance = np.where(without_gnss[:, None], noise_m2, R)
             set_states(x, P, reset, HORIZONTAL, x[:, HORIZONTAL] + moved_m, variance)
             self.moved_m[e] += moved_m
         if restart.any():
-            new_bias, no_bias = (restart & ~reset)[:, None], (reset & alone)[:, None]
+            new_bias, no_bias = (restart & ~reset)[:, None], (reset & without_gnss)[:, None]
             self.bias.value_m = np.where(
                 new_bias, -distance_m, np.where(no_bias, 0.0, self.bias.value_m)
             )
@@ -187,14 +190,14 @@ class VisionFilter:
         self.last_sample_s = np.where(has_sample, now_s, self.last_sample_s)
         self.last_attempt_s = np.where(is_fused | restart, now_s, self.last_attempt_s)
         self.fused_s = np.where(is_fused | reset, now_s, self.fused_s)
-        self.was_alone = np.where(has_sample, alone, self.was_alone)
+        self.was_without_gnss = np.where(has_sample, without_gnss, self.was_without_gnss)
         return x, P
 
 
 def set_states(
     x: Array, P: Array, which: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
-    """Set some states of some variants to what was measured, with its variance."""
+    """Set states of selected variants to measured values, with their variance."""
     x[which, rows] = value[which]
     P[which, :, rows] = 0.0
     P[which, rows, :] = 0.0

@@ -1,15 +1,14 @@
-"""Why EKF2 differs: the way from our filter to the logged EKF2, one change at a time.
+"""Steps from KF to the logged EKF2: difference of both filters explained one change at a time.
 
-Each stage is a replay of the whole flight with one thing more as EKF2 has it; the order is fixed
-and physical: when a sample counts, how much it counts, what is estimated besides, what was left
-out, and how the result is carried to the present. The mean square difference to what EKF2 logged
-goes from stage to stage, so that the steps and what is left add up to all of it. The first step
-takes our filter, as it ran on the grid and the source that were chosen, to the same filter on
-EKF2's own samples and prediction steps; without it, other steps would be blamed for that.
+Each step is a replay of the whole flight with one more property of EKF2. The order is fixed: sample
+times, noises, estimated states, gate, and output predictor. The mean square difference to the
+logged EKF2 changes with each step, so the steps and the unexplained remainder add up to the whole
+difference. The first step changes KF on the chosen grid and source to the same filter with EKF2's
+samples and prediction steps.
 
-EKF2's small process noise presupposes its bias states: given to a filter without them it makes
-things worse. Therefore the biases come first. The last replays reject what EKF2 rejected: where it
-rejects much, one sample on the edge of the gate would else lead the model another way.
+Biases come before process noise, because EKF2's small process noise makes a filter without bias
+states worse. The last replays use the logged rejections: with many rejections one sample near the
+gate limit would change all later ones.
 """
 
 from collections.abc import Mapping
@@ -32,43 +31,48 @@ from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
 from px4fuse.record import Count, NotNegative, Record
 
-ANALYSIS_NAME = "why EKF2 differs"
-OTHER_TIME = Unavailable("RMSE to truth", "the truth is of another time", "Record both together.")
-# The filter of the lesson spreads its process noise over steps of DT (DESIGN: Q per second is
-# SIGMA_A² · DT); EKF2 adds EKF2_ACC_NOISE² · Δt² each step, EKF2_ACC_NOISE² · Δt per second
+ANALYSIS_NAME = "difference KF - EKF2"
+OTHER_TIME = Unavailable(
+    "RMSE against ground truth",
+    "ground truth and replay do not overlap in time",
+    "Record both at the same time.",
+)
+# Process noise: KF adds SIGMA_A² · DT per second; EKF2 adds EKF2_ACC_NOISE² · Δt² per step, which
+# is EKF2_ACC_NOISE² · Δt per second
 SAMPLES = "samples and time steps"
-STAMPS = "stamps and delay"
+STAMPS = "timestamps and delay"
 NOISE = "measurement noise"
 BIASES = "accelerometer bias as a state"
 PROCESS = "process noise"
 ATTITUDE = "attitude and gyro bias as states"
-FIELD = "magnetometer"
-SPEED = "velocity of GNSS"
-FLOWING = "optical flow"
-VISION = "external vision"
-GATE = "gate, missed samples, resets"
+FIELD_STEP = "magnetometer"
+VELOCITY_STEP = "GNSS velocity"
+FLOW_STEP = "optical flow"
+VISION_STEP = "external vision"
+GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
-# FIELD, SPEED, FLOWING and VISION come before GATE, where EKF2 fuses these
+# The other four precede GATE if EKF2 fuses these aids
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, frozen=True, kw_only=True):
-    """One change on the way.
+    """One step from KF to EKF2.
 
     Attributes
     ----------
     name : str
-        One of :data:`STEPS`, :data:`FIELD`, :data:`SPEED`, :data:`FLOWING` or :data:`VISION`.
+        One of :data:`STEPS`, :data:`FIELD_STEP`, :data:`VELOCITY_STEP`, :data:`FLOW_STEP` or
+        :data:`VISION_STEP`.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
-        By how much it brings the track nearer to the logged one, in mean square; below 0: farther.
+        Reduction of the mean square difference to the logged EKF2; below 0: increase.
     position_moved_m : float
-        How far it moves the position at most, along this axis.
+        Largest change of the position along this axis.
     moved_at_s : float
-        When.
+        Time of this change.
     position_rmse_to_truth_m : float or None
-        Of the track after it; None without truth.
+        Position RMSE after the step; None without ground truth.
     """
 
     name: str
@@ -80,17 +84,17 @@ class Step(Record, frozen=True, kw_only=True):
 
 
 class RejectionRun(Record, frozen=True, kw_only=True):
-    """The longest run of rejected samples in flight.
+    """Longest run of rejected samples in flight.
 
     Attributes
     ----------
     start_s : float
-        Of the first.
+        Time of the first rejected sample.
     samples : int
     duration_s : float
-        Until a sample was used again.
+        Time until a sample was used again.
     distance_m : float
-        How far EKF2 went from where the same filter without a gate would have been, at most.
+        Largest distance of EKF2 from the same filter without a gate.
     """
 
     start_s: float
@@ -100,14 +104,14 @@ class RejectionRun(Record, frozen=True, kw_only=True):
 
 
 class UnreplayedPart(Record, frozen=True):
-    """Where the walk does not lead: parts of the segment in which EKF2 started or did not fuse.
+    """Part of the segment without replay (EKF2 starting or not fusing).
 
     Attributes
     ----------
     maximum_m : float
-        How far both filters are apart there, at most.
+        Largest difference KF - EKF2 there.
     at_s : float
-        When.
+        Time of this difference.
     """
 
     maximum_m: NotNegative
@@ -115,26 +119,26 @@ class UnreplayedPart(Record, frozen=True):
 
 
 class WhySteps(Record, frozen=True, kw_only=True):
-    """Why EKF2 differs along one axis: the whole is the sum of the steps and what is left.
+    """Difference KF - EKF2 along one axis, as the sum of the steps and a remainder.
 
     Attributes
     ----------
     count : int
-        EKF2's own samples that the means are over.
+        EKF2 samples in the means.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
-        Difference of our filter to the logged EKF2.
+        Mean square difference of KF to the logged EKF2.
     steps : tuple of Step
     position_left_mean_square_m2, velocity_left_mean_square_m2_s2 : float
-        Difference of the model to the logged EKF2.
+        Mean square difference of the model to the logged EKF2.
     position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
     spans_s : tuple of (float, float)
-        Parts of the flight that the means are over.
-    coast : Coast or None
-        None where nothing was rejected.
-    outside : Outside or None
-        None where the walk covers the segment.
+        Parts of the flight in the means.
+    coast : RejectionRun or None
+        None without rejections.
+    outside : UnreplayedPart or None
+        None if the replay covers the segment.
     sentences : tuple of str
-        What made the difference, in the order of their weight.
+        Explanations of the difference, largest contribution first.
     """
 
     count: Count
@@ -151,19 +155,19 @@ class WhySteps(Record, frozen=True, kw_only=True):
 
     @property
     def position_left_share(self) -> float:
-        """What is left of the mean square, as a share of all of it."""
+        """Unexplained share of the mean square difference."""
         return self.position_left_mean_square_m2 / self.position_mean_square_m2
 
 
 class Why(WhySteps, frozen=True, kw_only=True, eq=False):
-    """:class:`WhySteps`, with the tracks.
+    """:class:`WhySteps` with the time series.
 
     Attributes
     ----------
     times_s, kf_minus_ekf2_m, unexplained_m : ndarray
-        EKF2's own sample times, and how far our filter and the model are from EKF2's position.
+        EKF2 sample times, difference KF - EKF2, and difference model - EKF2 in position.
     cause : str
-        The weightiest of the steps in a sentence, without its moment.
+        Sentence of the largest step, without its time.
     """
 
     schema_type = WhySteps
@@ -178,21 +182,21 @@ class Why(WhySteps, frozen=True, kw_only=True, eq=False):
 def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
 ) -> dict[str, Why] | Unavailable:
-    """Walk from our filter to the logged EKF2, without words.
+    """Compute the steps from KF to the logged EKF2, without explanations.
 
     Parameters
     ----------
     model : Model
     settings : Settings, optional
-        Of our filter; its clock offset is that of the source that EKF2 fused.
+        Settings of KF; its time offset is that of the source that EKF2 fused.
     runs : mapping from axis name to Replay, optional
-        Our filter along horizontal axes; by default the same filter on EKF2's own samples and
-        steps, along north and east.
+        KF along horizontal axes; by default the same filter with EKF2's samples and steps, north
+        and east.
 
     Returns
     -------
     dict from axis name to Why, or Unavailable
-        Unavailable where the model does not reproduce what was logged.
+        Unavailable if the replay does not agree with the log.
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
@@ -205,13 +209,13 @@ def explain_by_steps(
     )
     evaluated_spans, times = model.flown.judged_s, ekf2.state.index.to_numpy()
     is_inside = inside_spans(times, evaluated_spans)
-    # all stages have the replay's times
+    # all steps have the times of the replay
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
         is_inside &= (times >= index[0]) & (times <= index[-1])
     times = times[is_inside]
     if not len(times):
         return Unavailable(
-            f"{ANALYSIS_NAME}",
+            ANALYSIS_NAME,
             "KF and the EKF2 replay have no time in common",
             "Analyse a segment in which EKF2 fused the source (--start, --end).",
         )
@@ -219,7 +223,7 @@ def explain_by_steps(
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
     ungated, stages = flown.delayed, []
-    # one at a time: each is as long as the flight
+    # one track at a time, to limit memory
     tracks = chain(delayed, (flown.published, ekf2.state))
     for stage, track in zip((*variants, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stages.append(
@@ -228,7 +232,13 @@ def explain_by_steps(
                 for direction in directions.values()
             ]
         )
-        if stage in (ATTITUDE, FIELD, SPEED, FLOWING, VISION):  # the last without a gate
+        if stage in (
+            ATTITUDE,
+            FIELD_STEP,
+            VELOCITY_STEP,
+            FLOW_STEP,
+            VISION_STEP,
+        ):  # the last step without a gate
             ungated = track
     spans = Segment(*span, "").cut(evaluated_spans)
     coast = _longest_rejection(flown, ungated, span, evaluated_spans)
@@ -236,7 +246,7 @@ def explain_by_steps(
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
         kf_state = state_at(runs[axis], times) if runs else stages[0][axis_index]
-        # ours, after each step, and the logged EKF2, shape (k + 2, 2, n)
+        # KF, after each step, and the logged EKF2: shape (k + 2, 2, n)
         path = np.array([kf_state, *(stage[axis_index] for stage in stages)])
         difference = path - path[-1]
         errors = [rms_to_truth(model.flight, track, direction, times) for track in path[:, 0]]
@@ -267,7 +277,7 @@ def explain_by_steps(
             spans_s=spans,
             coast=coast,
             times_s=times,
-            # copies: a view would keep all steps
+            # copies: a view would keep all steps in memory
             kf_minus_ekf2_m=difference[0, 0].copy(),
             unexplained_m=difference[-2, 0].copy(),
         )
@@ -275,7 +285,7 @@ def explain_by_steps(
 
 
 def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
-    """The filter after each step but the last; from one to the next, one thing changes."""
+    """Return the filter after each step except the last; each changes one property."""
     flown, aid, received = inputs.settings, inputs.aid, inputs.received
     kf_process_noise = {
         "EKF2_ACC_NOISE": float(
@@ -283,7 +293,7 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
         )
     }
     kf_parameters = {**flown, **kf_process_noise, aid.noise: kf_settings.sigma_z_m}
-    # from positions of GNSS, which ours is given, the delay was taken already
+    # the delay is already subtracted from the GNSS timestamps of KF
     applied_delay_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.place, 0.0)}
@@ -309,11 +319,11 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
         ATTITUDE: (variant := replace(noise, settings=flown, biases=True, attitude=True)),
     }
     if MAG.name in aids:
-        variants[FIELD] = variant = replace(variant, without=dict.fromkeys(others, 0.0))
+        variants[FIELD_STEP] = variant = replace(variant, without=dict.fromkeys(others, 0.0))
     if received.velocity_m_s is not None:
-        variants[SPEED] = variant = replace(variant, velocity=True)
+        variants[VELOCITY_STEP] = variant = replace(variant, velocity=True)
     for position, name in enumerate(others, start=1):
-        step = FLOWING if name == FLOW.name else VISION
+        step = FLOW_STEP if name == FLOW.name else VISION_STEP
         variants[step] = variant = replace(variant, without=dict.fromkeys(others[position:], 0.0))
     return variants | {GATE: Variant(flown, as_logged=True)}
 
@@ -326,7 +336,7 @@ def _longest_rejection(
     rejected, time = updates["rejected"].to_numpy() > 0, updates["fused_at_s"].to_numpy()
     if not rejected.any():
         return None
-    # each run from its first rejected sample to the sample after its last
+    # a run lasts from its first rejected sample to the sample after its last
     change = np.diff(rejected.astype(int), prepend=0, append=0)
     starts, ends = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
     longest = int(np.argmax(ends - starts))

@@ -1,7 +1,4 @@
-"""What EKF2 would have done with other parameters: logged, replayed and changed side by side.
-
-All three are judged over the same times, in the same way.
-"""
+"""EKF2 with other parameters: logged, replayed and changed results over the same times."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,23 +32,23 @@ from px4fuse.flight import AxisName, Columns, Ekf2, Flight, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share
 
 ANALYSIS_NAME = "EKF2 what-if"
-# Below this share of EKF2's samples in the log, gaps between fusions cannot be told from it
+# fraction of the replayed samples that the log must contain to measure gaps between fusions
 MIN_COMPLETE_SHARE = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
     "the log has no ground truth",
-    ("Record motion capture (ATT_POS_MOCAP) besides the position source, or fly in simulation."),
+    "Record motion capture (ATT_POS_MOCAP) besides the position source, or fly in simulation.",
 )
-# Of a flight on GNSS
+# Notes for flights on GNSS
 HEADING_FOLLOWS = (
-    "The heading follows, with the magnetometer as EKF2 fused it (as flown it is {:.1f}° off the "
-    "log, RMS)"
+    "Heading is replayed with the magnetometer (as flown it differs from the log by {:.1f}° RMS)"
 )
 HEADING_STAYS = (
-    "The heading is EKF2's own as flown, whatever is changed: the log does not hold what EKF2 "
-    "fused of a magnetometer, all axes throughout"
+    "The logged EKF2 heading is used in all columns: the log does not contain all fused "
+    "magnetometer samples"
 )
-HEIGHT_FOLLOWS, HEIGHT_STAYS = "The height follows too", "The height is EKF2's own as flown"
+HEIGHT_FOLLOWS = "Height is replayed with the logged height sensors"
+HEIGHT_STAYS = "The logged EKF2 height is used in all columns"
 OWN_HEADING, OWN_HEIGHT = (
     Unavailable(
         "heading error",
@@ -62,33 +59,37 @@ OWN_HEADING, OWN_HEIGHT = (
         "height error", "the replay uses the logged EKF2 height", "Read the height in the log."
     ),
 )
-# What must be left to judge once an aid is taken away
+# s; minimum time to evaluate after an aid is disabled
 MIN_EVALUATED_S = 5.0
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
-# Each rejection decides the next: a prediction is steady where millimetres of noise on positions
-# leave it where it was, and never where most samples are rejected
+# Position noise (m) and number of repeated runs. A result is predictable if this noise hardly
+# changes it
 DISTURBED_M, DISTURBED_RUNS = 0.002, 4
+# Rejected share below which no repeated runs are needed, and above which nothing is predictable
 MIN_REJECTED_SHARE, MAX_REJECTED_SHARE = 0.02, 0.35
-# After so long without a height EKF2 resets it (hgt_fusion_timeout_max, common.h)
+# s; time without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
+# common.h)
 HEIGHT_TIMEOUT_S = 5.0
+# Limits of predictable results between repeated runs: ratio of mean NIS, difference of the rejected
+# share, ratio of the position RMSE
 MAX_NIS_RATIO, MAX_REJECTED_SPREAD, MAX_RMSE_RATIO = 1.10, 0.03, 1.15
 
 
 class AxisSummary(Record, frozen=True):
-    """One axis of one EKF2.
+    """Statistics of one axis in one column of the what-if table.
 
     Attributes
     ----------
     nis_mean : float
-        Of all samples that it tried to fuse, rejected ones included.
+        Over all evaluated samples, including rejected ones.
     nis_band : (float, float)
-        Two-sided 95 % band of that mean for a consistent filter.
+        95 % band of the mean NIS of a consistent filter.
     innovation_std_m : float
     sigma_p_median_m : float or Unavailable
-        Standard deviation of position that it states.
+        Median reported σ of position.
     position_rmse_to_truth_m : float or Unavailable
-        Of what it publishes.
+        RMSE of the published position.
     """
 
     nis_mean: NotNegative
@@ -99,7 +100,7 @@ class AxisSummary(Record, frozen=True):
 
 
 class HeightSummary(Record, frozen=True):
-    """One sensor of height, or vision besides GNSS, of one EKF2: of all that it tried to fuse.
+    """Statistics of one height sensor, or of vision besides GNSS.
 
     Attributes
     ----------
@@ -118,37 +119,37 @@ class HeightSummary(Record, frozen=True):
 
     @property
     def steady(self) -> bool:
-        """Whether it goes on without the resets of EKF2's height, which the model does not have."""
+        """Return True if predictable: no height reset (not modelled), and few rejections."""
         is_without_reset = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
         return is_without_reset and self.rejected_share <= MAX_REJECTED_SHARE
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """One EKF2: as logged, as replayed, or with other parameters.
+    """One column of the what-if table: logged, replayed, or with other parameters.
 
     Attributes
     ----------
     changed : mapping
-        Parameters that differ from those flown.
+        Changed parameters.
     without : mapping from PX4's name of an aid to float
-        From when on (s) it is not fused.
+        Time (s) from which the aid is not fused.
     north, east : AxisSummary
     samples : int
     rejected_share : float
     longest_without_fusion_s : float or Unavailable
     resets : int
-        Of horizontal position.
+        Resets of horizontal position.
     heading_error_mean_deg : float or Unavailable
-        Heading minus the truth's, clockwise seen from above.
+        Heading minus true heading, clockwise seen from above.
     heights : mapping from PX4's name of an aid to HeightSummary
-        Of the sensors of height that the replay fuses; empty where the height is EKF2's own.
+        Replayed height sensors; empty if the logged EKF2 height is used.
     others : mapping from PX4's name of an aid to HeightSummary
-        Of vision that is fused besides GNSS, north and east together; empty where there is none.
+        Vision besides GNSS, north and east together; empty without it.
     height_rmse_to_truth_m : float or Unavailable
     late, lost : int
-        Samples that arrived after the fusion horizon had passed them: fused late, and never.
+        Samples that arrived behind the fusion horizon: fused late, and never fused.
     steady : bool
-        False where it is chaotic: single rejections decide, so that its numbers predict nothing.
+        False if the result is not predictable: single rejections change it.
     """
 
     changed: Mapping[str, float]
@@ -169,17 +170,17 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
     @property
     def axes(self) -> dict[str, AxisSummary]:
-        """By axis."""
+        """Statistics by axis."""
         return {"north": self.north, "east": self.east}
 
     @property
     def nis_mean(self) -> float:
-        """Of north and east together."""
+        """Mean NIS over north and east."""
         return float(np.mean([axis.nis_mean for axis in self.axes.values()]))
 
     @property
     def position_rmse_to_truth_m(self) -> float | Unavailable:
-        """Horizontal, of what it publishes."""
+        """Horizontal position RMSE of the published position (m)."""
         squares = 0.0
         for axis in self.axes.values():
             if isinstance(axis.position_rmse_to_truth_m, Unavailable):
@@ -190,20 +191,20 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
 @dataclass(frozen=True)
 class WhatIf:
-    """Side by side.
+    """Comparison of EKF2 as logged, as replayed, and with other parameters.
 
     Attributes
     ----------
     agreement : Agreement
-        Of replay and log: what entitles one to believe the rest.
+        Agreement of replay and log, the precondition for the rest.
     logged, replayed : Summary
-        As flown, by the log and by the model.
+        As flown, from the log and from the model.
     whatif : tuple of Summary
-        With each of the settings.
+        One per change of parameters.
     judged : tuple of (float, float)
-        Times that all of them are judged over.
+        Evaluated times (s), equal for all columns.
     notes : tuple of str
-        What to keep in mind, each a sentence.
+        One sentence each.
     """
 
     agreement: Agreement
@@ -221,26 +222,25 @@ def what_if(
     settings: Sequence[Mapping[str, float]],
     without: Mapping[str, float] | None = None,
 ) -> WhatIf | Unavailable:
-    """What EKF2 would have done with other parameters.
+    """Replay EKF2 with other parameters and compare with the log.
 
     Parameters
     ----------
     model : Model
     settings : sequence of mapping
-        What each changes, by PX4 name and in PX4's units.
+        Changed parameters of each replay, by PX4 name and in PX4's units.
     without : mapping from PX4's name of an aid to float, optional
-        From when on (s) it is not fused, besides; all are judged from then on.
+        Time (s) from which the aid is not fused; all columns are evaluated from then on.
 
     Returns
     -------
     WhatIf or Unavailable
-        Unavailable where the model does not reproduce what was logged.
+        Unavailable if the replay does not agree with the log.
 
     Raises
     ------
     SettingsError
-        A parameter or an aid that the model does not have, a value outside PX4's range, or a time
-        after which nothing is left to judge.
+        Unknown parameter or aid, a value outside PX4's range, or nothing left to evaluate.
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
@@ -249,7 +249,7 @@ def what_if(
     flight, judged = model.flight, model.flown.judged_s
     if without:
         since = min(without.values())
-        # each further stretch starts anew from the log, which had the aid
+        # a further stretch would start from the log, in which the aid was fused
         remaining_spans = [
             (max(start, since), end) for start, end in judged if end - since > MIN_EVALUATED_S
         ]
@@ -280,18 +280,18 @@ def what_if(
 def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     off_deg = model.agreement.heading_rms_difference_deg
     heading = HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
-    return heading, HEIGHT_STAYS if model.inputs.imposed else HEIGHT_FOLLOWS
+    return heading, HEIGHT_STAYS if model.inputs.height_reason else HEIGHT_FOLLOWS
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
-    """Values of a parameter from one to another, both included.
+    """Return values of a parameter from ``low`` to ``high``, both included.
 
-    Equal ratios between values above zero, else equal steps.
+    Equal ratios above zero, else equal steps.
 
     Raises
     ------
     SettingsError
-        Unknown name, a value outside PX4's range, ends in the wrong order, or a senseless count.
+        Unknown name, a value outside PX4's range, limits in the wrong order, or an invalid count.
 
     Examples
     --------
@@ -301,9 +301,9 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     check_parameters({name: low})
     check_parameters({name: high})
     if not low < high:
-        raise SettingsError(f"{name}={low:g}:{high:g}: the first value must be the smaller one.")
+        raise SettingsError(f"{name}={low:g}:{high:g}: give the smaller value first.")
     if not 2 <= count <= MAX_SWEEP_VALUES:
-        raise SettingsError(f"{count} values are not between 2 and {MAX_SWEEP_VALUES}.")
+        raise SettingsError(f"{count} values: give 2 to {MAX_SWEEP_VALUES}.")
     values = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
     values[[0, -1]] = low, high
     return [float(value) for value in values]
@@ -312,7 +312,7 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
 def _mark_unpredictable(
     model: Model, summaries: Sequence[Summary], judged: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
-    """Predictions, with whether each stays where it is when the positions are disturbed."""
+    """Mark the results that change when noise is added to the positions."""
     runs = [[summary] for summary in summaries]
     uncertain_runs = [
         repeated_runs
@@ -348,7 +348,7 @@ def _mark_unpredictable(
 
 
 def _agree(runs: Sequence[Summary]) -> bool:
-    """Whether all say the same of consistency, rejections and error."""
+    """Return True if consistency, rejections and RMSE of all runs agree within the limits."""
     rmse = [e for summary in runs if isinstance(e := summary.position_rmse_to_truth_m, float)]
     shares = [summary.rejected_share for summary in runs]
     nis = [[summary.axes[axis].nis_mean for summary in runs] for axis in HORIZONTAL]
@@ -365,7 +365,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summ
         updates[inside_spans(updates.index, judged)],
         updates["fused_at_s"].to_numpy(),
     )
-    # between the samples the variance grows from after one to before the next
+    # the variance grows between two samples; both ends define the interpolation
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
         s, r = (updates[f"{of}_variance_{axis}_m2"] for of in ("innovation", "observation"))
@@ -405,13 +405,13 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
     replayed = int(inside_spans(replay.updates.index, judged).sum())
     longest: float | Unavailable = Unavailable(
         "longest time without fusion",
-        (f"the log contains only {len(evaluated_updates)} of about {replayed} innovations"),
+        f"the log contains only {len(evaluated_updates)} of about {replayed} innovations",
         "Log estimator_aid_src_ev_pos at full rate.",
     )
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
         fused = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
         longest = _longest_between_fusions(np.concatenate([fused, resets]), judged)
-    assert isinstance(flight.attitude, pd.DataFrame)  # it was replayed
+    assert isinstance(flight.attitude, pd.DataFrame)  # a replay requires the attitude
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
         name: logged_aid_innovations(name, ekf2.aids[name]) for name in replay.other_aid_updates
@@ -442,9 +442,9 @@ def _make_summary(
     heading: pd.Series,
     **more: Any,
 ) -> Summary:
-    """What innovations, the published position and its stated variance show, and ``more``.
+    """Compute a column from innovations, published position, variance and ``more``.
 
-    None is the variance that EKF2 logs; any other is taken at its times too.
+    ``variance`` None stands for the logged variance; others are interpolated at its times.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
@@ -488,7 +488,7 @@ def _make_summary(
 def _innovation_statistics(
     updates: pd.DataFrame, *axes: AxisName
 ) -> tuple[float, tuple[float, float], float]:
-    """Mean NIS, its band, and the innovations' standard deviation, of some axes together."""
+    """Return mean NIS, its band and the innovation standard deviation over some axes."""
     nu = updates[[f"innovation_{axis}_m" for axis in axes]].to_numpy().ravel()
     s = updates[[f"innovation_variance_{axis}_m2" for axis in axes]].to_numpy().ravel()
     return float(np.mean(nu**2 / s)), nis_band(len(nu)), float(np.std(nu))
@@ -509,12 +509,12 @@ def _summarise_aid(evaluated_updates: pd.DataFrame, judged: Spans) -> HeightSumm
 def _heading_error(
     flight: Flight, replay: Ekf2Replay, heading: pd.Series, judged: Spans
 ) -> float | Unavailable:
-    """Mean of a heading (rad) minus the truth's, in degrees."""
+    """Return the mean of a heading (rad) minus the true heading, in degrees."""
     if GNSS_POS.noise not in replay.settings:
         return OWN_HEADING
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
-        return replace(NO_TRUTH, what="heading error", reason="the log holds no true attitude")
+        return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
     evaluated_heading = heading[inside_spans(heading.index, judged)]
     true_at_samples = np.interp(
         evaluated_heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
@@ -524,7 +524,7 @@ def _heading_error(
 
 
 def _longest_between_fusions(fused_s: Array, judged: Spans) -> float:
-    """Longest time between two fusions, the ends of what is judged included."""
+    """Return the longest time (s) between two fusions or the ends of the evaluated time."""
     ends = [judged[0][0], judged[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
@@ -532,7 +532,7 @@ def _longest_between_fusions(fused_s: Array, judged: Spans) -> float:
 def _deviation_note(
     model: Model, replay: Ekf2Replay, without: Mapping[str, float], judged: Spans
 ) -> str:
-    """How far from the replay as flown EKF2 comes without some aids."""
+    """Describe the difference to the replay as flown without some aids."""
     flown, changed_position = (
         replay_run.published.loc[inside_spans(replay_run.published.index, judged), Columns.POSITION]
         for replay_run in (model.flown, replay)
@@ -542,14 +542,15 @@ def _deviation_note(
     lost_text = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
     heights = {*model.flown.other_aid_updates} - {EV_POS.name}
     position = {*modelled_aids(model.inputs)} - {MAG.name} - heights
-    height = f"; its height is {down.max():.3g} m from it at most" if heights & {*without} else ""
+    height = f"; the height by at most {down.max():.3g} m" if heights & {*without} else ""
     give_up_note = (
-        "; with no horizontal aid EKF2 itself gives its position up after EKF2_NOAID_TOUT (5 s), "
-        "while the model dead-reckons on"
+        "; without a horizontal aid EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s), "
+        "while the replay dead-reckons"
     )
+    at_s = changed_position.index[distance.argmax()]
     return (
-        f"Without {lost_text}, what is published is {distance.max():.3g} m from the replay as flown at "
-        f"most (at {changed_position.index[distance.argmax()]:.1f} s), {distance[-1]:.3g} m at the end{height}"
+        f"Without {lost_text} the published position differs from the replay as flown by at most "
+        f"{distance.max():.3g} m (at {at_s:.1f} s), {distance[-1]:.3g} m at the end{height}"
         + (give_up_note if position <= without.keys() else "")
     )
 
@@ -558,14 +559,14 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
     min_noise = replay.settings.get(GNSS_POS.noise, 0.0)
     if min_noise >= replay.changed.get(EV_POS.noise, np.inf):
         yield (
-            "While EKF2 fuses GNSS it takes no position of vision to be more exact than "
-            f"{GNSS_POS.noise}, {min_noise:g} m"
+            f"While EKF2 fuses GNSS, it uses at least {GNSS_POS.noise} ({min_noise:g} m) as "
+            "noise of vision positions"
         )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
         change = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
         yield (
             f"{change or 'As flown'}: {replay.late + replay.lost} of "
-            f"{len(replay.updates) + replay.lost} samples would reach EKF2 after its fusion "
-            f"horizon has passed them ({replay.lost} would never be fused){remedy}"
+            f"{len(replay.updates) + replay.lost} samples would arrive after the fusion horizon "
+            f"({replay.lost} would never be fused){remedy}"
         )

@@ -1,6 +1,6 @@
-"""Flights with known truth and chosen mistakes, as PX4 ULog or in memory.
+"""Simulated flights with known truth and chosen mistakes, as PX4 ULog or in memory.
 
-``scenario`` says what is flown, ``mistakes`` what goes wrong, ``motion`` is the truth in closed
-form, ``sensors`` measures it, ``ulog_writer`` writes it, and ``flights`` puts these together.
-Scenario and mistakes import nothing heavy: the command line's help is made from them.
+``scenario`` defines the flight, ``mistakes`` the errors. ``motion`` computes the true motion,
+``sensors`` the measurements, ``ekf2`` the EKF2 topics, ``ulog_writer`` the file; ``flights``
+combines them. Scenario and mistakes have no heavy imports, because the command line help uses them.
 """

@@ -1,14 +1,12 @@
-"""What EKF2 makes of a simulated flight, by px4fuse's own model of it, as PX4 v1.16 logs it.
+"""EKF2 topics of a simulated flight, computed with px4fuse's model of EKF2, as PX4 v1.16 logs them.
 
-The model is :mod:`px4fuse.ekf2`, run forward from its own beginning instead of from a log: PX4's
-initial variances, levelled at rest, then IMU and positions as simulated. The model is linear about
-an attitude, here the true one: what the gyro measures beyond it enters as a turn, so that nothing
-of the truth reaches the estimate.
+The model :mod:`px4fuse.ekf2` starts with PX4's initial variances and levelling at rest, then runs
+on the simulated IMU and positions. It is linear about the true attitude: a gyro rotation that
+differs from it enters as a rotation, so the estimate does not depend on the true attitude.
 
-Outdoors EKF2 fuses magnetometer and barometer, and vehicle_attitude is its own. Indoors a slow
-error about the truth stands in for both sensors, and vehicle_attitude is not made by the model, so
-that what a student's filter is fed with does not depend on EKF2's parameters; the model's own
-attitude is in estimator_states.
+Outdoors EKF2 fuses magnetometer and barometer, and vehicle_attitude is estimated by EKF2. Indoors a
+slow error replaces both sensors, and vehicle_attitude is simulated without the model, so that KF's
+input does not depend on EKF2 parameters; the estimated attitude is in estimator_states.
 """
 
 from collections.abc import Mapping
@@ -17,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.heights import samples_inside
+from px4fuse.ekf2.heights import barometer_samples_inside
 from px4fuse.ekf2.inputs import UNLIMITED_RESETS, FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import delay_by, follow_attitude, publish
@@ -51,43 +49,43 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-PREDICT_US = 10_000  # EKF2_PREDICT_US
-# Of each axis of both fields, when the magnetometer has been aligned on the ground
+PREDICT_US = 10_000  # µs, EKF2_PREDICT_US
+# gauss, initial σ of each axis of both fields after alignment on the ground
 FIELD_SD_GAUSS = 0.03
-# v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
+# Rules of v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
 RULES = FusionRules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
-# v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
+# Rules of v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
 GNSS_RULES = FusionRules(
     np.inf, np.inf, 7.0, UNLIMITED_RESETS, None, False, reset_scale=2.0, with_velocity=True
 )
-# EKF2_NOAID_TOUT: without aiding for longer EKF2 stays where it is (fake_pos_control.cpp)
+# s, EKF2_NOAID_TOUT; without an aid for longer EKF2 holds its position (fake_pos_control.cpp)
 NO_AIDING_S = 5.0
-# EKF2_ANGERR_INIT, _GPS_V_NOISE, _GPS_P_NOISE, _GBIAS_INIT and _ABIAS_INIT (covariance.cpp)
+# σ from EKF2_ANGERR_INIT, _GPS_V_NOISE, _GPS_P_NOISE, _GBIAS_INIT and _ABIAS_INIT (covariance.cpp)
 INITIAL_SD = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
-# What EKF2 takes from standing still before the log begins, and for how long: the standard
-# deviations that v1.16 logs on the ground are 0.0005 rad/s, 0.06 m/s and 0.17 m/s² (horizontal)
+# Time (s) at rest before the log begins, and σ of the zero-motion measurements. They reproduce the
+# values of v1.16 on the ground: 0.0005 rad/s, 0.06 m/s and 0.17 m/s² (horizontal)
 REST_S = 10.0
 REST_SD = np.repeat([0.05, 0.0005, 0.06], 3)
-# Of heading and height as v1.16 logs them in flight, and of what stands in for the barometer
+# rad and m; σ of heading and height as logged by v1.16 in flight
 HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.15
-# Fine enough that variances are logged between the samples of a UWB too
+# s; small enough that variances between UWB samples are logged
 MAX_INTERVAL_S = 0.1
 
 
 def _fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
-    """What of EKF2's aids has parameters in the model."""
+    """Return the fused aids that have parameters in the model."""
     return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
 
 def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
-    """EKF2's parameters as flown: all that its model has, by PX4 name."""
+    """Return the flown value of all EKF2 parameters in the model, by PX4 name."""
     aid = scenario.aid
     gnss = aid == GNSS_POS
     known = settings_in_force({}, *_fused_aids(scenario))
     delay_ms = known[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
     of_aid: dict[str, float] = {aid.noise_mode: 1}
     if gnss:
-        # of the magnetic heading alone (1), or of all its axes where it should be right (0)
+        # EKF2_MAG_TYPE 1 fuses the magnetic heading only, 0 all axes
         only_heading = int(bool(mistakes.heading_deg))
         of_aid = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: only_heading}
         of_aid |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
@@ -98,14 +96,14 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
             aid.noise: mistakes.ekf2_noise_m or sensors.reported_sigma_m(scenario, mistakes),
             aid.gate: mistakes.ekf2_gate,
             aid.delay: delay_ms,
-            # a source that is slow to arrive has been allowed for
+            # EKF2_DELAY_MAX is set for a source that arrives late
             "EKF2_DELAY_MAX": max(known["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
             "EKF2_PREDICT_US": PREDICT_US,
         }
     )
 
 
-def fly(
+def simulate_ekf2(
     scenario: Scenario,
     mistakes: Mistakes,
     motion: Motion,
@@ -114,12 +112,12 @@ def fly(
     others: tuple[Topic, ...],
     log_parameters: Mapping[str, int | float],
 ) -> tuple[Topic, ...]:
-    """EKF2's topics of a flight, those that it had anything to say in.
+    """Return the EKF2 topics of a flight, without empty ones.
 
     Parameters
     ----------
     imu, source, others : Topic, SensedPositions, tuple of Topic
-        As EKF2 received them, whatever of them is logged; outdoors magnetometer and barometer.
+        As EKF2 received them, before logging; outdoors ``others`` are magnetometer and barometer.
     log_parameters : mapping
         Parameters of the log.
     """
@@ -139,7 +137,7 @@ def fly(
         settings=settings,
         stretches=(stretch,),
         received=_arrived_samples(source),
-        # ev_pos_control.cpp: without bit 0 samples are only compared with the state
+        # ev_pos_control.cpp: without bit 0 samples are evaluated but not fused
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
@@ -160,7 +158,7 @@ def fly(
 def _stretch(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
 ) -> tuple[Stretch, IntArray, Array]:
-    """The whole flight in prediction steps about the true attitude, and that attitude."""
+    """Return the flight in prediction steps about the true attitude, step times (µs), attitude."""
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
     interval = np.diff(time_us) * 1e-6
     ends = step_ends(interval, np.array([], dtype=np.intp), PREDICT_US * 1e-6)
@@ -196,7 +194,7 @@ def _stretch(
             state=state,
             variance=variance,
             down_m=motion.at(time).position_m[:, 2] + sensors.height_error(scenario, time),
-            # nothing tells of the tilt but the positions
+            # only the positions correct the tilt
             attitude_variance_rad2=np.tile([np.inf, np.inf, HEADING_SD_RAD**2], (len(time), 1)),
             down_variance_m2=np.full(len(time), HEIGHT_SD_M**2),
             attitude_error_rad=error,
@@ -209,7 +207,7 @@ def _stretch(
 
 
 def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
-    """The same stretch with the magnetic fields among its states, aligned on the ground."""
+    """Add the magnetic fields to the states, aligned on the ground."""
     taken_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(stretch.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
     fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
@@ -217,20 +215,20 @@ def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
 
 
 def _barometer_heights(stretch: Stretch, barometer: Topic) -> HeightSamples:
-    """The barometer, EKF2's only sensor of height here."""
+    """Return the barometer heights; the barometer is EKF2's only height sensor here."""
     taken_s = sensors.time_s(barometer) - 0.5 * float(np.median(stretch.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    samples = samples_inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
+    samples = barometer_samples_inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
     return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
 
 
 def _initial_state_at_rest(
     rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
-    """State and covariance when the log begins: PX4's initial ones, told that it stands still.
+    """Return state and covariance at the start, after zero-motion updates of PX4's initial state.
 
-    Standing still, specific force is -g and rotation is zero, up to the biases; the first levels
-    the attitude and ties tilt to accelerometer bias.
+    At rest specific force is -g and angular rate 0, except for the biases. Levelling correlates
+    tilt with the accelerometer bias.
     """
     H = np.zeros((9, STATES))
     H[0:3, THETA] = -skew(rotation @ force_m_s2)
@@ -249,9 +247,9 @@ def _initial_state_at_rest(
 
 
 def _arrived_samples(source: sensors.SensedPositions) -> ReceivedPositions:
-    """The samples in the order of their arrival, without those that are older than the one before.
+    """Return the samples in order of arrival, without those older than an earlier one.
 
-    EKF2 takes no sample that is not newer than the last (estimator_interface.cpp).
+    EKF2 ignores samples older than the last (estimator_interface.cpp).
     """
     fields = source.topic.fields
     stamp, arrival = (
@@ -289,7 +287,7 @@ def _topic_track(
     reset_sum_m = np.zeros((len(state), 3))
     for step, jump in resets:
         reset_sum_m[step:, :2] += jump
-    # the newest IMU samples are corrected with the bias of the horizon
+    # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     gyro = np.einsum("nij,nj->ni", stretch.rotation[1:], delay_by(state[:, GYRO_BIAS], lag)[1:])
     attitude_steps = -stretch.correction_rad - gyro * stretch.step_s[:, None]
     gyro_attitude_error = state[0, THETA] + np.concatenate(
@@ -315,9 +313,9 @@ def _topic_track(
 def _hold_without_aiding(
     model_run: StretchRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Resets by step, and where there is aiding; without it for long the position stays.
+    """Return resets by step and times with an aid; without one hold the position of ``state``.
 
-    EKF2 then fuses a position of its own making. The model has none: ``state`` is held in place.
+    EKF2 then fuses a fake position, which the model does not contain.
     """
     events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
     horizontal = slice(NORTH, EAST + 1)

@@ -1,4 +1,4 @@
-"""What a flight of EKF2's model looks like in the topics of PX4 v1.16."""
+"""Conversion of a run of the EKF2 model to topics of PX4 v1.16."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic, topic
 
-# Rates (Hz) of v1.16 (logged_topics.cpp). PX4's own simulation logs estimator_aid_src_ev_pos at
-# full rate, a vehicle only at this one
+# Hz; logging rates of v1.16 (logged_topics.cpp). PX4's simulation logs estimator_aid_src_ev_pos at
+# full rate, a vehicle at 2 Hz
 VEHICLE_AID_SOURCE_HZ = 2.0
 STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
 MAGNETOMETER_HZ, OTHER_AIDS_HZ = 2.0, 2.0
@@ -26,23 +26,23 @@ PUBLICATION_DELAY_US = 100
 
 @dataclass(frozen=True)
 class TopicTrack:
-    """What the model did, at the end of each prediction step, shape (n + 1, ...).
+    """Output of the model at the end of each prediction step, shape (n + 1, ...).
 
     Attributes
     ----------
     time_us : ndarray of int
         Since the first data.
     lag : int
-        Steps from the fusion horizon to what is published.
+        Steps from the fusion horizon to the publication.
     delayed_attitude, delayed : ndarray
-        Quaternions, and velocity, position and both biases at the horizon, by the time that they
-        are of.
+        Quaternions; velocity, position and both biases at the fusion horizon, by their time of
+        validity.
     velocity_m_s, position_m, attitude : ndarray
-        Published.
+        Published state.
     resets : tuple of (int, ndarray)
-        Step in which the published position jumped, and by how much (m, north and east).
+        Step and size (m, north and east) of each reset of the published position.
     aided : ndarray of bool
-        Whether vision was fused lately enough for a position.
+        True while positions were fused recently enough for a valid position.
     """
 
     time_us: IntArray
@@ -55,12 +55,12 @@ class TopicTrack:
     resets: tuple[tuple[int, Array], ...]
     aided: BoolArray
 
-    def stamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, Any]:
-        """The stamps of what the filter did in some steps, with samples that were taken then."""
+    def timestamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, Any]:
+        """Return the timestamps of messages about some steps; ``taken_s``: measurement times."""
         sampled_us = self.time_us[rows]
         if taken_s is not None:
             sampled_us = np.rint(taken_s * 1e6).astype(np.int64)
-        return sensors.stamps(sampled_us, self.time_us[rows + self.lag] - sampled_us)
+        return sensors.timestamps(sampled_us, self.time_us[rows + self.lag] - sampled_us)
 
 
 def ekf2_topics(
@@ -70,16 +70,16 @@ def ekf2_topics(
     attitude_hz: float,
     aid_source_hz: float,
 ) -> tuple[Topic, ...]:
-    """The topics that EKF2 had anything to say in.
+    """Return the topics of EKF2, without empty ones.
 
     Parameters
     ----------
-    model_run : Run
-        The model's run, of one variant in one stretch.
+    model_run : StretchRun
+        Run of one variant in one stretch.
     attitude_hz : float
-        Of vehicle_attitude, which is EKF2's where it fuses a magnetometer.
+        Rate of vehicle_attitude, which EKF2 estimates if it fuses a magnetometer.
     aid_source_hz : float
-        To what estimator_aid_src_ev_pos is thinned; 0 leaves it.
+        Logging rate of estimator_aid_src_ev_pos; 0: all messages.
     """
     topics = (
         _local_position_topic(track, gnss=inputs.aid == GNSS_POS),
@@ -101,7 +101,7 @@ def _local_position_topic(track: TopicTrack, *, gnss: bool) -> Topic:
     steps = np.array([step for step, _ in track.resets], dtype=np.intp)
     jumps = np.array([[0.0, 0.0], *(jump for _, jump in track.resets)])
     count = np.searchsorted(steps, rows, side="right")
-    fields = sensors.stamps(track.time_us[rows], PUBLICATION_DELAY_US)
+    fields = sensors.timestamps(track.time_us[rows], PUBLICATION_DELAY_US)
     fields |= sensors.vectors({"": track.position_m[rows], "v": track.velocity_m_s[rows]})
     aided = track.aided[np.maximum(rows - track.lag, 0)]
     fields |= {"delta_xy": jumps[count], "xy_reset_counter": count % 256}
@@ -112,7 +112,7 @@ def _local_position_topic(track: TopicTrack, *, gnss: bool) -> Topic:
 
 
 def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> Topic:
-    """estimator_states of v1.16: 25 states with 24 covariances, positions as 0."""
+    """Return estimator_states of v1.16: 25 states and 24 variances, horizontal positions as 0."""
     end = model_run.events[0].end
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
     events = events[end[events] < len(track.time_us) - track.lag]
@@ -121,26 +121,27 @@ def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> To
     states = np.zeros((len(rows), 25), np.float32)
     states[:, 0:4] = track.delayed_attitude[rows]
     states[:, 4 : 4 + track.delayed.shape[1]] = track.delayed[rows]
-    states[:, 7:9] = 0.0  # horizontally kept as latitude and longitude
+    states[:, 7:9] = 0.0  # v1.16 stores horizontal positions as latitude and longitude
     if gnss:
-        states[:, 9] -= sensors.HOME[2]  # and downwards as altitude, where there is an origin
+        # the vertical position is an altitude if there is an origin
+        states[:, 9] -= sensors.HOME[2]
     covariances = np.zeros((len(rows), 24), np.float32)
     covariances[:, : model_run.variance.shape[2]] = model_run.variance[events + 1, 0]
-    fields = track.stamps(rows) | {"states": states, "covariances": covariances}
+    fields = track.timestamps(rows) | {"states": states, "covariances": covariances}
     return topic("estimator_states", fields)
 
 
 def _aid_sources(
     inputs: Inputs, model_run: StretchRun, track: TopicTrack, rate_hz: float
 ) -> tuple[Topic, ...]:
-    """estimator_aid_src_*: a message for every sample that came in time."""
+    """Return estimator_aid_src_*: one message per sample that arrived in time."""
     events, run, aid = model_run.events[0], model_run, inputs.aid
     event_rows = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
     event_rows = event_rows[
         sensors.keep_at_rate(sensors.seconds(track.time_us[events.end[event_rows]]), rate_hz)
     ]
     rows, sample, received = events.end[event_rows], events.sample[event_rows], inputs.received
-    aid_stamps = track.stamps(rows, events.time_s[event_rows])
+    aid_stamps = track.timestamps(rows, events.time_s[event_rows])
     measured = received.position_m[sample, :2]
     north, east = measured.T
     innovation_arrays = (run.innovation, run.innovation_variance, run.noise)
@@ -148,7 +149,7 @@ def _aid_sources(
         each[event_rows, 0, POSITION_COLUMNS] for each in innovation_arrays
     )
     idle = np.isnan(innovation[:, :1])
-    # while it is not fused, against the state that there is
+    # while not fused, the innovation refers to the current state
     innovation = np.where(idle, measured - track.delayed[rows][:, POSITION][:, :2], innovation)
     variance = np.where(idle, run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise, variance)
     used = np.where(run.fused[event_rows, 0] | run.reset[event_rows, 0], track.time_us[rows], -1)
@@ -179,7 +180,7 @@ def _aid_sources(
 
 
 def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> list[Topic]:
-    """What a barometer has EKF2 say: its innovations."""
+    """Return estimator_aid_src_baro_hgt, or nothing without a barometer."""
     heights, end = model_run.stretch.heights, model_run.events[0].end
     if heights is None or model_run.heights is None:
         return []
@@ -194,7 +195,7 @@ def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) 
         _aid_source(
             BAROMETER,
             inputs.settings,
-            track.stamps(step, taken_s),
+            track.timestamps(step, taken_s),
             measured,
             (innovation, variance, noise),
             (rejected > 0, fused > 0),
@@ -205,7 +206,7 @@ def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) 
 def _magnetometer_topics(
     inputs: Inputs, model_run: StretchRun, track: TopicTrack, attitude_hz: float
 ) -> list[Topic]:
-    """What a magnetometer has EKF2 say: vehicle_attitude, its innovations, and that it is fused."""
+    """Return the topics that exist with a magnetometer: attitude, innovations and status."""
     field, settings, end = model_run.stretch.field, inputs.settings, model_run.events[0].end
     assert field is not None
     event_rows = np.flatnonzero(
@@ -235,13 +236,14 @@ def _magnetometer_topics(
         _aid_source(
             MAG,
             settings,
-            track.stamps(rows),
+            track.timestamps(rows),
             last,
             (innovation, variance, noise),
             (~taken, taken),
         ),
         topic(
-            "estimator_status", track.stamps(status_rows) | {"control_mode_flags": 1 << MAG_3D_BIT}
+            "estimator_status",
+            track.timestamps(status_rows) | {"control_mode_flags": 1 << MAG_3D_BIT},
         ),
     ]
 
@@ -249,16 +251,19 @@ def _magnetometer_topics(
 def _aid_source(
     aid: Aid,
     settings: Mapping[str, float],
-    stamps: Mapping[str, Any],
+    timestamps: Mapping[str, Any],
     observation: Array,
     innovation_parts: tuple[Array, Array, Array],
     decisions: tuple[BoolArray, BoolArray],
 ) -> Topic:
-    """An aid's message; ``innovation_parts`` are innovation, S and R, ``decisions`` rejected and fused."""
+    """Return the message of an aid.
+
+    ``innovation_parts``: innovation, S and R; ``decisions``: rejected and fused.
+    """
     innovation, variance, noise = innovation_parts
     ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
     fields = {
-        **stamps,
+        **timestamps,
         "observation": observation,
         "observation_variance": noise,
         "innovation": -innovation,
@@ -272,7 +277,7 @@ def _aid_source(
 
 
 def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> Topic:
-    """estimator_status_flags: once a second, and when fusion of vision starts or stops."""
+    """Return estimator_status_flags: once a second and at each start or stop of fusion."""
     events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
     attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
     is_fusing = np.zeros(len(time), np.bool_)
@@ -284,7 +289,7 @@ def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> To
     is_logged = changed | sensors.keep_at_rate(time, FLAGS_HZ)
     rows = np.flatnonzero(is_logged[: len(time) - track.lag])
     gnss = inputs.aid == GNSS_POS
-    fields = track.stamps(rows) | {
+    fields = track.timestamps(rows) | {
         "control_status_changes": np.cumsum(changed)[rows],
         "cs_gnss_pos": is_fusing[rows] & gnss,
         "cs_ev_pos": is_fusing[rows] & (not gnss),

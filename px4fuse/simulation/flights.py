@@ -1,4 +1,4 @@
-"""Scenario and mistakes to a flight, as ULog, and the answer for the instructor."""
+"""Simulated flights as topics, ULog and Flight, and the answer key for the instructor."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,28 +21,28 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
 
 NO_MISTAKES = Mistakes()
-# Horizontal position of vision, or of GNSS with its velocity (bit 2)
+# Parameter values that fuse horizontal positions; for GNSS also velocity (bit 2)
 SWITCHED_ON = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 PROFILE_WITH_VISION, PROFILE_DEFAULT = 129, 1
-RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, whose topics and fields these are
+RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, the release of the simulated topics
 HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulated flight: what is logged, and what only the instructor knows.
+    """Simulated flight: logged topics, and truth for the instructor.
 
     Attributes
     ----------
     scenario : Scenario
     mistakes : Mistakes
     motion : Motion
-        The truth at any time.
-    positions : Positions
-        The position source with its outliers and errors.
+        True motion at any time.
+    positions : SensedPositions
+        Position source with its outliers and errors.
     topics : tuple of Topic
-        All that is logged.
+        All logged topics.
     parameters : mapping
     """
 
@@ -55,7 +55,7 @@ class Simulation:
 
 
 def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation:
-    """Fly a scenario.
+    """Simulate a flight.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
         if scenario.kind not in (kinds := MISTAKES[name].kinds):
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
         if MISTAKES[name].of_ekf2 and not scenario.ekf2:
-            raise SettingsError(f"--mistake {name} is one of EKF2's: leave out --no-ekf2.")
+            raise SettingsError(f"--mistake {name} changes EKF2: omit --no-ekf2.")
     if scenario.aid == GNSS_POS and 0.0 < mistakes.ekf2_noise_m < (
         stated_m := sensors.reported_sigma_m(scenario, mistakes)
     ):
@@ -75,7 +75,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
             f"EKF2 uses the larger of {GNSS_POS.noise} and the receiver's accuracy ({stated_m:g} "
             "m). Use a larger value."
         )
-    motion = plan(scenario, mistakes, sensors.stream(scenario, sensors.Stream.WANDER))
+    motion = plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
     positions = sensors.positions(scenario, mistakes, motion)
     imu = sensors.imu(scenario, mistakes, motion)
     parameters = _parameters(scenario, mistakes)
@@ -95,9 +95,9 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
         topics.append(sensors.ground_truth(scenario, motion))
     for topic in topics:
         if len(topic.fields["timestamp"]) < 2:
-            raise SettingsError(f"with these mistakes nothing is left of {topic.name}.")
+            raise SettingsError(f"These mistakes leave no data in {topic.name}. Reduce them.")
     if scenario.ekf2:
-        own = ekf2.fly(scenario, mistakes, motion, imu, positions, others, parameters)
+        own = ekf2.simulate_ekf2(scenario, mistakes, motion, imu, positions, others, parameters)
         names = {topic.name for topic in own}
         topics = [*(topic for topic in topics if topic.name not in names), *own]
     if scenario.truth:
@@ -106,12 +106,12 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
 
 
 def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
-    """Fly a scenario and give what :func:`px4fuse.read_log` reads from its ULog."""
+    """Simulate a flight and return it as read from its ULog by :func:`px4fuse.read_log`."""
     return to_flight(simulate(scenario, mistakes))
 
 
 def to_ulog(simulation: Simulation) -> bytes:
-    """The flight as a ULog file; nothing in it says which mistakes were made."""
+    """Return the flight as a ULog file, without information about the mistakes."""
     info: dict[str, int | str] = {
         "sys_name": "PX4",
         "ver_hw": HARDWARE,
@@ -122,7 +122,7 @@ def to_ulog(simulation: Simulation) -> bytes:
 
 
 def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
-    """The flight as :func:`px4fuse.read_log` reads it from its ULog."""
+    """Return the flight as :func:`px4fuse.read_log` reads it from its ULog."""
     return read_ulog(name, to_ulog(simulation))
 
 
@@ -141,15 +141,15 @@ def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float
 
 
 def answer(simulation: Simulation) -> dict[str, Any]:
-    """What the instructor knows and the log does not say, as plain data.
+    """Return the answer key of the instructor, which the log does not contain, as plain data.
 
     Keys
     ----
     mistakes
-        Name to help and to the finding that a student should make.
+        Name to help and expected finding.
     truth
-        Biases, noises, the clock offset that must be *added* to the source's stamps, outliers by
-        index and time in the logged topic, and how far the path is from closing.
+        Biases, noises, time offset to *add* to the timestamps of the source, outliers by index and
+        time in the logged topic, and loop closure error.
     """
     scenario, mistakes = simulation.scenario, simulation.mistakes
     motion, source = simulation.motion, simulation.positions

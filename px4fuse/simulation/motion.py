@@ -1,9 +1,9 @@
-"""The truth: a smooth flight in closed form, and the attitude that it takes a quadrotor.
+"""True motion in closed form: a smooth path, and the attitude that a quadrotor needs for it.
 
-Velocity changes by ramps Δv · S(x), x = (t - start) / length, with the quintic
-S = 6x⁵ - 15x⁴ + 10x³, so that acceleration is continuous and jerk bounded. A slow wander of a few
-sines is added in the air. Thrust is along the body's z axis and there is no drag, so that the
-direction of the specific force a - g is the attitude (Mellinger and Kumar 2011, eq. 6 to 8).
+Velocity changes by ramps Δv · S(x), x = (t - start) / length, with the quintic S = 6x⁵ - 15x⁴ +
+10x³, so acceleration is continuous and jerk bounded. A slow deviation of a few sines is added in
+the air. Thrust is along the body z axis and there is no drag, so the direction of the specific
+force a - g determines the attitude (Mellinger and Kumar 2011, eq. 6 to 8).
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from px4fuse.errors import SettingsError
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
 
-# On the ground before take-off and after landing
+# s; time on the ground before take-off and after landing
 GROUND_S = 6.0
 CLIMB_M_S = 0.75
 CLIMB_RAMP_S = 1.5
-# A log of 70 MB
+# s; a log of this length has 70 MB
 MAX_FLIGHT_S = 3600.0
-# Of the fade of the wander, at take-off and landing
+# s; fade-in and fade-out of the slow deviation after take-off and before landing
 FADE_S = 3.0
-# To turn round at the end of the aisle, where the nose follows the flight
+# s; time of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
 WANDER_PERIODS_S = (3.0, 20.0)
 WANDER_SINES = 4
 
 
 def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
-    """S(x), from 0 to 1 with two zero derivatives at either end, and its three derivatives."""
+    """Return S(x), which rises from 0 to 1, and its three derivatives."""
     square, slope, complement = x * x, x * (1.0 - x), 1.0 - x
     value = square * x * (6.0 * square - 15.0 * x + 10.0)
     return (
@@ -47,13 +47,13 @@ def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Ramps:
-    """Changes of a velocity, one after another.
+    """Sequence of velocity changes.
 
     Attributes
     ----------
     start_s, length_s : ndarray, shape (n,)
     change : ndarray, shape (n, k)
-        Of the velocity, from one ramp to the next.
+        Velocity change of each ramp.
     """
 
     start_s: Array
@@ -62,14 +62,14 @@ class Ramps:
 
     @classmethod
     def of(cls, ramps: Sequence[tuple[float, float, Array]]) -> Ramps:
-        """Start, length and change of each ramp."""
+        """Return ramps from tuples of start, length and change."""
         start, length, change = zip(*ramps, strict=True)
         return cls(np.array(start), np.array(length), np.array(change))
 
     def at(self, time_s: Array) -> tuple[Array, Array, Array, Array]:
-        """Position, velocity, acceleration and jerk, each of shape (n, k), from zero at rest."""
+        """Return position, velocity, acceleration and jerk, shape (n, k), starting at rest at 0."""
         velocity_before = np.cumsum(self.change, axis=0) - self.change
-        # a whole ramp moves by half its length times its change, and by the speed before
+        # displacement of a whole ramp: half its length times its change, plus the previous velocity
         position_gained = (
             velocity_before[:-1] * np.diff(self.start_s)[:, None]
             + self.change[:-1] * (np.diff(self.start_s) - self.length_s[:-1] / 2.0)[:, None]
@@ -84,7 +84,7 @@ class Ramps:
         integral = length * (x * x) ** 2 * (x * x - 3.0 * x + 2.5)
         integral += np.maximum(time_in_ramp - length, 0.0)
         step, first, second, _ = _quintic(x)
-        # take is several times faster than indexing
+        # take() is several times faster than indexing
         change, before = self.change.take(at, axis=0), velocity_before.take(at, axis=0)
         return (
             position_before.take(at, axis=0)
@@ -98,7 +98,7 @@ class Ramps:
 
 @dataclass(frozen=True)
 class Sines:
-    """Sums of a few sines, the same pulsations on every axis.
+    """Sums of sines with the same angular frequencies on every axis.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Sines:
     def draw(
         cls, rng: np.random.Generator, rms: Array, periods_s: tuple[float, float], count: int
     ) -> Sines:
-        """Draw sines of log-uniform periods and random phases with this root mean square."""
+        """Draw sines with log-uniform periods and random phases, and a given RMS per axis."""
         low, high = np.log(periods_s)
         pulsation = 2.0 * np.pi / np.exp(rng.uniform(low, high, count))
         phase = rng.uniform(0.0, 2.0 * np.pi, (count, len(rms)))
@@ -123,7 +123,7 @@ class Sines:
         return cls(pulsation, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
     def at(self, time_s: Array, orders: int = 1) -> list[Array]:
-        """Value and derivatives below ``orders``, each of shape (n, k)."""
+        """Return the value and ``orders`` - 1 derivatives, each of shape (n, k)."""
         angle = np.outer(time_s, self.pulsation_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
@@ -137,7 +137,7 @@ class Sines:
 
 @dataclass(frozen=True)
 class State:
-    """The truth at some times, NED, each of shape (n, 3) where not said otherwise.
+    """True state at n times, NED; shape (n, 3) unless noted.
 
     Attributes
     ----------
@@ -155,13 +155,14 @@ class State:
 
 @dataclass(frozen=True)
 class Motion:
-    """A planned flight.
+    """Planned flight.
 
     Attributes
     ----------
     path, yaw : Ramps
-        Of position, shape (n, 3); of the yaw, whose "velocity" is the angle, shape (m, 1).
+        Position, shape (n, 3); yaw, whose "velocity" is the angle, shape (m, 1).
     wander : Sines
+        Slow deviation from the path.
     take_off_s, touch_down_s, duration_s : float
     """
 
@@ -173,11 +174,11 @@ class Motion:
     duration_s: float
 
     def at(self, time_s: Array) -> State:
-        """The truth at some times (s from the first data)."""
+        """Return the true state at given times (s from the first data)."""
         position, velocity, acceleration, jerk = self.path.at(time_s)
         w = self.wander.at(time_s, 4)
         e, inside = self._wander_fade(time_s)
-        # Leibniz: the wander fades in and out, with derivatives of its own while it does
+        # product rule (Leibniz) while the deviation fades in or out
         d = [part[inside] for part in w]
         velocity[inside] += e[1] * d[0]
         acceleration[inside] += 2 * e[1] * d[1] + e[2] * d[0]
@@ -193,11 +194,11 @@ class Motion:
         )
 
     def _wander_fade(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
-        """Size of the wander, shape (n, 1), its derivatives at m indices, (m, 1), and those."""
+        """Return the fade factor, (n, 1), its derivatives at m indices, (m, 1), and the indices."""
         rise = np.clip((time_s - self.take_off_s) / FADE_S, 0.0, 1.0)
         fall = np.clip((time_s - self.touch_down_s) / FADE_S + 1.0, 0.0, 1.0)
         inside = np.flatnonzero((rise * (1.0 - rise) > 0.0) | (fall * (1.0 - fall) > 0.0))
-        # at most one of the two is under way, the other's derivatives are 0 or cancel in x(1 - x)
+        # at most one of fade-in and fade-out is active
         down = fall[inside] > 0.0
         sign = np.where(down, -1.0, 1.0)
         _, *derivatives = _quintic(np.where(down, fall[inside], rise[inside]))
@@ -210,16 +211,16 @@ class Motion:
 
 @dataclass(frozen=True)
 class Attitude:
-    """Attitude and what the IMU feels of it.
+    """Attitude, and the angular rate and specific force that an ideal IMU measures.
 
     Attributes
     ----------
     body_to_ned : ndarray, shape (n, 3, 3)
-        Its columns are the body's axes, FRD.
+        Columns are the body axes, FRD.
     angular_rate_rad_s : ndarray, shape (n, 3)
         Body FRD.
     specific_force_m_s2 : ndarray, shape (n, 3)
-        Body FRD: along its z axis alone.
+        Body FRD: along the z axis only.
     """
 
     body_to_ned: Array
@@ -228,7 +229,7 @@ class Attitude:
 
 
 def attitude(state: State) -> Attitude:
-    """The attitude that turns thrust into a state's acceleration, and its rates in closed form."""
+    """Return the attitude whose thrust gives the acceleration, and its closed-form rates."""
     gravity = np.array([0.0, 0.0, constants.g])
     down = gravity - state.acceleration_m_s2  # opposite to thrust
     size = np.sqrt(np.einsum("ij,ij->i", down, down))[:, None]
@@ -265,7 +266,7 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     Raises
     ------
     SettingsError
-        The loop cannot end as far before its start as asked, or the flight would be too long.
+        The open end of the loop is too large, or the flight would be too long.
     """
     ramps = _Plan(GROUND_S, scenario.heading_deg)
     climb = min(CLIMB_M_S, scenario.altitude_m / 2.0)
@@ -296,16 +297,16 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
 
 
 class _Plan:
-    """Ramps under construction, placed by their centres: between those, speed × time is exact."""
+    """Ramps under construction, placed by their centres: speed × time between centres is exact."""
 
     def __init__(self, start_s: float, heading_deg: float) -> None:
         self.centre_s = start_s + CLIMB_RAMP_S / 2.0
         self.path: list[tuple[float, float, Array]] = []
-        # the nose points along the heading before the clock starts
+        # the nose points along the heading before the first data
         self.yaw = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def change(self, velocity: Array, length_s: float, then_s: float) -> None:
-        """Change velocity about the current time, then let time pass until the next centre."""
+        """Change velocity about the current time, then advance to the next centre."""
         self.path.append((self.centre_s - length_s / 2.0, length_s, velocity))
         self.centre_s += then_s
 
@@ -314,22 +315,22 @@ class _Plan:
 
 
 def direction(heading_deg: float) -> Array:
-    """Horizontal unit vector, NED, shape (3,)."""
+    """Return a horizontal unit vector, NED, shape (3,)."""
     heading = np.radians(heading_deg)
     return np.array([np.cos(heading), np.sin(heading), 0.0])
 
 
 def _fly_aisle(ramps: _Plan, scenario: Scenario, speed_m_s: float) -> None:
     velocity = speed_m_s * direction(scenario.heading_deg)
-    follows = scenario.follows and speed_m_s > 0.0
-    pause_s = max(scenario.pause_s, TURN_ROUND_S) if follows else scenario.pause_s
+    nose_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
+    pause_s = max(scenario.pause_s, TURN_ROUND_S) if nose_follows_path else scenario.pause_s
     ramps.centre_s += START_STOP_S / 2.0
     for number in range(scenario.passes):
         way = velocity if number % 2 == 0 else -velocity
         ramps.change(way, START_STOP_S, scenario.length_m / scenario.speed_m_s)
         stopped_s = ramps.centre_s + START_STOP_S / 2.0
         ramps.change(-way, START_STOP_S, START_STOP_S + pause_s)
-        if follows and number < scenario.passes - 1:
+        if nose_follows_path and number < scenario.passes - 1:
             ramps.turn(np.pi, stopped_s, TURN_ROUND_S)
 
 
@@ -338,8 +339,8 @@ def _fly_loop(ramps: _Plan, scenario: Scenario, mistakes: Mistakes) -> None:
     last_m = scenario.length_m - mistakes.open_end_m
     if last_m < scenario.speed_m_s * CORNER_S:
         raise SettingsError(
-            f"--mistake open-end={mistakes.open_end_m:g}: the last side would be {last_m:g} m; at "
-            f"most {scenario.length_m - scenario.speed_m_s * CORNER_S:g} m can be left out."
+            f"--mistake open-end={mistakes.open_end_m:g}: the last side would be {last_m:g} m. "
+            f"Use at most {scenario.length_m - scenario.speed_m_s * CORNER_S:g} m."
         )
     sides = 4 * scenario.passes
     before = np.zeros(3)
@@ -347,7 +348,7 @@ def _fly_loop(ramps: _Plan, scenario: Scenario, mistakes: Mistakes) -> None:
     for side in range(sides):
         velocity = speed * direction(scenario.heading_deg + 90.0 * side)
         length_s = CORNER_S if side else START_STOP_S
-        if side and scenario.follows and speed > 0.0:
+        if side and scenario.nose_follows_path and speed > 0.0:
             ramps.turn(np.pi / 2.0, ramps.centre_s - CORNER_S / 2.0, CORNER_S)
         metres = last_m if side == sides - 1 else scenario.length_m
         ramps.change(velocity - before, length_s, metres / scenario.speed_m_s)

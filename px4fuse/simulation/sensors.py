@@ -1,4 +1,4 @@
-"""What the sensors make of the truth, as PX4 v1.16 logs it, mistakes included."""
+"""Sensor messages of a simulated flight as PX4 v1.16 logs them, including the mistakes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,28 +20,28 @@ from px4fuse.simulation.motion import Motion, Sines, attitude, direction
 from px4fuse.simulation.scenario import DT_S, Scenario
 from px4fuse.simulation.ulog_writer import Topic, topic
 
-# Boot time of the first data: an autopilot takes a while to start
+# µs since boot of the first data
 START_US = 12_000_000
-# From a measurement of the position source to its arrival in PX4
+# s, latency from measurement to arrival in PX4: mean, standard deviation, minimum
 LATENCY_S, LATENCY_SIGMA_S, LEAST_LATENCY_S = 0.030, 0.003, 0.005
-# Scatter of the source's intervals, as a share of them
+# standard deviation of the source intervals, as a fraction of the interval
 INTERVAL_SCATTER = 0.02
 FIRST_POSITION_S = 0.1
-# PX4 stamps with the time of arrival until 500 replies at 10 Hz (Timesync.cpp)
+# s; PX4 uses arrival times until 500 TIMESYNC replies at 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGED_S = 50.0
-NLOS_BURST = 3  # samples, mean
-# Where the local frame has its origin outdoors: latitude, longitude (degrees) and altitude (m)
+NLOS_BURST = 3  # mean number of samples per outlier burst
+# Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME = (47.397742, 8.545594, 488.0)
-# Of a fix when it is stamped; GNSS is less exact downwards
+# s, age of a GNSS fix at its timestamp; noise factors north, east and down
 FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
-# The magnetic field there (NED) and noise of its samples; noise of the barometer
+# gauss, magnetic field at HOME (NED); gauss and m, noise of magnetometer and barometer
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
 SIGMA_FIELD_GAUSS, SIGMA_BAROMETER_M = 0.02, 0.4
 FIELD_RATE_HZ, BAROMETER_RATE_HZ = 14.0, 10.0
-# Root mean square of what height does beside the truth, slowly: weather and wind
+# m, RMS of the slow height error caused by weather and wind
 HEIGHT_ERROR_M = 0.03
-# A compass that is disturbed in flight pulls EKF2's heading along with this time constant
+# s, time constant with which EKF2's heading follows a compass that is disturbed in flight
 HEADING_FOLLOWS_S = 3.0
 ATTITUDE_PERIODS_S = (20.0, 60.0)
 ATTITUDE_SINES = 4
@@ -49,7 +49,7 @@ ATTITUDE_LATENCY_US = 200
 LANDED_INTERVAL_US = 1_000_000
 
 
-# Streams of random numbers: a mistake in one sensor leaves the others' noise as it was
+# Random number streams; separate ones keep the noise of the other sensors unchanged by a mistake
 Stream = IntEnum(
     "Stream",
     "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
@@ -58,30 +58,30 @@ Stream = IntEnum(
 )
 
 
-def stream(scenario: Scenario, name: Stream) -> np.random.Generator:
-    """The random numbers of one stream."""
+def random_stream(scenario: Scenario, name: Stream) -> np.random.Generator:
+    """Return the generator of one random number stream."""
     return np.random.default_rng([scenario.seed, name])
 
 
 @dataclass(frozen=True)
 class SensedPositions:
-    """The position source.
+    """Simulated position source.
 
     Attributes
     ----------
     topic : Topic
     outlier : ndarray of bool, shape (n,)
-        Of each logged sample, whether it is one of the outliers that were put in.
+        True for logged samples that are simulated outliers.
     error_m : ndarray, shape (n, 3)
-        What it measured beyond the truth, NED, mistakes of frame and scale included.
+        Measured minus true position, NED, including mistakes of frame and scale.
     position_m : ndarray, shape (n, 3)
-        What it measured, NED.
+        Measured position, NED.
     velocity_m_s : ndarray, shape (n, 3), or None
-        The same of GNSS; a UWB and a VIO send no velocity.
+        Measured velocity of GNSS; UWB and VIO send none.
     measured_s : ndarray, shape (n,)
-        When it truly measured, seconds from the first data.
+        True time of measurement, seconds from the first data.
     distance_m, drift_m : float, ndarray of shape (3,)
-        Horizontal distance flown, and the VIO's drift at the end (NED).
+        Horizontal distance flown, and VIO drift at the end (NED).
     """
 
     topic: Topic
@@ -95,19 +95,19 @@ class SensedPositions:
 
 
 def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
-    """Accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
-    rng = stream(scenario, Stream.BIAS)
+    """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
+    rng = random_stream(scenario, Stream.BIAS)
     accelerometer = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
     accelerometer[0] += mistakes.accel_bias_m_s2
     return accelerometer, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
 
 
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """sensor_combined, complete: the accelerometer's and the gyro's own samples."""
+    """Return sensor_combined with all samples of accelerometer and gyro."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
     truth = attitude(motion.at(seconds(time_us)))
     bias_a, bias_g = biases(scenario, mistakes)
-    rng = stream(scenario, Stream.IMU)
+    rng = random_stream(scenario, Stream.IMU)
     shape = (len(time_us), 3)
     force = truth.specific_force_m_s2 + bias_a
     force += scenario.accelerometer_noise_m_s2 * rng.standard_normal(shape)
@@ -115,7 +115,7 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     rate += scenario.gyro_noise_rad_s * rng.standard_normal(shape)
     if mistakes.vibration_m_s2:
         sigma = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
-        force += sigma * stream(scenario, Stream.VIBRATION).standard_normal(shape)
+        force += sigma * random_stream(scenario, Stream.VIBRATION).standard_normal(shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
     sample_fields: dict[str, Any] = {
@@ -127,41 +127,41 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
 
 
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """vehicle_magnetometer, complete."""
+    """Return vehicle_magnetometer with all samples."""
     time_us = _grid_us(motion.duration_s, FIELD_RATE_HZ)
     rotation = attitude(motion.at(seconds(time_us))).body_to_ned
-    if mistakes.heading_deg:  # the heading that EKF2 takes from it
+    if mistakes.heading_deg:  # EKF2's heading error is caused by this rotation
         rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ rotation
     field = np.einsum("nji,j->ni", rotation, EARTH_FIELD_GAUSS)
-    field += SIGMA_FIELD_GAUSS * stream(scenario, Stream.FIELD).standard_normal(field.shape)
+    field += SIGMA_FIELD_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(field.shape)
     at_s = motion.duration_s / 2.0 if mistakes.mag_at_s is None else mistakes.mag_at_s
     field[seconds(time_us) >= at_s, 1] += mistakes.mag_gauss
-    return topic("vehicle_magnetometer", stamps(time_us) | {"magnetometer_ga": field})
+    return topic("vehicle_magnetometer", timestamps(time_us) | {"magnetometer_ga": field})
 
 
 def barometer(scenario: Scenario, motion: Motion) -> Topic:
-    """vehicle_air_data, complete."""
+    """Return vehicle_air_data with all samples."""
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
     height_m = HOME[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
-    noise = stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
+    noise = random_stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
     height_m += SIGMA_BAROMETER_M * noise
-    return topic("vehicle_air_data", stamps(time_us) | {"baro_alt_meter": height_m})
+    return topic("vehicle_air_data", timestamps(time_us) | {"baro_alt_meter": height_m})
 
 
 def height_error(scenario: Scenario, time_s: Array) -> Array:
-    """How far below the truth the height is, slowly (m)."""
-    rng, rms = stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
+    """Return the slow height error, positive downward (m)."""
+    rng, rms = random_stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
     return Sines.draw(rng, rms, ATTITUDE_PERIODS_S, ATTITUDE_SINES).at(time_s)[0][:, 0]
 
 
 def limit_rate(complete: Topic, rate_hz: float) -> Topic:
-    """A topic as a logger keeps it that passes on at most this rate; 0 keeps all."""
+    """Limit a topic to a logging rate (Hz); 0 keeps all messages."""
     return _select_messages(complete, keep_at_rate(time_s(complete), rate_hz))
 
 
 def logged_imu(complete: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
-    """sensor_combined as the logger keeps it."""
+    """Return sensor_combined as logged: without the gap, and at the reduced rate."""
     stamps_s = time_s(complete)
     keep = _is_outside_gap(
         stamps_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
@@ -170,7 +170,7 @@ def logged_imu(complete: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
 
 
 def time_s(topic: Topic) -> Array:
-    """When each message was published, seconds from the first data."""
+    """Return the publication time of each message, seconds from the first data."""
     return seconds(topic.fields["timestamp"].astype(np.int64) - START_US)
 
 
@@ -181,10 +181,10 @@ def _select_messages(topic: Topic, keep: BoolArray) -> Topic:
 def mean_imu_at_rest(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, time_s: float
 ) -> tuple[Array, Array]:
-    """Mean of accelerometer (m/s²) and gyro (rad/s) over some time of standing before the log."""
+    """Return mean accelerometer (m/s²) and gyro (rad/s) at rest before the log."""
     truth = attitude(motion.at(np.zeros(1)))
     bias_a, bias_g = biases(scenario, mistakes)
-    rng = stream(scenario, Stream.REST)
+    rng = random_stream(scenario, Stream.REST)
     share = 1.0 / np.sqrt(time_s * scenario.imu_rate_hz)
     force = truth.specific_force_m_s2[0] + bias_a
     force += share * scenario.accelerometer_noise_m_s2 * rng.standard_normal(3)
@@ -193,7 +193,7 @@ def mean_imu_at_rest(
 
 
 def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """vehicle_attitude: the truth with a small slow error, as of a good estimator without EKF2."""
+    """Return vehicle_attitude: the true attitude with a small slow error, independent of EKF2."""
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     error = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix()
@@ -202,26 +202,26 @@ def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> T
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
-    """vehicle_attitude_groundtruth."""
+    """Return vehicle_attitude_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
 
 
 def quaternions(body_to_ned: Array) -> Array:
-    """Rotation matrices as w, x, y, z."""
+    """Convert rotation matrices to quaternions (w, x, y, z)."""
     return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
 
 
 def attitude_topic(name: str, time_us: NDArray[np.int64], late_us: int, quaternion: Array) -> Topic:
-    """An attitude, published so much later."""
-    return topic(name, stamps(time_us, late_us) | {"q": quaternion})
+    """Return an attitude topic, published ``late_us`` after the measurement."""
+    return topic(name, timestamps(time_us, late_us) | {"q": quaternion})
 
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
-    """Error of the logged attitude, a rotation about north, east and down."""
+    """Return the error of the logged attitude, a rotation about north, east and down."""
     tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
-    rng = stream(scenario, Stream.ATTITUDE)
+    rng = random_stream(scenario, Stream.ATTITUDE)
     rms = np.array([tilt, tilt, yaw])
     sines = Sines.draw(rng, rms, ATTITUDE_PERIODS_S, ATTITUDE_SINES)
     error = sines.at(time_s)[0]
@@ -234,7 +234,7 @@ def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rot
 
 
 def land_detector(motion: Motion) -> Topic:
-    """vehicle_land_detected: once a second, and when it changes."""
+    """Return vehicle_land_detected: once a second, and at each change."""
     changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(np.int64)
     time_us = np.union1d(np.arange(0, int(motion.duration_s * 1e6), LANDED_INTERVAL_US), changes_us)
     landed = (time_us < changes_us[0]) | (time_us >= changes_us[1])
@@ -243,10 +243,10 @@ def land_detector(motion: Motion) -> Topic:
 
 
 def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
-    """vehicle_local_position_groundtruth."""
+    """Return vehicle_local_position_groundtruth."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     state = motion.at(seconds(time_us))
-    fields = stamps(time_us) | vectors(
+    fields = timestamps(time_us) | vectors(
         {"": state.position_m, "v": state.velocity_m_s, "a": state.acceleration_m_s2}
     )
     fields["heading"] = np.angle(np.exp(1j * state.yaw_rad))
@@ -254,12 +254,12 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
 
 
 def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedPositions:
-    """vehicle_visual_odometry of UWB in the aisle and VIO around the loop, GNSS outdoors."""
-    timing = stream(scenario, Stream.TIMING)
+    """Return vehicle_visual_odometry (UWB in the aisle, VIO on the loop), or GNSS outdoors."""
+    timing = random_stream(scenario, Stream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
     count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
     nominal_s = FIRST_POSITION_S + interval_s * np.arange(count)
-    # half an interval at most, so that the order stays
+    # below half an interval, so that the order is kept
     scatter = np.clip(timing.normal(0.0, INTERVAL_SCATTER, count), -0.4, 0.4)
     time_s = np.maximum(nominal_s + scatter * interval_s, 0.0)
     state = motion.at(time_s)
@@ -272,7 +272,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
     position += drift
     outdoor = scenario.kind == "outdoor"
     sigma = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if outdoor else 1.0)
-    position += sigma * stream(scenario, Stream.SOURCE).standard_normal(position.shape)
+    position += sigma * random_stream(scenario, Stream.SOURCE).standard_normal(position.shape)
     airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
     shift, outlier = outliers(scenario, mistakes, airborne)
     position += shift
@@ -289,11 +289,11 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
     keep = _is_outside_gap(
         time_s, mistakes.dropout_s, mistakes.dropout_at_s, motion.duration_s
     ) & keep_at_rate(time_s, mistakes.decimate_hz)
-    arrival_us, stamp_us = _stamps(mistakes, time_s, timing)
+    arrival_us, stamp_us = _source_times_us(mistakes, time_s, timing)
     reported_m = reported_sigma_m(scenario, mistakes)
     velocity = None
     if outdoor:
-        noise = stream(scenario, Stream.FIX_VELOCITY).standard_normal(position.shape)
+        noise = random_stream(scenario, Stream.FIX_VELOCITY).standard_normal(position.shape)
         velocity = (state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * noise)[keep]
         fix_us = stamp_us + round(1e6 * FIX_AGE_S)
         topic = _gnss_topic(fix_us[keep], position[keep], velocity, reported_m, scenario)
@@ -315,21 +315,21 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SensedP
 
 
 def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
-    """Standard deviation that the source reports; EKF2 takes none below 0.01 m (EKF2.cpp)."""
+    """Return the reported standard deviation (m); EKF2 uses at least 0.01 m (EKF2.cpp)."""
     return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
 
 
 def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float) -> Array:
-    """A first-order Gauss-Markov process on each axis, shape (n, 3)."""
-    noise = stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
+    """Return a first-order Gauss-Markov process on each axis, shape (n, 3)."""
+    noise = random_stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
     keep = np.exp(-interval_s / mistakes.slow_error_s)
     noise[1:] *= np.sqrt(1.0 - keep**2)
     return np.asarray(lfilter([1.0], [1.0, -keep], noise, axis=0))
 
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
-    """Drift of the VIO, NED, shape (n, 3): a share of the distance, and a random walk on it."""
-    rng = stream(scenario, Stream.DRIFT)
+    """Return the VIO drift (m, NED), shape (n, 3): proportional to distance, plus a random walk."""
+    rng = random_stream(scenario, Stream.DRIFT)
     straight = scenario.vio_drift * direction(rng.uniform(0.0, 360.0))
     steps = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
     walk = np.cumsum(steps * rng.standard_normal((len(distance_m), 3)), axis=0)
@@ -339,10 +339,10 @@ def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
 def outliers(
     scenario: Scenario, mistakes: Mistakes, airborne: BoolArray
 ) -> tuple[Array, BoolArray]:
-    """Shift of each sample, shape (n, 3), and which are outliers, in bursts while airborne.
+    """Return the outlier offset of each sample, shape (n, 3), and True for outliers.
 
-    A burst has one horizontal direction, away from the anchor that is hidden, and sizes from half
-    to one and a half of the mean one.
+    Outliers come in bursts while airborne, as from a hidden anchor. A burst has one horizontal
+    direction, and sizes from 0.5 to 1.5 times the mean.
     """
     shift = np.zeros((len(airborne), 3))
     chosen = np.zeros(len(airborne), np.bool_)
@@ -350,7 +350,7 @@ def outliers(
     count = round(len(flying) * mistakes.nlos_percent / 100.0)
     if count == 0:
         return shift, chosen
-    rng = stream(scenario, Stream.NLOS)
+    rng = random_stream(scenario, Stream.NLOS)
     bursts = -(-count // NLOS_BURST)
     lengths = 1 + rng.multinomial(count - bursts, np.full(bursts, 1.0 / bursts))
     gaps = rng.multinomial(len(flying) - count, np.full(bursts + 1, 1.0 / (bursts + 1)))
@@ -366,17 +366,17 @@ def outliers(
 
 
 def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
-    """Samples that a logger keeps which passes on at most this rate; 0 keeps all."""
+    """Return True for the samples that a logger with this maximum rate (Hz) keeps; 0 keeps all."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
-    # a sample on the edge of an interval must not fall to either side by rounding
+    # the margin prevents rounding from moving a sample to the wrong interval
     return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
 
 
-def _stamps(
+def _source_times_us(
     mistakes: Mistakes, time_s: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Times of arrival and stamps of measurement, µs from the first data."""
+    """Return arrival times and measurement timestamps, µs from the first data."""
     latency = mistakes.clock_jump_s or LATENCY_S
     latency_s = np.maximum(rng.normal(latency, LATENCY_SIGMA_S, len(time_s)), LEAST_LATENCY_S)
     arrival_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
@@ -395,7 +395,7 @@ def _odometry_topic(
     body_to_ned: Array | None,
 ) -> Topic:
     variance = np.full(position_m.shape, sigma_m**2)
-    fields = stamps(stamp_us, arrival_us - stamp_us)
+    fields = timestamps(stamp_us, arrival_us - stamp_us)
     fields |= {"position": position_m, "position_variance": variance}
     if body_to_ned is not None:
         fields["q"] = quaternions(body_to_ned)
@@ -409,7 +409,7 @@ def _gnss_topic(
     sigma_m: float,
     scenario: Scenario,
 ) -> Topic:
-    """vehicle_gps_position (msg/SensorGps.msg), with EKF2's own origin."""
+    """Return vehicle_gps_position (msg/SensorGps.msg), about the origin of EKF2."""
     latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME[:2])
     accuracies = {
         "eph": sigma_m,
@@ -422,11 +422,11 @@ def _gnss_topic(
         "altitude_msl_m": HOME[2] - position_m[:, 2],
     }
     velocity = {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
-    return topic(GPS_POSITION, stamps(stamp_us) | place | accuracies | velocity)
+    return topic(GPS_POSITION, timestamps(stamp_us) | place | accuracies | velocity)
 
 
 def _low_pass(position_m: Array, interval_s: float, constant_s: float) -> Array:
-    """First-order low pass, started at rest on the first sample."""
+    """Apply a first-order low-pass filter, started at rest at the first sample."""
     keep = np.exp(-interval_s / constant_s)
     smooth, _ = lfilter([1.0 - keep], [1.0, -keep], position_m, axis=0, zi=keep * position_m[:1])
     return np.asarray(smooth)
@@ -435,7 +435,7 @@ def _low_pass(position_m: Array, interval_s: float, constant_s: float) -> Array:
 def _is_outside_gap(
     time_s: Array, length_s: float, at_s: float | None, duration_s: float
 ) -> BoolArray:
-    """Samples outside a gap, which lies in the middle unless said otherwise."""
+    """Return True for samples outside a gap, by default in the middle of the flight."""
     start_s = (duration_s - length_s) / 2.0 if at_s is None else at_s
     return np.asarray((time_s <= start_s) | (time_s >= start_s + length_s))
 
@@ -446,12 +446,12 @@ def _grid_us(duration_s: float, rate_hz: float) -> NDArray[np.int64]:
 
 
 def seconds(time_us: NDArray[np.int64]) -> Array:
-    """Microseconds as seconds."""
+    """Convert microseconds to seconds."""
     return np.asarray(time_us * 1e-6, dtype=np.float64)
 
 
-def stamps(time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0) -> dict[str, Any]:
-    """The two stamps of what was sampled then and published so much later, µs since boot."""
+def timestamps(time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0) -> dict[str, Any]:
+    """Return ``timestamp`` and ``timestamp_sample``, published ``later_us`` after measurement."""
     return {
         "timestamp": _boot_stamps(time_us + later_us),
         "timestamp_sample": _boot_stamps(time_us),
@@ -459,7 +459,7 @@ def stamps(time_us: NDArray[np.int64], later_us: int | NDArray[np.int64] = 0) ->
 
 
 def vectors(values: Mapping[str, Array]) -> dict[str, Any]:
-    """Vectors, shape (n, 3), as PX4 names their parts: ``vx``, ``vy``, ``vz`` of "v"."""
+    """Return vectors, shape (n, 3), as PX4 components: ``vx``, ``vy``, ``vz`` for "v"."""
     return {
         f"{name}{axis}": vector[:, i]
         for name, vector in values.items()

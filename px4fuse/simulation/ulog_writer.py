@@ -1,4 +1,4 @@
-"""Topics to the bytes of a ULog file.
+"""Encoding of topics as a ULog file.
 
 Source: ULog file format, version 1, https://docs.px4.io/main/en/dev_log/ulog_file_format
 """
@@ -15,23 +15,23 @@ from px4fuse.readers import ULOG_MAGIC
 from px4fuse.record import table
 
 _VERSION = b"\x01"
-# By numpy's names, where they are not the same but for the "_t" of integers
+# ULog names of numpy types; integer types only add "_t"
 _TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS = bytes(40)
-# By topic and field: its type, and what it holds where that is not given
+# Type and default of each field by topic; a field without default is optional
 FIELDS = table(__file__, "topics.toml", dict[str, dict[str, list[Any]]])
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One instance of a topic: PX4's name and its fields.
+    """One instance of a PX4 topic with its fields.
 
     Attributes
     ----------
     name : str
     fields : mapping from PX4 field name to ndarray
-        Of shape (n,) or (n, k), in the types in which they are logged; the first is
-        ``timestamp``, µs since boot, not decreasing.
+        Shape (n,) or (n, k), in the logged types. The first is ``timestamp``, µs since boot, not
+        decreasing.
     instance : int
     """
 
@@ -41,15 +41,15 @@ class Topic:
 
 
 def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "") -> Topic:
-    """A topic with the fields of PX4 in their types.
+    """Return a topic with PX4's fields and types.
 
     Parameters
     ----------
     name : str
     field_values : mapping
-        Fields, a row per message; one number stands for all of them.
+        Fields with one row per message; a scalar applies to all messages.
     table_row : str
-        Of which row of the table the topic is, where that is not its name.
+        Row of the table, if it differs from the topic name.
     """
     rows, count = FIELDS[table_row or name], np.size(field_values["timestamp"])
     assert field_values.keys() <= rows.keys(), f"{name} has no {field_values.keys() - rows.keys()}"
@@ -76,12 +76,12 @@ def encode(
     start_us: int,
     dropouts_ms: Sequence[int] = (),
 ) -> bytes:
-    """Encode a ULog file: the same input gives the same bytes.
+    """Encode a ULog file; the same input gives the same bytes.
 
     Parameters
     ----------
     topics : sequence of Topic
-        Messages are written in the order of their time stamps, those of one topic as they stand.
+        Messages are sorted by timestamp; the order within a topic is kept.
     parameters : mapping
         int becomes int32, float becomes float32.
     info : mapping
@@ -89,7 +89,7 @@ def encode(
     start_us : int
         Boot time at which logging starts.
     dropouts_ms : sequence of int
-        Written after the data.
+        Durations of the dropouts, written after the data.
     """
     out = [ULOG_MAGIC + _VERSION, struct.pack("<Q", start_us), _message("B", _FLAG_BITS)]
     formats = dict.fromkeys(_format(topic) for topic in topics)
@@ -132,16 +132,16 @@ def _format(topic: Topic) -> str:
 
 
 def _data(topic: Topic, number: int) -> list[bytes]:
-    """One whole message per sample."""
+    """Return one complete message per sample."""
     head = [("size", "<u2"), ("kind", "u1"), ("number", "<u2")]
     body = [
         (name, values.dtype.newbyteorder("<"), values.shape[1:])
         for name, values in topic.fields.items()
     ]
-    # a field of PX4 may be called like one of the header
+    # the underscore avoids name conflicts with PX4 fields
     dtype = np.dtype([(f"_{name}", kind) for name, kind in head] + body)
     records = np.zeros(len(topic.fields["timestamp"]), dtype)
-    records["_size"] = dtype.itemsize - 3  # what follows size and kind
+    records["_size"] = dtype.itemsize - 3  # excludes the header bytes of size and kind
     records["_kind"] = ord("D")
     records["_number"] = number
     for name, values in topic.fields.items():
