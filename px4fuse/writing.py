@@ -67,10 +67,10 @@ def written_before(paths: Sequence[Path]) -> str:
     """List the outputs that a run wrote before it ended early, of which there is at least one.
 
     >>> written_before([Path("a.pdf"), Path("a.json")])
-    'a.pdf, a.json written before'
+    'already written: a.pdf, a.json'
     """
     few = len(paths) <= _MOST_NAMED
-    return f"{', '.join(map(str, paths)) if few else f'{len(paths)} files'} written before"
+    return f"already written: {', '.join(map(str, paths)) if few else f'{len(paths)} files'}"
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -134,6 +134,6 @@ def _refusal(path: Path, error: OSError, written: Sequence[Path]) -> OutputError
     name = "standard output" if path == STANDARD_OUTPUT else path
     why = "nobody reads this pipe" if error.errno == errno.ENXIO else error.strerror
     is_locked = LOCKS and isinstance(error, PermissionError)
-    before = f", {written_before(written)}" if written else ""
+    before = f"; {written_before(written)}" if written else ""
     remedy = "Close the program that has it open, or choose" if is_locked else "Choose"
     return OutputError(f"{name}: cannot be written ({why}){before}", f"{remedy} another place.")
