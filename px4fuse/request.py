@@ -189,7 +189,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
 
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Range of values of one parameter, ends included; equal ratios above zero, else equal steps."""
+    """Range of values of one parameter, ends included; equal ratios above 0, else equal steps."""
 
     parameter: str
     low: float
