@@ -22,7 +22,7 @@ NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def summary(fleet: Fleet) -> Page:
-    """Format the logs that could not be compared, the σ of both filters by axis, and the findings."""
+    """Format logs that could not be compared, the σ of both filters by axis, and findings."""
     page, logs = Page(), fleet.table.drop_duplicates("log")
     uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
     causes = uncompared.agg(["count", "first"]).reset_index()
@@ -87,10 +87,10 @@ def differences(results: ChangeResults) -> Page:
     least = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(f"Numbers that differ by less than {least} are not listed.", colour=MUTED_COLOUR)
     for finding in results.findings:
-        text = words(
+        styled = words(
             f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
         )
-        page.labelled(f"Only {finding.only_in}", text)
+        page.labelled(f"Only {finding.only_in}", styled)
     for text in results.worse:
         page.labelled("Worse", words(text, 8.0, RED))
     if not results.worse:
