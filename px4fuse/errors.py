@@ -26,8 +26,8 @@ def suggest_name(name: str, known: Iterable[str]) -> str:
     """
     import difflib  # noqa: PLC0415 - needed for errors only
 
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f"Did you mean {near[0]}? " if near else ""
+    similar = difflib.get_close_matches(name, list(known), n=1)
+    return f"Did you mean {similar[0]}? " if similar else ""
 
 
 def to_one_line(text: str) -> str:

@@ -93,13 +93,18 @@ def check_output_folder(folder: Path) -> None:
     """
     register = _register.get() or _Register()
     entries = _entries(folder)
-    for place in (folder, *entries, *(one for entry in entries for one in _entries(entry))):
+    for place in (
+        folder,
+        *entries,
+        *(subentry for entry in entries for subentry in _entries(entry)),
+    ):
         if (identity := _identity(place)) is None:
             continue
-        found = place if identity in register.read else register.containing.get(identity)
-        if found is not None:
+        input_path = place if identity in register.read else register.containing.get(identity)
+        if input_path is not None:
             raise OutputError(
-                f"-o {folder} contains an input of this command, {found}", "Choose another folder."
+                f"-o {folder} contains an input of this command, {input_path}",
+                "Choose another folder.",
             )
 
 

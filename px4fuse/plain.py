@@ -75,8 +75,8 @@ def join_first(names: Sequence[str], most: int, between: str = ", ") -> str:
     >>> join_first("abcd", 2), join_first("ab", 2)
     ('a, b and 2 more', 'a, b')
     """
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return between.join(names[:most]) + more
+    suffix = f" and {len(names) - most} more" if len(names) > most else ""
+    return between.join(names[:most]) + suffix
 
 
 def format_p_value(p: float) -> str:

@@ -174,7 +174,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
     LogError
         A path is not a regular file or a folder, is too large, or cannot be read.
     """
-    found: dict[str, Path] = {}
+    file_by_hash: dict[str, Path] = {}
     limit = max_log_bytes.get()
     for path in paths:
         if path.is_dir():
@@ -191,8 +191,8 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                     sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
             except OSError as error:
                 raise _unreadable(display_name(file), error, LogError) from error
-            found.setdefault(sha256, file)
-    return found
+            file_by_hash.setdefault(sha256, file)
+    return file_by_hash
 
 
 def files_below(folder: Path) -> list[Path]:
@@ -200,18 +200,18 @@ def files_below(folder: Path) -> list[Path]:
 
     A folder that cannot be listed is returned, too.
     """
-    found: list[Path] = []
+    files: list[Path] = []
     folders_left = [folder]
     while folders_left:
         place = folders_left.pop()
         try:
             with os.scandir(place) as entries:
                 for entry in entries:
-                    into = folders_left if entry.is_dir(follow_symlinks=False) else found
+                    into = folders_left if entry.is_dir(follow_symlinks=False) else files
                     into.append(Path(entry.path))
         except OSError:
-            found.append(place)
-    return sorted(found)
+            files.append(place)
+    return sorted(files)
 
 
 def _read(path: Path, count: int, error_type: type[Px4FuseError], name: str) -> bytes:

@@ -19,11 +19,11 @@ def in_unit(typed: str, unit: str) -> float | None:
     >>> in_unit("10cm", "m"), in_unit("0,5", "s"), in_unit("10 apples", "m")
     (0.1, 0.5, None)
     """
-    found = _TYPED.fullmatch(typed.strip())
-    scale = _SCALES.get(unit, {}).get(found[2].lower() or unit.lower()) if found else None
-    if found is None or scale is None:
+    match = _TYPED.fullmatch(typed.strip())
+    scale = _SCALES.get(unit, {}).get(match[2].lower() or unit.lower()) if match else None
+    if match is None or scale is None:
         return None
     try:
-        return float(found[1].replace(",", ".")) * scale
+        return float(match[1].replace(",", ".")) * scale
     except ValueError:  # several decimal points
         return None

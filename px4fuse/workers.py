@@ -158,9 +158,9 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
         message: tuple[bool, Any] = worker.pipe.recv()
     except (EOFError, OSError):
         worker.process.join(5)
-        how = f"exit code {worker.process.exitcode}"
+        status = f"exit code {worker.process.exitcode}"
         when = "" if worker.ready else " during its start"
-        return False, JobFailure(f"the worker process ended{when} ({how}).")
+        return False, JobFailure(f"the worker process ended{when} ({status}).")
     # unpickling runs code of the result's classes, which may raise any exception
     except Exception as error:  # noqa: BLE001
         return False, JobFailure(f"the result could not be unpickled ({type(error).__name__}).")

@@ -106,13 +106,13 @@ def _replace(real: Path, content: bytes) -> None:
     """Write a file completely or not at all."""
     real.parent.mkdir(parents=True, exist_ok=True)
     # a short name: the target's name may already have the maximum length
-    part = real.with_name(f".px4fuse-{secrets.token_hex(8)}")
+    temporary = real.with_name(f".px4fuse-{secrets.token_hex(8)}")
     try:
-        with part.open("xb") as file:
+        with temporary.open("xb") as file:
             file.write(content)
-        part.replace(real)
+        temporary.replace(real)
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _opened_pipe(path: Path) -> IO[bytes]:

@@ -195,8 +195,8 @@ def main() -> None:
 
 def _prepare_libraries() -> None:
     """Set the environment variables that libraries read at their import."""
-    for name, one in ONE_THREAD.items():
-        os.environ.setdefault(name, one)
+    for name, value in ONE_THREAD.items():
+        os.environ.setdefault(name, value)
     for name in UNUSED:
         os.environ.pop(name, None)
     if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):

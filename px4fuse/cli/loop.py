@@ -149,10 +149,10 @@ def _solve_graph(
     from px4fuse.results.build import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
-    path, part = split_part(str(source))
-    if part is not None:
+    path, track = split_part(str(source))
+    if track is not None:
         raise SettingsError(
-            f"{display_name(source)}: a pose graph has no track {part!r}", f"Omit :{part}."
+            f"{display_name(source)}: a pose graph has no track {track!r}", f"Omit :{track}."
         )
     for parameter in inputs.typed_parameters():
         if parameter.name not in GRAPH_PARAMETERS:

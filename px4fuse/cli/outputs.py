@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # bytes; limit for the name of a report (file systems allow 255), and the kept part of a longer one
 LONGEST_NAME, LONGEST_STEM = 200, 180
 # Name and id on a report without a student
-NOBODY = ("", "")
+NO_PERSON = ("", "")
 # characters; longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
 # Key in click's context: files that this run has written, for the message if it ends early
@@ -116,8 +116,8 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
 
     name = f"{stem}{settings}"
     if len(os.fsencode(name)) > LONGEST_NAME:
-        kept = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
-        name = f"{kept}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
+        short_stem = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
+        name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
     for file, read in ((path, attached_results), (path.with_suffix(".json"), read_results)):
         if not file.exists():
@@ -128,7 +128,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
             is_same = False
         else:
             is_same = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
-            is_same &= _person(old) in (NOBODY, _person(results))
+            is_same &= _person(old) in (NO_PERSON, _person(results))
         if not is_same:
             raise OutputError(
                 f"{file} exists and is not a report of the same files and student by this version; "
@@ -141,7 +141,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
 def _person(results: Results) -> tuple[str, str]:
     """Return name and id of the student on a report."""
     student = getattr(results, "student", None)
-    return NOBODY if student is None else (student.name, student.id)
+    return NO_PERSON if student is None else (student.name, student.id)
 
 
 def web_page(output: Path | None, default: Path) -> Path:

@@ -67,8 +67,8 @@ def noise_text(noise: Noise) -> str:
     """Format a noise estimate and its 95 % interval, without the unit."""
     if noise.value is None:
         ends = (("at most", noise.high), ("at least", noise.low))
-        known = (f"{word} {end:.2g}" for word, end in ends if end is not None)
-        return next(known, "not identifiable")
+        bounds = (f"{word} {end:.2g}" for word, end in ends if end is not None)
+        return next(bounds, "not identifiable")
     low = "0" if noise.low is None else f"{noise.low:.2g}"
     high = "?" if noise.high is None else f"{noise.high:.2g}"
     return f"{noise.value:.3g} ({low}-{high})"

@@ -65,13 +65,13 @@ def _read_attached(path: Path) -> DiffInput | None:
     limit = MAX_REPORT_BYTES if is_report else MAX_RESULTS_BYTES
     advice = "Reports are below 2 MB" if is_report else "Give results of px4fuse compare"
     content = read_bytes_limited(path, ResultsError, limit, size_remedy=advice)
-    found = (attached_results if is_report else read_results)(content, name)
-    if not isinstance(found, Results):
+    results = (attached_results if is_report else read_results)(content, name)
+    if not isinstance(results, Results):
         raise ResultsError(
-            f"{name} contains {found.schema.name}, which px4fuse diff cannot compare. "
+            f"{name} contains {results.schema.name}, which px4fuse diff cannot compare. "
             "Give a log, or a report or results of px4fuse compare."
         )
-    return DiffInput(name, "report" if is_report else "results", found)
+    return DiffInput(name, "report" if is_report else "results", results)
 
 
 def _analyse_log(path: Path, other: DiffInput | None, progress: Progress) -> DiffInput:

@@ -37,27 +37,27 @@ def numbers(results: ComparisonResults | AidsResults) -> dict[str, Number]:
     own: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if at(results, "source.kind") == "gnss":
         own = ("gnss_pos",)
-    found: dict[str, Number] = {}
+    numbers_by_path: dict[str, Number] = {}
     for measure in MEASURES:
         kind, interval = measure["path"], measure["interval"]
         for path, names in _places(results, kind):
             parent, _, field = path.rpartition(".")
-            part, first_name = at(results, parent), names[0] if names else ""
-            value = getattr(part, field, None)
-            unclear = isinstance(part, Clock) and not part.determinable
-            unclear |= isinstance(part, HeadingError) and part.drifts
+            record, first_name = at(results, parent), names[0] if names else ""
+            value = getattr(record, field, None)
+            unclear = isinstance(record, Clock) and not record.determinable
+            unclear |= isinstance(record, HeadingError) and record.drifts
             is_duplicate = kind == _REJECTED and first_name not in (level, "down")
             is_duplicate |= kind.startswith("aids.") and first_name in own
             if unclear or is_duplicate or not isinstance(value, int | float):
                 continue
             labels = (AIDS[name].label if name in AIDS else name for name in names)
-            found[path] = Number(
+            numbers_by_path[path] = Number(
                 ", ".join((measure["label"], *labels)),
                 measure["unit"],
                 float(value),
-                getattr(part, interval) if interval else None,
+                getattr(record, interval) if interval else None,
             )
-    return found
+    return numbers_by_path
 
 
 def _places(

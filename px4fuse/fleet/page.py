@@ -207,7 +207,7 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
         "lacking": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": axes,
-        "findings": [part for part in log.get("findings", "").split(FINDING_SEPARATOR) if part],
+        "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
     }
     return log | {"tags": _tags(log)}
 

@@ -36,15 +36,15 @@ COLUMNS = {row["column"]: row["type"] for row in _COLUMNS}
 Row = dict[str, Any]
 
 
-def at(found: object, path: str) -> Any:
+def at(results: object, path: str) -> Any:
     """Return the value at a path in the results; None if there is none."""
 
-    def below(part: Any, name: str) -> Any:
-        if isinstance(part, tuple):
-            return part[int(name)]
-        return part.get(name) if isinstance(part, Mapping) else getattr(part, name, None)
+    def below(parent: Any, name: str) -> Any:
+        if isinstance(parent, tuple):
+            return parent[int(name)]
+        return parent.get(name) if isinstance(parent, Mapping) else getattr(parent, name, None)
 
-    return reduce(below, path.split("."), found)
+    return reduce(below, path.split("."), results)
 
 
 def axis_rows(results: ComparisonResults) -> list[Row]:

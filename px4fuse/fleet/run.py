@@ -92,7 +92,7 @@ def batch(
     output: str | Path | None = None,
     *,
     reports: bool = False,
-    **how: Any,
+    **settings: Any,
 ) -> pd.DataFrame:
     """Compare many logs, on this computer or a Dask cluster.
 
@@ -118,7 +118,7 @@ def batch(
         Address space for one log, of which libraries use 0.6 GB; enforced on Linux only.
     progress : callable
         Called with the activity, the number of finished logs, and the number of all logs.
-    **how
+    **settings
         The arguments above, and those of :func:`px4fuse.compare`, such as ``sigma_z_m``.
 
     Returns
@@ -136,7 +136,7 @@ def batch(
     sources = (paths,) if isinstance(paths, str | Path) else paths
     with TemporaryDirectory(prefix="px4fuse-") as scratch:
         folder = Path(scratch if output is None else output)
-        fleet = run(map(str, sources), folder, reports=reports and output is not None, **how)
+        fleet = run(map(str, sources), folder, reports=reports and output is not None, **settings)
     return fleet.table if output is not None else fleet.table.assign(results="", report="")
 
 

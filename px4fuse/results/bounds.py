@@ -40,8 +40,8 @@ def bounds_of(name: str) -> tuple[float, float]:
     >>> bounds_of("nis_mean"), bounds_of("position_rmse_m"), bounds_of("start_s")
     ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))
     """
-    found = (bounds for pattern, bounds in BOUNDS.items() if re.search(pattern, name))
-    return next(found, (-math.inf, math.inf))
+    matches = (bounds for pattern, bounds in BOUNDS.items() if re.search(pattern, name))
+    return next(matches, (-math.inf, math.inf))
 
 
 def within_bounds(results: T) -> T:
@@ -57,15 +57,17 @@ def within_bounds(results: T) -> T:
     """
     reasons: list[str] = []
     try:
-        found: T = _part(results, None, "", reasons)
+        checked: T = _checked(results, None, "", reasons)
     except _OutsideError as error:
         raise ResultsError(f"no results: {error}", REMEDY) from error
     if not reasons:
         return results
-    if hasattr(found, "missing"):
+    if hasattr(checked, "missing"):
         missing = (Unavailable(reason.split(" ", 1)[0], reason, REMEDY) for reason in reasons)
-        return replace(found, missing=(*found.missing, *missing))
-    return replace(found, notes=(*found.notes, *reasons)) if hasattr(found, "notes") else found
+        return replace(checked, missing=(*checked.missing, *missing))
+    return (
+        replace(checked, notes=(*checked.notes, *reasons)) if hasattr(checked, "notes") else checked
+    )
 
 
 def _kinds(kind: Any) -> tuple[Any, ...]:
@@ -77,7 +79,7 @@ def _kinds(kind: Any) -> tuple[Any, ...]:
     return getattr(kind, "kinds", (kind,))
 
 
-def _part(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:
+def _checked(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:
     """Return a value without numbers outside their bounds; raise if it is such a number itself."""
     if isinstance(value, float):
         low, high = bounds_of(path.rpartition(".")[2])
@@ -98,7 +100,7 @@ def _struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Str
     for field in fields(value):
         old, name = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
-            new = _part(old, field.type, name, reasons)
+            new = _checked(old, field.type, name, reasons)
         except _OutsideError as error:
             if field.default is None:
                 reasons.append(str(error))
@@ -118,7 +120,7 @@ def _mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list[str])
     for key, old in value.items():
         name = f"{path}.{key}"
         try:
-            checked[key] = _part(old, of_values, name, reasons)
+            checked[key] = _checked(old, of_values, name, reasons)
         except _OutsideError as error:
             try:
                 checked[key] = _unavailable(old, of_values, name, error, reasons)
@@ -135,7 +137,7 @@ def _tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, 
     checked = []
     for old in value:
         try:
-            checked.append(_part(old, Any, path, reasons))
+            checked.append(_checked(old, Any, path, reasons))
         except _OutsideError as error:
             if not isinstance(old, msgspec.Struct):
                 raise
@@ -152,7 +154,7 @@ def _unavailable(
         if isinstance(member, type) and issubclass(member, Unavailable):
             texts = {"what": path, "reason": str(error), "remedy": REMEDY}
             other_fields = {
-                field.name: _part(getattr(old, field.name), field.type, path, reasons)
+                field.name: _checked(getattr(old, field.name), field.type, path, reasons)
                 for field in fields(member)
                 if field.name not in texts and hasattr(old, field.name)
             }
