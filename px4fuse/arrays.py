@@ -1,4 +1,4 @@
-"""Types of arrays, for annotations everywhere."""
+"""Array types for annotations, and integration over time."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ BoolArray = NDArray[np.bool_]
 
 
 def cumulative_integral(values: Array, time_s: Array) -> Array:
-    """Integral up to each time by the trapezoidal rule, along the first axis, from zero."""
+    """Integrate values over time up to each sample (trapezoidal rule, first axis, from zero)."""
     integral = np.zeros_like(values)
     length = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
     np.cumsum((values[1:] + values[:-1]) / 2.0 * length, axis=0, out=integral[1:])

@@ -1,13 +1,13 @@
-"""Short text of a record that holds tables or arrays."""
+"""Short text (repr) of records that contain tables or arrays."""
 
 from collections.abc import Mapping
 from typing import Any
 
-MAX_TEXT = 60  # characters of a text
+MAX_TEXT = 60  # characters
 
 
 def one_line_repr(result: Any) -> str:
-    """Write a record on one line, its tables and arrays by their shapes.
+    """Format a record on one line, with tables and arrays by their shapes.
 
     >>> import pandas as pd
     >>> from px4fuse.flight import Truth

@@ -1,39 +1,39 @@
-"""Everything that px4fuse raises on purpose.
+"""Errors that px4fuse raises.
 
 ::
 
     Px4FuseError
     ├── LogError           the log cannot be read, or is not one
-    ├── MissingDataError   the log can be read but lacks what was asked for
+    ├── MissingDataError   the log can be read, but the required data are not in it
     ├── TrajectoryError    a trajectory or pose graph cannot be read or used
     ├── SettingsError      a setting is outside its documented range
-    ├── ResultsError       a file holds no results of px4fuse that this version reads
+    ├── ResultsError       a file contains no results of px4fuse that this version reads
     └── OutputError        a result cannot be written
 
-The text of each is one line for a person: what is wrong, where, and what to do. It names arguments
-as Python does, in backticks (`sigma_z_m`); the command line puts its options in their place
-(:func:`px4fuse.request.with_options`), prints it on standard error and ends with exit code 2.
+The text is one line: the fault, its place, and an action. Arguments are in backticks
+(`sigma_z_m`); the command line replaces them by its options
+(:func:`px4fuse.request.with_options`), prints the text to standard error and ends with exit code 2.
 """
 
 from collections.abc import Iterable
 
 
 def suggest_name(name: str, known: Iterable[str]) -> str:
-    """The known name that a mistyped one is nearest to, as a question; empty where none is near.
+    """Return a question with the known name that is most similar; empty if none is similar.
 
     >>> suggest_name("EKF2_EVP_NOIS", ["EKF2_EVP_GATE", "EKF2_EVP_NOISE"]), suggest_name("x", ["y"])
     ('Did you mean EKF2_EVP_NOISE? ', '')
     """
-    import difflib  # noqa: PLC0415 - where something is wrong only
+    import difflib  # noqa: PLC0415 - needed for errors only
 
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f"Did you mean {near[0]}? " if near else ""
+    similar = difflib.get_close_matches(name, list(known), n=1)
+    return f"Did you mean {similar[0]}? " if similar else ""
 
 
 def to_one_line(text: str) -> str:
-    r"""A text without what would break or rewrite the line on which it is printed.
+    r"""Replace characters that would break or change the line on which the text is printed.
 
-    File names may hold line feeds and a terminal's escape sequences.
+    File names may contain line feeds and escape sequences of a terminal.
 
     >>> to_one_line("a\nb\x1b[2J")
     'a b?[2J'
@@ -42,14 +42,14 @@ def to_one_line(text: str) -> str:
 
 
 class Px4FuseError(Exception):
-    """Base of all errors that px4fuse raises on purpose; all is put on one line.
+    """Base class of all errors of px4fuse; the text is put on one line.
 
     Parameters
     ----------
     reason : str
-        What is wrong, and where.
+        The fault and its place.
     remedy : str
-        What to do, a sentence; empty where the reason says it.
+        The action, as a sentence; empty if the reason contains it.
     """
 
     def __init__(self, reason: str, remedy: str = "") -> None:
@@ -63,11 +63,11 @@ class LogError(Px4FuseError):
 
 
 class MissingDataError(Px4FuseError):
-    """The log was read, but what was asked for is not in it."""
+    """The log was read, but the required data are not in it."""
 
 
 class TrajectoryError(Px4FuseError):
-    """A trajectory or pose graph cannot be read, or lacks what was asked for."""
+    """A trajectory or pose graph cannot be read, or the required data are not in it."""
 
 
 class SettingsError(Px4FuseError):
@@ -75,7 +75,7 @@ class SettingsError(Px4FuseError):
 
 
 class ResultsError(Px4FuseError):
-    """A file holds no results of px4fuse, or none that this version reads."""
+    """A file contains no results of px4fuse, or none that this version reads."""
 
 
 class OutputError(Px4FuseError):

@@ -1,9 +1,9 @@
-"""Register of the files that a command reads: nothing is written to any of them.
+"""Register of the input files of a command; px4fuse never writes to any of them.
 
-Files are known by device and inode, so that another path, a symbolic or hard link and other
-letters on a file system that ignores case are the same file. Readers add each file that they open;
-:func:`px4fuse.writing.write_all` refuses to write to one. Only the process of the command has a
-register: what its workers read is added before they start.
+Files are identified by device and inode, so a link, another path, or another spelling on a file
+system that ignores case is the same file. Readers add each file that they open.
+:func:`px4fuse.writing.write_all` raises an error for a registered file. Only the process of the
+command has a register: it adds the files of its workers before they start.
 """
 
 import os
@@ -15,17 +15,17 @@ from pathlib import Path
 
 from px4fuse.errors import OutputError
 
-# Device and inode; a path on a file system without inodes
+# Device and inode; the path on a file system without inodes
 _Identity = tuple[int, int] | str
 
 
 @dataclass(frozen=True)
 class _Register:
-    """Files and folders that are read, and the folders that contain one, at any depth."""
+    """Input files and folders, and all folders above them."""
 
     read: set[_Identity] = field(default_factory=set)
     containing: dict[_Identity, Path] = field(default_factory=dict)
-    entered: set[Path] = field(default_factory=set)  # folders whose parents are in `containing`
+    entered: set[Path] = field(default_factory=set)  # folders whose parents are in containing
 
 
 _register: ContextVar[_Register | None] = ContextVar("register", default=None)
@@ -33,7 +33,7 @@ _register: ContextVar[_Register | None] = ContextVar("register", default=None)
 
 @contextmanager
 def inputs_protected() -> Iterator[None]:
-    """Register what is read inside, and refuse to write to it inside."""
+    """Register the files that are read inside the context, and reject writing to them."""
     before = _register.set(_Register())
     try:
         yield
@@ -43,7 +43,7 @@ def inputs_protected() -> Iterator[None]:
 
 @contextmanager
 def own_files() -> Iterator[None]:
-    """Read files that px4fuse wrote and is about to update, which are not registered."""
+    """Read files of px4fuse inside the context without registering them, to update them."""
     before = _register.set(None)
     try:
         yield
@@ -52,7 +52,7 @@ def own_files() -> Iterator[None]:
 
 
 def add_input(path: Path) -> None:
-    """Register a file or folder; a path that does not exist is ignored."""
+    """Register an input file or folder; a path that does not exist is ignored."""
     register = _register.get()
     if register is None or (identity := _identity(path)) is None:
         return
@@ -65,12 +65,12 @@ def add_input(path: Path) -> None:
 
 
 def check_outputs(targets: Iterable[Path]) -> None:
-    """Refuse targets that are registered files.
+    """Raise an error if an output is a registered input.
 
     Raises
     ------
     OutputError
-        A target is one of the inputs.
+        An output is an input.
     """
     register = _register.get() or _Register()
     for target in targets:
@@ -82,24 +82,29 @@ def check_outputs(targets: Iterable[Path]) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Refuse a folder for outputs that contains a registered file or folder, also by a link.
+    """Raise an error if the output folder contains an input, also through a link.
 
-    Outputs are written into the folder and its subfolders, so the entries of both are compared.
+    Outputs are written to the folder and its subfolders, so the entries of both are compared.
 
     Raises
     ------
     OutputError
-        It contains one.
+        The folder contains an input.
     """
     register = _register.get() or _Register()
     entries = _entries(folder)
-    for place in (folder, *entries, *(one for entry in entries for one in _entries(entry))):
+    for place in (
+        folder,
+        *entries,
+        *(subentry for entry in entries for subentry in _entries(entry)),
+    ):
         if (identity := _identity(place)) is None:
             continue
-        found = place if identity in register.read else register.containing.get(identity)
-        if found is not None:
+        input_path = place if identity in register.read else register.containing.get(identity)
+        if input_path is not None:
             raise OutputError(
-                f"-o {folder}: contains an input of this command, {found}", "Give another folder."
+                f"-o {folder} contains an input of this command, {input_path}",
+                "Choose another folder.",
             )
 
 

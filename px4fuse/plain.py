@@ -1,4 +1,4 @@
-"""Results as plain data: what JSON can hold, without NaN; and numbers as people read them."""
+"""Conversion to JSON types, and formatting of numbers and short texts."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,9 +11,9 @@ import msgspec
 
 
 def to_json_types(value: object) -> Any:
-    """Records, mappings and tuples as dicts and lists.
+    """Convert records, mappings and tuples to dicts and lists.
 
-    What is None or not a finite number is left out of a dict, never written as zero or NaN.
+    None, NaN and infinity are left out of a dict.
 
     >>> to_json_types({"rate_hz": float("nan"), "topics": ("a", "b")})
     {'topics': ['a', 'b']}
@@ -33,7 +33,7 @@ def to_json_types(value: object) -> Any:
 
 
 def utc_time(unix_s: float | None) -> str | None:
-    """ISO 8601 with milliseconds; None where it is not known, or a clock is beyond the calendar.
+    """Format a UNIX time (s) as ISO 8601 with milliseconds; None if unknown or out of range.
 
     >>> utc_time(1.5), utc_time(1e18)
     ('1970-01-01T00:00:01.500+00:00', None)
@@ -47,7 +47,7 @@ def utc_time(unix_s: float | None) -> str | None:
 
 
 def format_number(value: float, digits: int = 3) -> str:
-    """A number with as many digits as a person reads, never with an exponent.
+    """Format a number with ``digits`` significant digits and without an exponent.
 
     >>> [format_number(value) for value in (0.811, 22.41, 3412.0, 4.2e6, 0.0129, 2.9e-05, 0.0)]
     ['0.811', '22.4', '3,410', '4,200,000', '0.0129', '0.000029', '0']
@@ -56,7 +56,7 @@ def format_number(value: float, digits: int = 3) -> str:
 
 
 def format_factor(factor: float) -> str:
-    """A factor with as many digits as a person reads.
+    """Format a factor with 2 significant digits, or 3 below 2.
 
     >>> [format_factor(f) for f in (1.18, 9.87, 61.2, 388.0, 3412.0, 5.13e6)]
     ['1.18', '9.9', '61', '390', '3,400', '5,100,000']
@@ -65,22 +65,22 @@ def format_factor(factor: float) -> str:
 
 
 def capitalise_first(text: str) -> str:
-    """A text that begins with a capital letter; the rest of it stays as it is."""
+    """Return the text with its first letter in upper case."""
     return text[:1].upper() + text[1:]
 
 
 def join_first(names: Sequence[str], most: int, between: str = ", ") -> str:
-    """The first few of several names, and how many more there are.
+    """Join the first names and append the number of the others.
 
     >>> join_first("abcd", 2), join_first("ab", 2)
     ('a, b and 2 more', 'a, b')
     """
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return between.join(names[:most]) + more
+    suffix = f" and {len(names) - most} more" if len(names) > most else ""
+    return between.join(names[:most]) + suffix
 
 
 def format_p_value(p: float) -> str:
-    """A p-value as it is read: small is small.
+    """Format a p-value with 2 digits; below 0.001 only the bound is given.
 
     >>> [format_p_value(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
     ['p 0.43', 'p 0.021', 'p < 0.001', 'p < 0.001', 'p < 0.001']
@@ -89,7 +89,7 @@ def format_p_value(p: float) -> str:
 
 
 def format_length(metres: float) -> str:
-    """A length as a person says it.
+    """Format a length (m) in mm, cm or m.
 
     >>> [format_length(m) for m in (0.0041, 0.0612, 0.336, 1.42, 23.4, 250.0)]
     ['4 mm', '6 cm', '34 cm', '1.4 m', '23 m', '250 m']
@@ -101,7 +101,7 @@ def format_length(metres: float) -> str:
 
 
 def format_excess(factor: float) -> str:
-    """By how much something is too large, from how many times (1 or more) it is.
+    """Format by how much a quantity is too large, from its ratio (1 or more) to the right value.
 
     >>> [format_excess(f) for f in (1.18, 1.96, 2.4, 24.3)]
     ['18 %', '96 %', '2.4 times', '24 times']

@@ -1,9 +1,8 @@
-"""Reading the files that a person names: regular ones only, within a limit, and in one line if not.
+"""Reading of input files: regular files only, up to a size limit.
 
-Every file that is read is registered as an input, which no output replaces.
-
-A device, a named pipe or a socket may never end or may block; a sparse file may be larger than any
-memory. So a file is looked at before it is opened, and no more than its limit is read.
+Each file is registered as an input, which no output replaces. A device, named pipe or socket may
+block or never end, and a sparse file may be larger than the memory. So type and size are checked
+before a file is opened, and no more than the limit is read.
 """
 
 import hashlib
@@ -17,14 +16,14 @@ from pathlib import Path
 from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
 from px4fuse.input_files import add_input
 
-#: Largest flight log that is read, in bytes; ``--max-size`` sets it for one command
+#: bytes; maximum size of a flight log, which ``--max-size`` sets for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
-_SIZE_REMEDY = "Cut it to the flight, or allow more with --max-size MB"
+_SIZE_REMEDY = "Cut the log to the flight, or increase the limit with --max-size MB"
 _BYTES_PER_MB = 1_000_000
 
 
 def display_name(path: Path) -> str:
-    r"""A path's last part for messages: never empty, and on one line.
+    r"""Return the file name of a path for messages: never empty, and on one line.
 
     >>> display_name(Path("logs/a.ulg")), display_name(Path(".")), display_name(Path("a\nb"))
     ('a.ulg', '.', 'a b')
@@ -33,7 +32,7 @@ def display_name(path: Path) -> str:
 
 
 def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
-    """Size of a regular file in bytes; the file is registered as an input.
+    """Return the size of a regular file in bytes, and register the file as an input.
 
     Parameters
     ----------
@@ -47,19 +46,19 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     Raises
     ------
     Px4FuseError
-        Of type ``error_type``: it is missing, cannot be looked at, or is not a regular file.
+        Of type ``error_type``: the file is missing, not accessible, or not a regular file.
     """
     name = name or display_name(path)
     try:
         status = path.stat()
-    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
+    except (OSError, ValueError) as error:  # ValueError: the path contains NUL
         near = ""
-        with suppress(OSError):  # a folder that may not be looked into has no names to offer
+        with suppress(OSError):  # no suggestion if the folder cannot be listed
             if isinstance(error, FileNotFoundError):
                 near = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
         raise _unreadable(name, error, error_type, near) from error
     if stat.S_ISDIR(status.st_mode):
-        raise error_type(f"{name}: is a folder", "Give a file.")
+        raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
         raise error_type(
             f"{name} is not a regular file (device, pipe or socket).", "Save it to a file first."
@@ -69,7 +68,7 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
 
 
 def read_head(path: Path, count: int, error_type: type[Px4FuseError]) -> bytes:
-    """First bytes of a regular file, at most ``count``.
+    """Read the first bytes of a regular file, at most ``count``.
 
     Raises
     ------
@@ -86,10 +85,10 @@ def read_bytes_limited(
     limit_bytes: int,
     *,
     name: str = "",
-    size_remedy: str = "Cut it to the flight",
+    size_remedy: str = "Cut the file to the flight",
     empty_remedy: str | None = None,
 ) -> bytes:
-    """All bytes of a regular file that is not too large.
+    """Read all bytes of a regular file up to a size limit.
 
     Parameters
     ----------
@@ -98,9 +97,9 @@ def read_bytes_limited(
     name : str, optional
         For messages; by default as :func:`display_name` shows it.
     size_remedy : str
-        What to do where it is too large.
+        Action in the error if the file is too large.
     empty_remedy : str, optional
-        What to do where it is empty; without it an empty file is read as it is.
+        Action in the error if the file is empty; without it an empty file is accepted.
 
     Raises
     ------
@@ -110,7 +109,7 @@ def read_bytes_limited(
     name = name or display_name(path)
     size = file_size(path, error_type, name)
     content = b"" if size > limit_bytes else _read(path, size + 1, error_type, name)
-    if len(content) > size:  # it grows, or is one of /proc, which say that they are empty
+    if len(content) > size:  # the file grows, or is in /proc, where sizes are 0
         content = _read(path, limit_bytes + 1, error_type, name)
     if (least := max(size, len(content))) > limit_bytes:
         raise error_type(_too_large(name, least, limit_bytes), f"{size_remedy}.")
@@ -120,14 +119,14 @@ def read_bytes_limited(
 
 
 def read_log_bytes(path: Path) -> bytes:
-    """All bytes of a flight log, up to :data:`max_log_bytes`.
+    """Read all bytes of a flight log, up to :data:`max_log_bytes`.
 
     Raises
     ------
     LogError
-        It cannot be read, is not a regular file, is empty or too large.
+        The log cannot be read, is not a regular file, is empty or too large.
     """
-    limit, empty_remedy = max_log_bytes.get(), "Copy it from the vehicle again"
+    limit, empty_remedy = max_log_bytes.get(), "Copy the log from the vehicle again"
     return read_bytes_limited(
         path, LogError, limit, size_remedy=_SIZE_REMEDY, empty_remedy=empty_remedy
     )
@@ -139,14 +138,14 @@ def read_text(
     limit_bytes: int,
     *,
     name: str = "",
-    size_remedy: str = "Cut it",
+    size_remedy: str = "Shorten the file",
 ) -> str:
-    """Text of a regular file in UTF-8, or in UTF-16 as a Windows shell writes it.
+    """Read a text file in UTF-8, or in UTF-16 as written by a Windows shell.
 
     Parameters
     ----------
-    path, refuse, limit_bytes, name, size_remedy
-        As :func:`read_bytes_limited` takes them.
+    path, error_type, limit_bytes, name, size_remedy
+        See :func:`read_bytes_limited`.
 
     Raises
     ------
@@ -165,17 +164,17 @@ def read_text(
 
 
 def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
-    """Flight logs and other recordings by their SHA-256; of a folder all regular files in it.
+    """Return files by their SHA-256; for a folder, all regular files in it.
 
-    In a folder, files larger than :data:`max_log_bytes` are passed over, as no log of such a size
-    is read. Of files with the same content the first one counts.
+    In a folder, files larger than :data:`max_log_bytes` are ignored. Of files with the same content
+    the first is returned.
 
     Raises
     ------
     LogError
-        What was given is not a regular file or a folder, is too large, or cannot be read.
+        A path is not a regular file or a folder, is too large, or cannot be read.
     """
-    found: dict[str, Path] = {}
+    file_by_hash: dict[str, Path] = {}
     limit = max_log_bytes.get()
     for path in paths:
         if path.is_dir():
@@ -192,27 +191,27 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                     sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
             except OSError as error:
                 raise _unreadable(display_name(file), error, LogError) from error
-            found.setdefault(sha256, file)
-    return found
+            file_by_hash.setdefault(sha256, file)
+    return file_by_hash
 
 
 def files_below(folder: Path) -> list[Path]:
-    """All but folders in a folder and its subfolders, however deep, sorted; links as they are.
+    """Return all files in a folder and its subfolders, sorted; links are not followed.
 
-    A folder that cannot be looked into is among them.
+    A folder that cannot be listed is returned, too.
     """
-    found: list[Path] = []
+    files: list[Path] = []
     folders_left = [folder]
     while folders_left:
         place = folders_left.pop()
         try:
             with os.scandir(place) as entries:
                 for entry in entries:
-                    into = folders_left if entry.is_dir(follow_symlinks=False) else found
+                    into = folders_left if entry.is_dir(follow_symlinks=False) else files
                     into.append(Path(entry.path))
         except OSError:
-            found.append(place)
-    return sorted(found)
+            files.append(place)
+    return sorted(files)
 
 
 def _read(path: Path, count: int, error_type: type[Px4FuseError], name: str) -> bytes:
@@ -232,4 +231,4 @@ def _unreadable(
 
 def _too_large(name: str, *sizes: int) -> str:
     size, limit = (f"{n / _BYTES_PER_MB:,.{0 if n >= 10 * _BYTES_PER_MB else 2}f}" for n in sizes)
-    return f"{name}: {size} MB, more than the limit of {limit} MB"
+    return f"{name}: the file has {size} MB; the limit is {limit} MB"

@@ -1,7 +1,7 @@
-"""What all records share: they are frozen and strict, and are written as they are.
+"""Base class of the records in results: immutable, strictly typed, and written without change.
 
-Names carry units. A number that could not be computed is left out, or an :class:`Unavailable`
-stands in place of the part that it belongs to; it is never zero.
+Field names contain the unit. A number that could not be computed is absent, or its part is an
+:class:`Unavailable`; it is never replaced by zero.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ Vector = tuple[float, float, float]
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A fact as it is computed and written: no field but its own, and what is None is left out.
+    """Immutable record; fields that are None are not written.
 
     Attributes
     ----------
     schema_type : type or None
-        Of a record that carries arrays or tables too: its base, which has what is written.
+        For a record that also contains arrays or tables: its base class with the written fields.
     """
 
     schema_type: ClassVar[type[Record] | None] = None
 
 
 class Unavailable(Record, frozen=True):
-    """Something that was looked for and not found; it stands in place of what it would have been.
+    """Missing data with the reason and how to log them; it replaces the record.
 
     Attributes
     ----------
     what : str
-        What is missing, as a noun phrase ("EKF2 innovations").
+        Missing data as a noun phrase ("EKF2 innovations").
     reason : str
-        Why, in terms of the log ("no topic vehicle_attitude").
+        Reason in terms of the log ("no topic vehicle_attitude").
     remedy : str
-        What would have logged it, or what to do instead.
+        Action: how to log the data, or an alternative.
     source : str
-        Name of the position source that this is; empty where it is something else.
+        Name of the position source, if a position source is missing; else empty.
     """
 
     what: str
@@ -63,15 +63,15 @@ class Unavailable(Record, frozen=True):
 T = TypeVar("T")
 A = TypeVar("A")
 if TYPE_CHECKING:
-    RecordOrUnavailable: TypeAlias = Union[T, A]  # noqa: UP007 - an alias that takes parameters
+    RecordOrUnavailable: TypeAlias = Union[T, A]  # noqa: UP007 - generic alias
     OrUnavailable: TypeAlias = Union[T, Unavailable]  # noqa: UP007
 else:
 
     class RecordOrUnavailable:
-        """``RecordOrUnavailable[T, A]``: a record, or the other one, a kind of :class:`Unavailable`.
+        """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
 
-        msgspec decodes a union of two structs only by a tag, which these have not. To msgspec each
-        ``RecordOrUnavailable[T, A]`` is therefore a type of its own, which :func:`decode_record_or_unavailable` decodes.
+        msgspec needs a tag to decode a union of two structs, and these have none. So each union is
+        a separate type, which :func:`decode_record_or_unavailable` decodes.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -81,19 +81,19 @@ else:
             return either_type
 
     class OrUnavailable:
-        """``OrUnavailable[T]``: a record, or :class:`Unavailable`."""
+        """``OrUnavailable[T]``: a record T, or :class:`Unavailable`."""
 
         def __class_getitem__(cls, kind: type) -> type:
             return RecordOrUnavailable[kind, Unavailable]
 
 
 def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
-    """Decode an :class:`RecordOrUnavailable`, as a ``dec_hook`` of msgspec.
+    """Decode a :class:`RecordOrUnavailable`; a ``dec_hook`` of msgspec.
 
     Raises
     ------
     ValueError
-        It is none of the two.
+        The value is neither of the two.
     """
     record_type, unavailable_type = union_type.kinds
     kind = (
@@ -104,11 +104,11 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
     try:
         return msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
     except msgspec.ValidationError as error:
-        raise ValueError(str(error)) from error  # so that msgspec adds where this part is
+        raise ValueError(str(error)) from error  # msgspec adds the path to a ValueError
 
 
 def to_serializable(value: Any) -> Any:
-    """What is written of a record, without the arrays that it carries, in all its parts."""
+    """Return the written fields of a record and its parts, without arrays and tables."""
     if isinstance(value, Record):
         kind = value.schema_type or type(value)
         return kind(
@@ -120,15 +120,15 @@ def to_serializable(value: Any) -> Any:
 
 
 def table(beside: str, name: str, kind: type[T]) -> T:
-    """A table of the package, in a TOML file beside a module.
+    """Read a TOML file of the package as a type.
 
     Parameters
     ----------
     beside : str
-        ``__file__`` of the module.
+        ``__file__`` of a module in the folder of the file.
     name : str
-        Of the table's file.
+        Name of the TOML file.
     kind : type
-        What it holds.
+        Type of the content.
     """
     return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)

@@ -1,7 +1,7 @@
-"""What is analysed and how: the one thing that a command line is parsed into.
+"""Requests: the files and settings of one analysis, parsed from a command line.
 
-A request is what :func:`px4fuse.analysis.run` takes and what the results record, so that a report
-can be made again without its command line.
+:func:`px4fuse.analysis.run` takes a request. The results record it, so that a report can be made
+again without its command line.
 """
 
 import os
@@ -17,29 +17,29 @@ import msgspec
 from px4fuse.record import table
 
 AUTO: Literal["auto"] = "auto"
-# The filter's settings where nobody chooses
+# Default settings of KF
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
-# What a log does not tell of a position source
+# Kind of a position source, which the messages in a log may leave open
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
-# What the height of a GNSS flight is from
+# Height source of a GNSS flight
 HeightName = Literal["gnss", "barometer"]
-# What a trajectory file's axes may be said to be
+# Frame of a trajectory file
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
 System = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
 class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The positioning system's own recording, and how it is read.
+    """Position file of the positioning system (CSV), and how to read it.
 
     Attributes
     ----------
     path : str
     frame : {"ned", "enu", "nwu"} or None
-        None: from its column names, or what fits EKF2.
+        None: from the column names, else the frame that fits EKF2 best.
     yaw_deg : float, "auto" or None
-        Turn it clockwise, seen from above; "auto" finds yaw and origin.
+        Clockwise rotation of the file, seen from above; "auto" estimates yaw and origin.
     columns : tuple of str or None
         Names or numbers of its columns: time, x, y, z and sigma.
     time_unit : {"s", "ms", "us", "ns"} or None
@@ -59,10 +59,10 @@ _PATHS = ("log", "mavlink", "source", "estimate", "reference")
 
 
 class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What all requests share."""
+    """Base class of all requests."""
 
     def without_paths(self) -> Self:
-        """The same with the names of files alone, as results record it."""
+        """Return the request with file names instead of paths, as the results record it."""
         paths = {name: getattr(self, name, None) for name in _PATHS}
         changes: dict[str, Any] = {n: _name(path) for n, path in paths.items() if path is not None}
         position = getattr(self, "position", None)
@@ -74,7 +74,7 @@ class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ComparisonRequest(
     _RequestBase, frozen=True, kw_only=True, tag_field="command", tag="compare"
 ):
-    """A flight to compare with EKF2, as ``compare``, ``tune`` and ``sync`` take it.
+    """Flight to compare with EKF2, for ``compare``, ``tune`` and ``sync``.
 
     Attributes
     ----------
@@ -86,25 +86,25 @@ class ComparisonRequest(
         MAVLink system id of the vehicle; None for the one with the most data.
     position : PositionFile or None
     position_source : str or None
-        Name of a track of the flight; None for the best.
+        Name of a position track of the flight; None for the most direct one.
     source_kind : {"uwb", "vio", "mocap", "gnss"} or None
-        What the source is; None for what its messages make of it.
+        Kind of the position source; None: from its messages.
     height : {"gnss", "barometer"} or None
-        What "down" is from where the source is GNSS; None for the one that EKF2 fused, GNSS first.
+        Height source on a GNSS flight; None for the one that EKF2 fused, GNSS first.
     sigma_a_m_s2, dt_s : float
-        As :class:`px4fuse.filter.settings.Settings`.
+        See :class:`px4fuse.filter.settings.Settings`.
     sigma_z_m : float or None
-        None: 0.1, and of GNSS what EKF2 takes for its noise.
+        None: 0.1 m, and for GNSS the measurement noise that EKF2 uses.
     input : {"imu", "zero"} or None
-        None: the IMU where it is logged.
+        None: the IMU if it is logged.
     axes : tuple of str
-        Empty for all that the source supports.
+        Empty for all axes with a position.
     heading_deg : float or None
-        Of the aisle; None for that of the track.
+        Heading of the aisle axis, clockwise from north; None for the main direction of the track.
     start_s, end_s : float or None
-        Segment, seconds from the first data; None for the flight.
+        Segment in seconds after the first data; None for take-off and landing.
     clock_offset_s : float, "auto" or None
-        Added to the source's stamps; None is 0, or "auto" with ``position``.
+        Seconds to add to the timestamps of the source; None is 0, or "auto" with ``position``.
     """
 
     log: str
@@ -126,14 +126,14 @@ class ComparisonRequest(
 
 
 class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where it landed from where it took off, and how far it was turned there.
+    """Landing place and rotation relative to the take-off place.
 
     Attributes
     ----------
     forward_m, right_m : float
-        Along the vehicle's nose at take-off, and to the right of it.
+        Along the nose of the vehicle at take-off, and to its right (m).
     turned_deg : float or None
-        Clockwise; None where it is not known.
+        Rotation between take-off and landing, clockwise; None if unknown.
     """
 
     forward_m: float
@@ -142,7 +142,7 @@ class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two times (s) at which the vehicle was at the same place, and how precisely (m, 1 σ)."""
+    """Two times (s) at which the vehicle was at the same place, within ``sigma_m`` (m, 1 σ)."""
 
     time_1_s: float
     time_2_s: float
@@ -150,28 +150,28 @@ class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", tag="loop"):
-    """A loop to measure and correct, as ``loop`` takes it.
+    """Loop to measure and correct, for ``loop``.
 
     Attributes
     ----------
     source : str
-        Path of a trajectory or a flight log, as ``FILE`` or ``LOG:PART``; in results its name.
+        Path of a trajectory or a flight log (``FILE`` or ``LOG:TRACK``); in results its name.
     frame : str or None
-        What a trajectory's axes are; None as its reader tells.
+        Frame of a trajectory file; None: as detected.
     system : int or None
         MAVLink system id of the vehicle.
     reference : str or None
-        Path of what the paths are scored against, besides the log's ground truth.
+        Path of a reference trajectory for ATE and RPE, besides the log's ground truth.
     start_s, end_s : float or None
-        Override take-off and landing.
+        Start and end of the loop; None for take-off and landing.
     landed_at : Landing or None
     came_back : bool
-        False where the landing closes no loop.
+        False if the vehicle did not return to the take-off place.
     closures : tuple of GivenClosure
     position_drift_m, heading_drift_deg : float
-        What the odometry drifts in 100 m (1 σ).
+        Drift of the odometry after 100 m (1 σ).
     key_frames_m : float or None
-        Distance between key frames; None for one that suits the path.
+        Distance between key frames; None: 2 % of the extent of the path.
     """
 
     source: str
@@ -189,7 +189,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
 
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Values of one parameter, both ends included; equal ratios above zero, else equal steps."""
+    """Range of values of one parameter, ends included; equal ratios above 0, else equal steps."""
 
     parameter: str
     low: float
@@ -198,7 +198,7 @@ class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", tag="whatif"):
-    """A flight whose EKF2 is replayed with other parameters, as ``whatif`` takes it.
+    """Flight whose EKF2 is replayed with changed parameters, for ``whatif``.
 
     Attributes
     ----------
@@ -209,11 +209,11 @@ class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command"
     system : int or None
         MAVLink system id of the vehicle; None for the one with the most data.
     changes : mapping from PX4 name to value
-        In PX4's units. Empty without a sweep: what the data ask for.
+        In PX4's units. Empty without a sweep: the maximum-likelihood noise and delay.
     sweep : Sweep or None
-        One parameter over several values, the others changed as said.
+        One parameter with several values, in addition to ``changes``.
     without : mapping from PX4's name of an aid to float
-        From when on (s) it is not fused, besides.
+        Time (s) from which EKF2 does not fuse the aid.
     """
 
     log: str
@@ -225,16 +225,16 @@ class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command"
 
 
 class EvaluationRequest(_RequestBase, frozen=True, kw_only=True):
-    """Two trajectories to score, as ``evaluate`` takes them.
+    """Two trajectories to compare by ATE and RPE, for ``evaluate``.
 
     Attributes
     ----------
     estimate, reference : str
-        Paths of trajectories or flight logs, as ``FILE`` or ``LOG:PART``.
+        Paths of trajectories or flight logs (``FILE`` or ``LOG:TRACK``).
     alignment, association, max_gap_s, time_offset_s
-        As :func:`px4fuse.evaluate` takes them; None as it chooses.
+        Arguments of :func:`px4fuse.evaluate`; None: chosen automatically.
     rpe : tuple of str
-        Deltas with their units; empty for some that suit the path.
+        Deltas with their units; empty: several that fit the path length.
     consecutive : bool
     system : int or None
         MAVLink system id of the vehicle.
@@ -255,17 +255,17 @@ Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
 class Option(msgspec.Struct, frozen=True):
-    """How a field of a request is typed on the command line; what it takes is the field's type.
+    """Option of the command line for one field of a request.
 
     Attributes
     ----------
     name : str
     meaning : str
-        Its help; empty where the command declares the option itself.
+        Help text; empty if the command declares the option itself.
     unit : str
-        Of a number, as :data:`px4fuse.units.NAMES` has it.
+        Unit of a number, one of :data:`px4fuse.units.NAMES`.
     example : float
-        Shown where what was typed cannot be understood.
+        Number in the error message if the typed text is not a number.
     metavar : str or None
     """
 
@@ -277,7 +277,7 @@ class Option(msgspec.Struct, frozen=True):
 
 
 _TABLES = table(__file__, "options.toml", dict[str, dict[str, Option]])
-# Which recordings of one flight are read, and what the filter does, for one flight or many
+# Options by topic, from options.toml
 RECORDINGS, FILTER_OPTIONS = _TABLES["recordings"], _TABLES["filter"]
 POSITION_OPTIONS, CLOCK_OPTION = _TABLES["position"], _TABLES["clock"]
 LOOP_OPTIONS, EVALUATION_OPTIONS = _TABLES["loop"], _TABLES["evaluation"]
@@ -290,7 +290,7 @@ _OF_REQUESTS: dict[type[msgspec.Struct], Mapping[str, Option]] = {
     EvaluationRequest: EVALUATION_OPTIONS,
 }
 
-# What the errors of a command may name, besides fields: arguments in Python, to its options
+# Options for arguments that are named in errors and are not fields of a request
 _ARGUMENTS = {
     "position": "--position",
     "changes": "--set",
@@ -299,7 +299,7 @@ _ARGUMENTS = {
 
 
 def with_options(text: str, options: Mapping[str, Option] = OPTIONS) -> str:
-    """The text of an error with options in the place of the arguments that it names.
+    """Replace argument names in backticks by the options of the command line.
 
     >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
     '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
@@ -311,40 +311,40 @@ def with_options(text: str, options: Mapping[str, Option] = OPTIONS) -> str:
 def command_line(
     request: Request | EvaluationRequest, command: str | None = None, *, typed: bool = False
 ) -> str:
-    """The command that makes this again, for people to read: without defaults.
+    """Format the command line that repeats an analysis, without defaults.
 
     Parameters
     ----------
     request : Request or EvaluationRequest
     command : str, optional
-        Of those that take this request; by default ``compare``, ``loop``, ``whatif`` or
+        Name of the command; by default ``compare``, ``loop``, ``whatif`` or
         ``evaluate``.
     typed : bool
-        With the paths as they were typed, for the shell of this system; else with the names of
-        files alone, as a POSIX shell reads it.
+        True: with paths, quoted for the shell of this system, so that it can be pasted. False: with
+        file names only, quoted for a POSIX shell.
     """
     shown_request = request if typed else request.without_paths()
-    # what must be given are files, and everything else is an option
+    # required fields are files; all other fields are options
     needed = [field.name for field in msgspec.structs.fields(shown_request) if field.required]
     files = [_path_argument(getattr(shown_request, name)) for name in needed]
-    words = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
-    words += [word for pair in _all_options(shown_request) for word in pair if word is not None]
+    arguments = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
+    arguments += [word for pair in _all_options(shown_request) for word in pair if word is not None]
     if isinstance(shown_request, WhatIfRequest):
         for name, value in shown_request.changes.items():
-            words += ["--set", f"{name}={_option_text(value)}"]
-        if (sweep_range := shown_request.sweep) is not None:
-            ends = f"{_option_text(sweep_range.low)}:{_option_text(sweep_range.high)}:{sweep_range.count}"
-            words += ["--sweep", f"{sweep_range.parameter}={ends}"]
+            arguments += ["--set", f"{name}={_option_text(value)}"]
+        if (sweep := shown_request.sweep) is not None:
+            ends = f"{_option_text(sweep.low)}:{_option_text(sweep.high)}:{sweep.count}"
+            arguments += ["--sweep", f"{sweep.parameter}={ends}"]
         for name in shown_request.without:
-            words += ["--without", name]
+            arguments += ["--without", name]
         for since in {*shown_request.without.values()} - {0.0}:
-            words += ["--from", _option_text(since)]
+            arguments += ["--from", _option_text(since)]
     join = subprocess.list2cmdline if typed and os.name == "nt" else shlex.join
-    return join(["px4fuse", *words])
+    return join(["px4fuse", *arguments])
 
 
 def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
-    """What is not at its default, as a part of a file name.
+    """Format the settings that are not at their defaults, as part of a file name.
 
     >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, mavlink="b/c.tlog"))
     '_mavlink-c_sigma-z-0.05'
@@ -358,12 +358,12 @@ def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) 
 
 
 def _path_argument(path: str) -> str:
-    """A path that is not taken for an option."""
+    """Prefix a path that begins with "-", so that it is not read as an option."""
     return f"./{path}" if path.startswith("-") else path
 
 
 def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
-    """Options with their values, None for a flag, of the fields that are not at their defaults."""
+    """Yield options and values (None for a flag) of fields that are not at their defaults."""
     options = _OF_REQUESTS[type(request)]
     for field in msgspec.structs.fields(request):
         value = getattr(request, field.name)
@@ -378,7 +378,7 @@ def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
 
 
 def _option_text(value: Any) -> str:
-    """A value as it is typed."""
+    """Format a value for the command line."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.astuple(value)
     if isinstance(value, tuple):
@@ -387,5 +387,5 @@ def _option_text(value: Any) -> str:
 
 
 def _name(path: str) -> str:
-    """Name of a file without its folders and without stray bytes that a terminal hands over."""
+    """Return the file name of a path; bytes that are not valid text are replaced."""
     return PurePath(path).name.encode(errors="replace").decode()

@@ -1,6 +1,9 @@
-"""One thread for linear algebra: the matrices here are small, and more threads only wait."""
+"""Environment variables for single-threaded linear algebra.
 
-# Read by libraries as they are loaded, before any code of ours runs
+The matrices are small, so more threads would only wait for each other.
+"""
+
+# Libraries read these variables when they are loaded
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",

@@ -1,9 +1,10 @@
-"""Work on what strangers wrote, in processes that may hang, crash or take all memory.
+"""Worker processes for untrusted files, with limits of time and memory for each job.
 
-Neither pool of the standard library can do this. ``concurrent.futures`` cannot end one running
-job: a worker that is killed breaks the whole pool (BrokenProcessPool). ``multiprocessing.Pool``
-waits forever for the result of a worker that died. Pebble's pool (5.2) breaks as a whole, too,
-where a worker dies before it was noted which job it has. So: one pipe per process, and a clock.
+A job may hang, crash or use all memory without effect on the others. The pools of the standard
+library cannot do this: in ``concurrent.futures`` a killed worker ends the whole pool
+(BrokenProcessPool), and ``multiprocessing.Pool`` waits forever for the result of a dead worker.
+Pebble's pool (5.2) ends if a worker dies before its job was registered. So each process here has a
+pipe and a deadline.
 """
 
 import multiprocessing
@@ -24,18 +25,18 @@ from px4fuse.threads import ONE_THREAD
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# A worker is replaced after so many jobs: what libraries cache does not grow with the class. A new
-# process takes two seconds to import
+# A worker is replaced after this number of jobs, which limits the caches of libraries. The imports
+# of a new process take 2 s
 JOBS_PER_WORKER = 80
-# Of one report: a flight of ten minutes takes about one minute; what takes longer is not a report
+# s; one report of a 10-minute flight takes about 60 s
 TIMEOUT_S = 120.0
 MEMORY_BYTES = 4_000_000_000
-# Until a new process has imported what the function needs, on a slow and busy machine
+# s for the imports of a new process on a slow and busy computer
 START_S = 180.0
-# Read by an interpreter as it starts, before any code of ours runs
+# Read by a Python interpreter when it starts
 _ENVIRONMENT = {
-    # a spawned interpreter looks for modules in the current folder first; who grades there would
-    # run a functools.py that was handed in
+    # without it, an interpreter imports modules from the current folder first: a submitted
+    # functools.py would be executed
     "PYTHONSAFEPATH": "1",
     **ONE_THREAD,
 }
@@ -43,16 +44,16 @@ _ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class JobFailure:
-    """What stands for the result of a job that gave none, and why: one line for a person."""
+    """Result of a job that failed, with the reason on one line."""
 
     reason: str
 
 
 class _Worker:
-    """A process, our end of its pipe, and the job it has."""
+    """Worker process, the parent's end of its pipe, and its current job."""
 
     def __init__(self, function: Callable[[Any], Any], memory_bytes: int | None, job: int) -> None:
-        # spawn: the same on Windows and macOS, and no copy of the parent's memory
+        # spawn works on all systems and does not copy the memory of the parent
         context = multiprocessing.get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
         self.process = context.Process(target=_serve, args=(child_pipe, function, memory_bytes))
@@ -63,7 +64,7 @@ class _Worker:
         finally:
             os.environ.clear()
             os.environ.update(before)
-        child_pipe.close()  # so that the pipe ends when the process does
+        child_pipe.close()  # so the pipe is closed when the process ends
         self.ready = False
         self.job = job
         self.jobs_done = 0
@@ -84,39 +85,37 @@ def run_bounded(
     timeout_s: float = TIMEOUT_S,
     memory_bytes: int | None = MEMORY_BYTES,
 ) -> Generator[tuple[int, Result | JobFailure]]:
-    """Call a function on every job, in processes of their own, each within bounds.
+    """Call a function on every job in worker processes, each job within limits.
 
-    A job whose process hangs, dies or takes too much memory is lost alone: its process is ended
-    and replaced. Whatever ends this generator (an error, Ctrl-C, its ``close``) ends all processes.
+    If the process of a job hangs, dies or uses too much memory, it is ended and replaced; other
+    jobs continue. All processes end with this generator (error, Ctrl-C, ``close``).
 
     Parameters
     ----------
     function : callable
-        At the top level of a module; pickled, as are jobs and results.
+        Defined at the top level of a module; function, jobs and results are pickled.
     processes : int, optional
-        At once; by default as many as there are cores.
+        Number of parallel processes; by default the number of cores.
     timeout_s : float
-        For one job, once its process is ready.
+        Time limit for one job, once its process is ready.
     memory_bytes : int or None
-        Address space of one process (RLIMIT_AS), libraries included, which take about 0.6 GB of it;
-        None for no limit. Without effect on Windows, which has no such limit, and on macOS, which
-        does not enforce it.
+        Address space of one process (RLIMIT_AS), of which libraries use about 0.6 GB; None for no
+        limit. Without effect on Windows and macOS.
 
     Yields
     ------
     (int, object)
-        Index of a job and its result, :class:`JobFailure` where there is none, in the order in which
-        they finish.
+        Index of a job and its result or :class:`JobFailure`, in the order in which jobs finish.
     """
     waiting = list(range(len(jobs)))[::-1]
     workers: dict[Connection, _Worker] = {}
     try:
         while waiting or workers:
             while waiting and len(workers) < (processes or os.cpu_count() or 1):
-                # given now, sent when the process is ready: a start that fails costs one job
+                # assigned now, sent when the process is ready: a failed start costs one job
                 new_worker = _Worker(function, memory_bytes, waiting.pop())
                 workers[new_worker.pipe] = new_worker
-            # the latest when somebody's time is up
+            # wait until the first deadline at most
             first_deadline = min(worker.deadline for worker in workers.values())
             ready_pipes = wait(workers, max(0.0, first_deadline - time.monotonic()))
             for pipe, worker in list(workers.items()):
@@ -132,13 +131,13 @@ def run_bounded(
                             continue
                         worker.job = waiting.pop()
                     worker.deadline = time.monotonic() + timeout_s
-                    # a process that died in between shows at the next look at its pipe
+                    # a process that died meanwhile is detected at the next read of its pipe
                     with suppress(BrokenPipeError, ConnectionResetError):
                         pipe.send(jobs[worker.job])
                 elif time.monotonic() >= worker.deadline:
                     limit = timeout_s if worker.ready else START_S
                     workers.pop(pipe).end()
-                    yield worker.job, JobFailure(f"it took longer than {limit:g} s and was ended.")
+                    yield worker.job, JobFailure(f"the time limit of {limit:g} s was exceeded.")
     finally:
         for worker in workers.values():
             worker.end()
@@ -147,30 +146,30 @@ def run_bounded(
 def run_one_bounded(
     function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int = MEMORY_BYTES
 ) -> Result | JobFailure:
-    """One call in a process of its own, within bounds: see :func:`run_bounded`."""
+    """Call a function on one job in a worker process, within limits: see :func:`run_bounded`."""
     work = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
     with closing(work):
         return next(work)[1]
 
 
 def _receive_result(worker: _Worker) -> tuple[bool, Any]:
-    """Whether the process can go on, and what it said."""
+    """Return True if the process is usable, and the result that it sent."""
     try:
         message: tuple[bool, Any] = worker.pipe.recv()
     except (EOFError, OSError):
         worker.process.join(5)
-        how = f"exit code {worker.process.exitcode}"
-        when = "" if worker.ready else " before it began"
-        return False, JobFailure(f"the process that read it ended{when} ({how}).")
-    # unpickling runs what the classes of a result define: anything can go wrong
+        status = f"exit code {worker.process.exitcode}"
+        when = "" if worker.ready else " during its start"
+        return False, JobFailure(f"the worker process ended{when} ({status}).")
+    # unpickling runs code of the result's classes, which may raise any exception
     except Exception as error:  # noqa: BLE001
-        return False, JobFailure(f"its result could not be read ({type(error).__name__}).")
+        return False, JobFailure(f"the result could not be unpickled ({type(error).__name__}).")
     return message
 
 
 def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
-    """Life of a worker: ready, then job by job until the pipe ends."""
-    # Ctrl-C is for the parent, which ends us
+    """Run the loop of a worker process: job by job until the pipe is closed."""
+    # the parent handles Ctrl-C and ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _limit_memory(memory_bytes)
@@ -183,11 +182,11 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
         try:
             message = pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
         except MemoryError:
-            # the next job would not find enough memory either
-            why = JobFailure("it needed more memory than one file may take.")
+            # the next job would not have enough memory, so the process ends
+            why = JobFailure("the memory limit for one file was exceeded.")
             message = pickle.dumps((False, why))
-        except Exception as error:  # noqa: BLE001 - a job's failure is its result
-            # two seconds to import, in every process, for what mostly does not happen
+        except Exception as error:  # noqa: BLE001 - the failure of a job is its result
+            # imported here: the import takes 2 s and is needed for errors only
             from px4fuse.results.reading import one_line  # noqa: PLC0415
 
             kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
@@ -197,7 +196,7 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
 
 
 def _end_with_parent() -> None:
-    """Not to hang for ever where the parent was killed and can end nobody."""
+    """End this process when its parent ends, even if the parent was killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -209,7 +208,7 @@ def _limit_memory(memory_bytes: int | None) -> None:
         import resource  # noqa: PLC0415 - not on Windows
     except ImportError:
         return
-    # a crash leaves no memory image of a student's file behind
+    # no core dump: it would contain the file of a student
     for kind, most in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
         if most is not None:
             with suppress(ValueError, OSError):  # macOS refuses some values

@@ -1,4 +1,4 @@
-"""Writing results: each file beside its target under a temporary name, then renamed."""
+"""Writing of outputs: each file under a temporary name beside its target, then renamed."""
 
 import errno
 import os
@@ -14,11 +14,11 @@ from px4fuse.errors import OutputError
 from px4fuse.input_files import check_outputs
 
 STANDARD_OUTPUT = Path("-")
-# Wait for a reader of a named pipe, in s
+# s to wait for a reader of a named pipe
 READER_S = 5.0
-# Windows does not replace a file that another program has open
+# True on Windows, which does not replace a file that another program has open
 LOCKS = sys.platform == "win32"
-# Paths that a message names; of more it states the number
+# Maximum number of paths in a message; more paths are counted
 _MOST_NAMED = 4
 
 
@@ -27,14 +27,14 @@ def write_all(
 ) -> None:
     """Write outputs in the order given, and stop at the first that cannot be written.
 
-    A regular file is written under a temporary name beside its target and renamed. At any time the
+    A regular file is written under a temporary name beside its target and renamed: at any time the
     target is the old file or the complete new one. A symbolic link stays, and the file that it
-    leads to is replaced. Standard output, devices and named pipes are written directly.
+    points to is replaced. Standard output, devices and named pipes are written directly.
 
     Parameters
     ----------
     contents : mapping from Path to bytes
-        Missing folders are made. :data:`STANDARD_OUTPUT` is standard output.
+        Missing folders are created. :data:`STANDARD_OUTPUT` is standard output.
     placed : callable
         Called with each path after it is written.
 
@@ -44,7 +44,7 @@ def write_all(
         An output is an input of this command, and nothing is written; or an output cannot be
         written, and the text lists the outputs that were written before it.
     BrokenPipeError
-        The reader of a pipe has left. All other outputs are written.
+        The reader of a pipe has ended. All other outputs are written.
     """
     check_outputs(path for path in contents if path != STANDARD_OUTPUT)
     written: list[Path] = []
@@ -52,7 +52,7 @@ def write_all(
     for path, content in contents.items():
         try:
             _write(path, content)
-        except BrokenPipeError as error:  # as with | head: its reader needs no more
+        except BrokenPipeError as error:  # the reader has ended (| head)
             gone = error
             continue
         except OSError as error:
@@ -64,13 +64,13 @@ def write_all(
 
 
 def written_before(paths: Sequence[Path]) -> str:
-    """List the outputs that a run wrote before it ended early, of which there is at least one.
+    """Format the list of the outputs that a run wrote before it ended early.
 
     >>> written_before([Path("a.pdf"), Path("a.json")])
-    'a.pdf, a.json written before'
+    'already written: a.pdf, a.json'
     """
     few = len(paths) <= _MOST_NAMED
-    return f"{', '.join(map(str, paths)) if few else f'{len(paths)} files'} written before"
+    return f"already written: {', '.join(map(str, paths)) if few else f'{len(paths)} files'}"
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -87,15 +87,15 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _is_standard_output(path: Path) -> bool:
-    """Return True if standard output goes to this file, as /dev/stdout under ``> file``."""
+    """Return True if standard output goes to this file, as /dev/stdout does under ``> file``."""
     try:
         return os.path.samestat(path.stat(), os.fstat(1))
-    except OSError:  # the file is new, or standard output is closed
+    except OSError:  # the file does not exist, or standard output is closed
         return False
 
 
 def _mode(path: Path) -> int:
-    """Type of a file, that of a regular one if the file is new."""
+    """Return the mode of a file; that of a regular file if it does not exist."""
     try:
         return path.stat().st_mode
     except FileNotFoundError:
@@ -103,20 +103,20 @@ def _mode(path: Path) -> int:
 
 
 def _replace(real: Path, content: bytes) -> None:
-    """Put a file in its place, complete or not at all."""
+    """Write a file completely or not at all."""
     real.parent.mkdir(parents=True, exist_ok=True)
-    # short, as the name of the target may have the greatest length that the file system allows
-    part = real.with_name(f".px4fuse-{secrets.token_hex(8)}")
+    # a short name: the target's name may already have the maximum length
+    temporary = real.with_name(f".px4fuse-{secrets.token_hex(8)}")
     try:
-        with part.open("xb") as file:
+        with temporary.open("xb") as file:
             file.write(content)
-        part.replace(real)
+        temporary.replace(real)
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _opened_pipe(path: Path) -> IO[bytes]:
-    """Open a named pipe; to open it in the usual way waits without limit for a reader."""
+    """Open a named pipe; waits at most READER_S for a reader."""
     until = time.monotonic() + READER_S
     while True:
         try:
@@ -132,8 +132,8 @@ def _opened_pipe(path: Path) -> IO[bytes]:
 
 def _refusal(path: Path, error: OSError, written: Sequence[Path]) -> OutputError:
     name = "standard output" if path == STANDARD_OUTPUT else path
-    why = "nobody reads this pipe" if error.errno == errno.ENXIO else error.strerror
+    why = "the pipe has no reader" if error.errno == errno.ENXIO else error.strerror
     is_locked = LOCKS and isinstance(error, PermissionError)
-    before = f", {written_before(written)}" if written else ""
+    before = f"; {written_before(written)}" if written else ""
     remedy = "Close the program that has it open, or choose" if is_locked else "Choose"
-    return OutputError(f"{name}: cannot be written ({why}){before}", f"{remedy} another place.")
+    return OutputError(f"{name}: cannot be written ({why}){before}", f"{remedy} another name.")

@@ -115,7 +115,7 @@ def command(*arguments: str | Path) -> Any:
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
+def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     logs = tiny_logs(tmp_path / "logs", 1)
     (logs / "inner").mkdir()
     shutil.copy(logs / "f1.ulg", logs / "inner" / "twin.ulg")
@@ -171,7 +171,7 @@ def test_every_log_is_in_the_table_with_its_numbers_or_its_line(tmp_path):
     pd.testing.assert_frame_equal(written, table, rtol=1e-9)
 
 
-def test_the_terminal_counts_what_is_wrong_with_whole_logs(capsys):
+def test_batch_terminal_counts_reasons_of_logs(capsys):
     table = made_up(60).fillna({"axis": "", "change": ""})
     show(terminal(), summary(Fleet(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())
@@ -180,7 +180,7 @@ def test_the_terminal_counts_what_is_wrong_with_whole_logs(capsys):
     assert f"60 logs: {(table.drop_duplicates('log')['status'] == 'done').sum()} done" in said
 
 
-def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
+def test_batch_csv_missing_numbers_empty_no_formulas(tmp_path):
     table = fleet_table([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
     assert table["kf_nis_mean"].isna().all()
     assert table["updates"].isna().tolist() == [False, True]
@@ -196,7 +196,7 @@ def test_absent_numbers_are_empty_and_texts_are_no_formulas(tmp_path):
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_logs_without_a_position_are_not_judged_but_known(tmp_path):
+def test_batch_log_without_position_is_not_compared(tmp_path):
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     row = px4fuse.batch(log, tmp_path / "out").loc[0]
     assert (row["status"], row["axis"]) == ("not judged", "")
@@ -209,7 +209,7 @@ def test_logs_without_a_position_are_not_judged_but_known(tmp_path):
 
 @pytest.mark.reallogs
 @pytest.mark.usefixtures("in_this_process")
-def test_a_flight_on_gnss_has_its_rows(shared_logs):
+def test_batch_gnss_flight_has_rows(shared_logs):
     (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
     table = px4fuse.batch(log)
     assert table["axis"].tolist() == ["aisle", "north", "east"]
@@ -220,7 +220,7 @@ def test_a_flight_on_gnss_has_its_rows(shared_logs):
 
 
 @pytest.mark.usefixtures("remembered", "in_this_process")
-def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
+def test_batch_second_run_processes_new_logs_only(flights, tmp_path, monkeypatch):
     logs, output = tmp_path / "logs", tmp_path / "out"
     shutil.copytree(flights, logs)
     (logs / "f3.ulg").rename(tmp_path / "f3.ulg")
@@ -250,9 +250,7 @@ def test_a_second_run_does_only_what_is_new(flights, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("in_this_process")  # the second time
-def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
-    flights, undisturbed, tmp_path
-):
+def test_batch_ctrl_c_keeps_results_and_prints_one_line(flights, undisturbed, tmp_path):
     with running(flights, tmp_path, "--workers", "1", start_new_session=True) as process:
         until_one_is_done(process, tmp_path)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
@@ -270,7 +268,7 @@ def test_ctrl_c_at_a_terminal_keeps_what_is_done_and_says_so_on_one_line(
 
 
 @pytest.mark.usefixtures("remembered")
-def test_a_log_that_hangs_or_crashes_costs_that_log(tmp_path, monkeypatch):
+def test_batch_hanging_or_crashing_log_fails_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "analyse", batch_tools.analyse)
     logs = tmp_path / "logs"
     logs.mkdir()
@@ -297,7 +295,7 @@ def analysed(log: Path | str, max_bytes: int = 10**9) -> job.Outcome:
     return contextvars.copy_context().run(job.analyse, work)
 
 
-def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypatch):
+def test_batch_log_changed_while_read_fails(flights, tmp_path, monkeypatch):
     log = tmp_path / "f.ulg"
     shutil.copy(flights / "f1.ulg", log)
     compared = job._compare_log
@@ -318,7 +316,7 @@ def test_a_log_that_changes_while_it_is_read_says_so(flights, tmp_path, monkeypa
 
 @pytest.mark.usefixtures("remembered", "in_this_process")
 @pytest.mark.parametrize("ends", [KeyboardInterrupt, OutputError])
-def test_what_ends_a_run_keeps_what_is_done(flights, undisturbed, tmp_path, monkeypatch, ends):
+def test_batch_interrupted_run_keeps_results(flights, undisturbed, tmp_path, monkeypatch, ends):
     write_all, written = run.write_all, []
 
     def full(contents: dict[Path, bytes]) -> None:
@@ -342,7 +340,7 @@ def test_what_ends_a_run_keeps_what_is_done(flights, undisturbed, tmp_path, monk
 
 
 @pytest.mark.usefixtures("in_this_process")  # one of them
-def test_two_runs_in_one_folder(tmp_path):
+def test_batch_two_runs_in_one_folder_keep_tables_valid(tmp_path):
     """Both end well, and what they leave is one whole table."""
     logs, out = tiny_logs(tmp_path / "logs", 3, truth=False), tmp_path / "out"
     with running(logs, out, "--workers", "1") as other:
@@ -358,7 +356,7 @@ def test_two_runs_in_one_folder(tmp_path):
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_junk_in_hundreds_costs_a_line_each(tmp_path):
+def test_batch_invalid_logs_have_one_row_each(tmp_path):
     folder = tmp_path / "logs"
     folder.mkdir()
     for number in range(160):
@@ -371,7 +369,7 @@ def test_junk_in_hundreds_costs_a_line_each(tmp_path):
     assert table["reason"].str.len().between(10, 300).all()
 
 
-def test_settings_that_a_batch_cannot_have_are_refused(flights):
+def test_batch_settings_of_one_flight_are_refused(flights):
     for settings in ({"mavlink": "a.tlog"}, {"sigma": 1.0}, {"sigma_z_m": 0.0}):
         with pytest.raises(SettingsError):
             px4fuse.batch(flights, **settings)
@@ -382,7 +380,7 @@ def test_settings_that_a_batch_cannot_have_are_refused(flights):
 # ------------------------------------------------------------------ where logs lie
 
 
-def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
+def test_find_logs_in_folders_globs_and_urls(tmp_path, monkeypatch):
     import fsspec
 
     monkeypatch.chdir(tmp_path)
@@ -408,7 +406,7 @@ def test_logs_are_found_in_folders_globs_and_urls(tmp_path, monkeypatch):
 
 
 @pytest.mark.reallogs
-def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
+def test_batch_shared_logs_run_completely(shared_logs, tmp_path):
     """But for those of the sample's release, two long ones, and GNSS, which test_gnss.py has.
 
     Of a flight that two programs recorded there is one; simulated ones of other releases are in
@@ -441,7 +439,7 @@ def test_shared_logs_of_every_kind_in_one_run(shared_logs, tmp_path):
 # ------------------------------------------------------------------ a cluster of its own
 
 
-def test_what_a_cluster_lacks_is_one_line(monkeypatch, flights):
+def test_batch_unusable_cluster_prints_one_line(monkeypatch, flights):
     monkeypatch.setattr(engine, "CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
         with (
@@ -463,7 +461,7 @@ def started_worker(address: str, log: Path, path: str) -> Any:
     return started("worker", address, *local, says=says, log=log, PYTHONPATH=path)
 
 
-def test_a_cluster_that_runs_already(flights, undisturbed, tmp_path):
+def test_batch_running_cluster_gives_the_same_table(flights, undisturbed, tmp_path):
     """A scheduler and two workers; at the end the scheduler goes."""
     path = os.pathsep.join((str(batch_tools.REPOSITORY / "tests"), str(batch_tools.REPOSITORY)))
     ports = ("--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")

@@ -19,7 +19,7 @@ from px4fuse.results.contract import schema
 pytestmark = pytest.mark.usefixtures("analysed_once")
 
 
-def test_linear_algebra_has_one_thread_unless_said(monkeypatch, capsys):
+def test_libraries_use_one_thread_unless_set_by_user(monkeypatch, capsys):
     """More of them only wait for each other: twice the CPU time of `tune`, in the same time."""
     environment = {"OPENBLAS_NUM_THREADS": "3"}
     monkeypatch.setattr(os, "environ", environment)
@@ -46,7 +46,7 @@ def made(tmp_path_factory, sample_log) -> tuple[Path, str]:
     return folder, result.output
 
 
-def test_report_and_results_say_the_same_and_name_no_folder_and_no_person(made):
+def test_compare_report_attaches_results_without_paths(made):
     folder, said = made
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
     assert "vehicle_visual_odometry" in said
@@ -59,7 +59,7 @@ def test_report_and_results_say_the_same_and_name_no_folder_and_no_person(made):
     assert results["settings"]["sigma_z_m"] == 0.12
 
 
-def test_awkward_text_reaches_the_pages_as_it_is(made):
+def test_compare_report_prints_special_characters(made):
     pages = [page.extract_text() for page in pypdf.PdfReader(made[0] / "report.pdf").pages]
     assert "Ana $x$ Müller" in pages[0]
     assert "Costs $5 and x^2 or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)
@@ -68,11 +68,11 @@ def test_awkward_text_reaches_the_pages_as_it_is(made):
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(("severity", "code"), [("info", 1), ("error", 0)])
-def test_fail_on_is_another_exit_code(tmp_path, sample_log, severity, code):
+def test_compare_fail_on_sets_exit_code(tmp_path, sample_log, severity, code):
     done("compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity, code=code)
 
 
-def test_help_imports_nothing_heavy():
+def test_help_imports_no_slow_library():
     """--help answers at once: it may import neither pandas nor matplotlib nor scipy."""
     code = (
         "import sys\n"
@@ -86,7 +86,7 @@ def test_help_imports_nothing_heavy():
     assert "compare" in done.stdout
 
 
-def test_a_name_with_stray_bytes_or_ten_thousand_characters_is_drawn(tmp_path, sample_log):
+def test_compare_accepts_invalid_bytes_and_long_student_id(tmp_path, sample_log):
     part = "--axis", "north", "--start", "20", "--end", "40"
     own = "--student", "bad\udcff", "--id", "9" * 10_000
     done("compare", sample_log, *part, "-o", tmp_path / "r.pdf", *own)
@@ -107,7 +107,7 @@ def samples_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("samples_installed")
-def test_sample_writes_the_flights_and_says_what_to_do_with_them() -> None:
+def test_sample_writes_logs_and_prints_next_command() -> None:
     assert done("sample").output.splitlines()[0].split(maxsplit=1) == [
         "Next", f"px4fuse compare {Path('sample_logs') / 'aisle_uwb.ulg'}"
     ]  # fmt: skip
@@ -118,7 +118,7 @@ def test_sample_writes_the_flights_and_says_what_to_do_with_them() -> None:
 
 
 @pytest.mark.usefixtures("samples_installed")
-def test_sample_overwrites_nothing() -> None:
+def test_sample_existing_other_file_is_refused() -> None:
     Path("flights").mkdir()
     Path("flights/loop_slam.tum").write_text("mine")
     said = refused("sample", "-o", "flights")
@@ -126,13 +126,13 @@ def test_sample_overwrites_nothing() -> None:
     assert contents(Path("flights")) == {"loop_slam.tum": b"mine"}
 
 
-def test_without_the_samples_it_says_what_to_install(monkeypatch) -> None:
+def test_sample_without_package_prints_install_command(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
     assert 'not installed. Run pip install "px4fuse[samples]".' in refused("sample")
 
 
 @pytest.mark.parametrize(("words", "loaded"), [("info", False), ("extract -o out", True)])
-def test_an_extra_costs_nothing_where_it_is_not_used(words, loaded, sample_log, tmp_path):
+def test_commands_without_tables_do_not_import_pyarrow(words, loaded, sample_log, tmp_path):
     """In a process of its own: here everything is loaded already."""
     typed = [*words.split(), str(sample_log)]
     script = (
@@ -145,7 +145,7 @@ def test_an_extra_costs_nothing_where_it_is_not_used(words, loaded, sample_log, 
     assert done.stdout.splitlines()[-1] == f"pyarrow {loaded} False"
 
 
-def test_no_file_is_opened_in_the_encoding_of_the_machine(tmp_path: Path) -> None:
+def test_commands_legacy_code_page_open_files_as_utf8(tmp_path: Path) -> None:
     """With a console of Windows' western code page, and a decimal comma where there is one."""
     (tmp_path / "l.ulg").write_bytes(tiny_log(1))
     typed = [

@@ -83,7 +83,7 @@ def test_diff_takes_report_of_aids_alone(tmp_path):
 # -- bad input -------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_compared_is_refused(settings, tmp_path):
+def test_diff_unsuitable_inputs_are_refused(settings, tmp_path):
     usual = settings[0]
     link, printed, text = tmp_path / "link.pdf", tmp_path / "printed.pdf", tmp_path / "notes.txt"
     link.symlink_to(usual)

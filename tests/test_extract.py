@@ -63,7 +63,7 @@ def rich_flight() -> Flight:
 # ---- what was read is what is written ---------------------------------------------------------
 
 
-def test_csv_reads_back_as_exactly_the_same_floats(written, sample_flight):
+def test_extract_csv_reads_back_identical_floats(written, sample_flight):
     ekf2 = sample_flight.ekf2
     expected = {
         "imu": sample_flight.imu, "attitude": sample_flight.attitude,
@@ -80,7 +80,7 @@ def test_csv_reads_back_as_exactly_the_same_floats(written, sample_flight):
         np.testing.assert_array_equal(table.iloc[:, 1:], frame, err_msg=name)
 
 
-def test_innovations_are_one_tidy_table(written, sample_flight):
+def test_extract_innovations_are_one_table_with_axis_column(written, sample_flight):
     table = read(written / "ekf2_innovations.csv")
     assert table["time_s"].is_monotonic_increasing
     assert set(table["axis"]) == {"north", "east"}
@@ -90,7 +90,7 @@ def test_innovations_are_one_tidy_table(written, sample_flight):
         np.testing.assert_array_equal(rows[frame.columns], frame)
 
 
-def test_those_of_a_flight_on_gnss_are_of_gnss(tmp_path):
+def test_extract_gnss_flight_has_gnss_innovations(tmp_path):
     log = tmp_path / "o.ulg"
     log.write_bytes(to_ulog(simulate(make_scenario("outdoor", passes=1, length_m=10.0))))
     assert "external vision" not in extract(log, "-o", tmp_path / "o")
@@ -99,7 +99,7 @@ def test_those_of_a_flight_on_gnss_are_of_gnss(tmp_path):
     assert {*read(tmp_path / "o" / "ekf2_innovations.csv")["axis"]} == {"north", "east"}
 
 
-def test_the_lists_of_a_flight_are_tables():
+def test_tables_contain_resets_instances_clocks_and_spans():
     flight = rich_flight()
     tables = extraction.tables(flight)
     resets = tables["resets"]
@@ -118,7 +118,7 @@ def test_the_lists_of_a_flight_are_tables():
     assert clock == {name: value for name, value in told.items() if value is not None}
 
 
-def test_all_that_an_analysis_reads_is_extracted(sample_flight):
+def test_tables_contain_ekf2_parameters_and_orientation(sample_flight):
     """EKF2's own parameters, and the orientation of odometry."""
     flight = read_log(REPOSITORY / "sample_logs" / "loop_vio.ulg")
     tables = extraction.tables(flight)
@@ -135,7 +135,7 @@ def test_all_that_an_analysis_reads_is_extracted(sample_flight):
 # ---- the dictionary ---------------------------------------------------------------------------
 
 
-def test_the_dictionary_and_the_files_agree_both_ways(written, sample_flight):
+def test_dictionary_lists_exactly_the_written_columns(written, sample_flight):
     dictionary = pd.read_csv(written / "data_dictionary.csv", keep_default_na=False)
     described = list(zip(dictionary["table"], dictionary["column"], strict=True))
     assert len(set(described)) == len(described)
@@ -155,7 +155,7 @@ def test_the_dictionary_and_the_files_agree_both_ways(written, sample_flight):
 
 
 @pytest.mark.parametrize("flight", [rich_flight(), aisle_flight(duration_s=5.0, imu=None)])
-def test_every_column_of_every_flight_is_described_in_the_unit_of_its_name(flight):
+def test_dictionary_units_match_column_names(flight):
     dictionary = extraction.data_dictionary(flight)
     tables = extraction.tables(flight)
     assert list(dict.fromkeys(dictionary["table"])) == list(tables)
@@ -167,7 +167,7 @@ def test_every_column_of_every_flight_is_described_in_the_unit_of_its_name(fligh
         assert not suffix or row.unit == UNITS[suffix], row
 
 
-def test_flight_json_says_what_the_log_is_and_lacks(written, sample_flight):
+def test_flight_json_lists_log_streams_and_missing_data(written, sample_flight):
     text = (written / "flight.json").read_text(encoding="utf-8")
     about = json.loads(text, parse_constant=pytest.fail)
     assert about["schema"] == {"name": "px4fuse-flight", "version": "1.0"}
@@ -187,7 +187,7 @@ def test_flight_json_says_what_the_log_is_and_lacks(written, sample_flight):
     ("estimator_states", {"ekf2_variance"}),
     ("vehicle_visual_odometry", {"position_vehicle_visual_odometry"}),
 ])  # fmt: skip
-def test_what_is_unavailable_has_no_table_and_is_said(tmp_path, dropped, lost):
+def test_extract_unavailable_part_has_no_table_and_is_listed(tmp_path, dropped, lost):
     whole = set(extraction.tables(read_log(make_log().write(tmp_path / "whole.ulg"))))
     path = make_log().drop(dropped).write(tmp_path / "less.ulg")
     said = extract(path, "-o", tmp_path / "out")
@@ -200,7 +200,7 @@ def test_what_is_unavailable_has_no_table_and_is_said(tmp_path, dropped, lost):
 # ---- names and folders ------------------------------------------------------------------------
 
 
-def test_table_names_are_file_names_on_every_system(sample_flight):
+def test_tables_names_are_valid_file_names(sample_flight):
     track = sample_flight.positions[0]
     names = ["uwb log.csv", "UWB_LOG.csv", 'a/b\\c:d*?"<>|', "CON", "ünï", "x" * 300, "end. "]
     flight = replace(sample_flight, positions=tuple(replace(track, name=name) for name in names))
@@ -213,7 +213,7 @@ def test_table_names_are_file_names_on_every_system(sample_flight):
 @pytest.mark.parametrize(("options", "said"), [
     ([], "is a file"), (["--format", "parquet"], 'pip install "px4fuse[parquet]"'),
 ])  # fmt: skip
-def test_what_cannot_be_written_is_one_line(
+def test_extract_impossible_output_prints_one_line(
     tmp_path, monkeypatch, capsys, sample_log, options, said
 ):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
@@ -229,7 +229,7 @@ def test_what_cannot_be_written_is_one_line(
 # ---- Parquet ----------------------------------------------------------------------------------
 
 
-def test_parquet_holds_the_same_tables(tmp_path, sample_log, sample_flight):
+def test_extract_parquet_contains_the_same_tables(tmp_path, sample_log, sample_flight):
     pytest.importorskip("pyarrow", reason="Parquet needs the extra px4fuse[parquet]")
     extract(sample_log, "-o", tmp_path, "--format", "parquet")
     for name, table in extraction.tables(sample_flight).items():
@@ -241,7 +241,7 @@ def test_parquet_holds_the_same_tables(tmp_path, sample_log, sample_flight):
 # ---- the lesson by hand -----------------------------------------------------------------------
 
 
-def test_the_lesson_by_hand_is_what_compare_does(
+def test_lesson_example_on_tables_matches_compare(
     tmp_path, monkeypatch, capsys, sample_log, sample_flight
 ):
     """The ten lines round every measurement to the DT grid; else they are our filter."""

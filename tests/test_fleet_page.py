@@ -35,7 +35,7 @@ def parts(row: list[Any]) -> dict[str, Any]:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_what_a_judged_log_lacks_is_told_too() -> None:
+def test_page_compared_log_lists_its_missing_results() -> None:
     table = made_up(30)
     table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
     text = html_text(table, "Bench", "px4fuse 1")
@@ -46,7 +46,7 @@ def test_what_a_judged_log_lacks_is_told_too() -> None:
     assert f'<option value="remedy:Set it.">Set it. ({judged})' in text
 
 
-def test_what_speaks_for_a_log_is_its_horizontal_axes() -> None:
+def test_logs_of_uses_horizontal_axes() -> None:
     def ours(rows: pd.DataFrame) -> float:
         return float(logs_of(rows)[0]["factors"]["kf"])
 
@@ -62,7 +62,7 @@ def test_what_speaks_for_a_log_is_its_horizontal_axes() -> None:
     assert logs_of(both)[0]["position_rmse_m"] == 9.0
 
 
-def test_a_column_without_numbers_is_absent_not_zero() -> None:
+def test_logs_of_column_without_numbers_is_absent() -> None:
     table = made_up(4)
     for name in ("clock_offset_s", "sigma_z_m", "ekf2_nis_mean", "position_rmse_m"):
         table[name] = np.nan
@@ -74,7 +74,7 @@ def test_a_column_without_numbers_is_absent_not_zero() -> None:
     assert "nan" not in text.split("<script")[0].split("</style>")[1]
 
 
-def test_an_empty_fleet_and_one_that_only_failed() -> None:
+def test_page_without_compared_logs_is_complete() -> None:
     assert "0 logs" in html_text(made_up(0), "Bench", "px4fuse 1")
     table = made_up(30)
     failed = table[table["status"] == "failed"].reset_index(drop=True)
@@ -91,7 +91,7 @@ def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
 
 @settings(max_examples=40)
 @given(text=st.text(max_size=40) | st.sampled_from(HOSTILE))
-def test_text_makes_no_elements(text: str) -> None:
+def test_page_text_of_logs_is_escaped(text: str) -> None:
     def shape(word: str) -> list[tuple[str, list[str]]]:
         made = html_text(hostile_table(f"a{word}z"), word, word)
         made.encode()
@@ -102,7 +102,7 @@ def test_text_makes_no_elements(text: str) -> None:
     assert shape(text.replace(";", ",").replace("/", "|")) == shape("x")
 
 
-def test_links_lead_nowhere_but_beside_the_page() -> None:
+def test_page_links_stay_beside_the_page() -> None:
     bad = ("//example.org/a", "/etc/passwd", "javascript:alert(1)", "https://example.org/")
     table = made_up(4).assign(report=np.repeat(bad, 3), results="")
     rows = content(html_text(table, "a", "b"))["rows"]
@@ -135,7 +135,7 @@ def head(title: str) -> str:
 COUNT = "document.querySelector('.count').textContent"
 
 
-def test_sorts_filters_and_unfolds(page: Browser) -> None:
+def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     # what the table shows as "3 × too small" is sorted by the factor behind it
     page.click(head("ours"))
     page.click("tbody tr:first-child .name")
@@ -167,7 +167,7 @@ def test_filters_of_fleet_page_combine(page: Browser) -> None:
     assert page.complaints() == []
 
 
-def test_five_thousand_logs_are_a_hundred_rows(browser: Browser, tmp_path: Path) -> None:
+def test_page_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None:
     shown(browser, tmp_path, made_up(5000))
     rows = "document.querySelectorAll('.list > tbody > tr').length"
     everything = "document.querySelectorAll('*').length"
@@ -191,7 +191,7 @@ def test_five_thousand_logs_are_a_hundred_rows(browser: Browser, tmp_path: Path)
     assert browser.requests() <= {"file", "data"}
 
 
-def test_without_scripts_it_is_a_plain_table(browser: Browser, tmp_path: Path) -> None:
+def test_page_without_scripts_is_a_table(browser: Browser, tmp_path: Path) -> None:
     shown(browser, tmp_path, made_up(400), scripts=False)
     browser.call("Emulation.setScriptExecutionDisabled", value=False)
     text = browser.ask("document.body.innerText")
@@ -202,7 +202,7 @@ def test_without_scripts_it_is_a_plain_table(browser: Browser, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("scheme", "width"), [("light", 360), ("dark", 1400)])
-def test_everybody_can_read_it(page: Browser, scheme: str, width: int) -> None:
+def test_page_is_accessible(page: Browser, scheme: str, width: int) -> None:
     page.resize(width, 800)
     page.scheme(scheme)
     page.click("tbody tr:nth-child(3) .name")

@@ -64,7 +64,7 @@ def remedies(inventory: Inventory) -> list[str]:
 # ---- the sample log ---------------------------------------------------------------------------
 
 
-def test_every_row_says_what_the_flight_holds(sample_flight):
+def test_inventory_rows_match_flight_contents(sample_flight):
     inventory, ekf2 = take_inventory(sample_flight), sample_flight.ekf2
     frames = {
         "IMU": sample_flight.imu, "attitude": sample_flight.attitude, "EKF2 state": ekf2.state,
@@ -85,7 +85,7 @@ def test_every_row_says_what_the_flight_holds(sample_flight):
     assert source(inventory, "land detector").start_s == sample_flight.airborne[0][0]
 
 
-def test_abilities_are_what_compare_then_does(sample_flight):
+def test_inventory_counts_match_compare(sample_flight):
     """The counts are of the very samples that compare uses."""
     inventory = take_inventory(sample_flight)
     comparison = compare(sample_flight)
@@ -108,7 +108,7 @@ def strict(text: str) -> dict:
     return json.loads(text, parse_constant=pytest.fail)
 
 
-def test_json_is_alone_on_standard_output_or_in_a_file(
+def test_info_json_is_written_to_stdout_or_file(
     sample_log, sample_flight, tmp_path, monkeypatch, capsys
 ):
     text, target = info(sample_log, "--json", "-"), tmp_path / "new" / "info.json"
@@ -133,7 +133,7 @@ def test_json_is_alone_on_standard_output_or_in_a_file(
     ("vehicle_local_position", "EKF2 state",
      {"EKF2 states", "EKF2 variances", "EKF2 innovations", "aids", "what if"}),
 ])  # fmt: skip
-def test_what_a_topic_is_needed_for(tmp_path, topic_, part, lost):
+def test_inventory_missing_topic_disables_analyses(tmp_path, topic_, part, lost):
     inventory = inventory_of(make_log().drop(topic_), tmp_path)
     assert topic_ in source(inventory, part).unavailable
     assert {can.name for can in inventory.abilities if not can.possible} - {"truth"} == lost
@@ -142,7 +142,7 @@ def test_what_a_topic_is_needed_for(tmp_path, topic_, part, lost):
 
 
 @pytest.mark.parametrize(("profile", "wanted"), [(1, 129), (3, 131)])
-def test_a_source_that_was_not_logged_names_the_profile_that_logs_it(tmp_path, profile, wanted):
+def test_inventory_unlogged_source_advises_sdlog_profile(tmp_path, profile, wanted):
     log = make_log().drop("vehicle_visual_odometry")
     log.parameters["SDLOG_PROFILE"] = profile
     inventory = inventory_of(log, tmp_path)
@@ -153,7 +153,7 @@ def test_a_source_that_was_not_logged_names_the_profile_that_logs_it(tmp_path, p
 @pytest.mark.parametrize(
     ("imu_hz", "said"), [(4.0, "sensor_combined was logged at 4.0 Hz"), (49.5, None), (100.0, None)]
 )
-def test_an_imu_or_an_attitude_that_is_too_slow_is_no_acceleration(tmp_path, imu_hz, said):
+def test_inventory_slow_imu_or_attitude_has_no_acceleration(tmp_path, imu_hz, said):
     inventory = inventory_of(make_log(imu_hz=imu_hz), tmp_path)
     found = ability(inventory, "acceleration")
     slow = [remedy for remedy in remedies(inventory) if "sensor_combined at full rate" in remedy]
@@ -168,7 +168,7 @@ def test_an_imu_or_an_attitude_that_is_too_slow_is_no_acceleration(tmp_path, imu
     assert "vehicle_attitude was logged at 5.0 Hz, but the acceleration needs 10 Hz" in slow.reason
 
 
-def test_damage_comes_first_and_that_of_a_recording_blames_no_sd_card(tmp_path, sample_log):
+def test_inventory_damage_is_first_advice_by_recording_type(tmp_path, sample_log):
     path = tmp_path / "damaged.tlog"
     content = Aisle(seconds=10.0).record().tlog()
     path.write_bytes(content[: len(content) // 2] + bytes(5000) + content[len(content) // 2 :])
@@ -183,7 +183,7 @@ def test_damage_comes_first_and_that_of_a_recording_blames_no_sd_card(tmp_path, 
     assert "Copy the log" in remedies(take_inventory(read_log(path.with_suffix(".ulg"))))[0]
 
 
-def test_a_log_that_stands_still_is_described(tmp_path):
+def test_info_log_without_take_off_is_described(tmp_path):
     log = make_log()
     for name in ("x", "y", "z"):
         log["vehicle_local_position"][name][:] = 0
@@ -195,7 +195,7 @@ def test_a_log_that_stands_still_is_described(tmp_path):
     assert "never, by the land detector" in info(tmp_path / "made.ulg")
 
 
-def test_the_only_reference_is_not_its_own_truth(tmp_path):
+def test_inventory_mocap_as_source_is_no_ground_truth(tmp_path):
     log = make_log().add(odometry("vehicle_mocap_odometry", 10.0, 16))
     assert ability(inventory_of(log, tmp_path), "truth").possible
     flight = read_log(log.drop("vehicle_visual_odometry").write(tmp_path / "made.ulg"))
@@ -207,7 +207,7 @@ def test_the_only_reference_is_not_its_own_truth(tmp_path):
 # ---- gaps -------------------------------------------------------------------------------------
 
 
-def test_gaps_are_counted_and_the_longest_is_given(tmp_path):
+def test_inventory_gaps_have_count_and_durations(tmp_path):
     log = make_log(seconds=40.0)
     for name, rate_hz, first_s in (("sensor_combined", 100, 0.0),
                                    ("vehicle_visual_odometry", 5, 0.1)):  # fmt: skip
@@ -241,7 +241,7 @@ def test_gaps_are_counted_and_the_longest_is_given(tmp_path):
     aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", origin=GNSS)),
     replace(aisle_flight(duration_s=20.0), positions=()),
 ])  # fmt: skip
-def test_abilities_follow_the_flight(flight: Flight):
+def test_inventory_analyses_agree_with_compare(flight: Flight):
     """Without streams, as a reader may give it; every no is one of compare's own."""
     inventory = take_inventory(flight)
     strict(json.dumps(to_plain(inventory)))
@@ -262,7 +262,7 @@ def test_abilities_follow_the_flight(flight: Flight):
         assert ability(inventory, name).possible != isinstance(part, Unavailable), name
 
 
-def test_dropouts_and_senders_that_number_nothing_are_told(monkeypatch, tmp_path, sample_flight):
+def test_info_prints_dropouts_and_senders_without_sequence(monkeypatch, tmp_path, sample_flight):
     """Others stand in the golden texts; the start here is beyond the calendar."""
     senders = (Sender(1, 197, "visual odometry", 99, None, False),)
     dropouts = (Dropout(3.0, 0.25), Dropout(7.0, 0.5))
@@ -281,7 +281,7 @@ def test_dropouts_and_senders_that_number_nothing_are_told(monkeypatch, tmp_path
 
 
 @pytest.mark.reallogs
-def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch, capsys):
+def test_info_shared_logs_are_described_or_refused(shared_logs, monkeypatch, capsys):
     kinds = ("real/*.ulg", "simulated/*.ulg", "mavlink/*")
     paths = sorted(path for kind in kinds for path in shared_logs.glob(kind))
     assert len(paths) > 30
@@ -312,7 +312,7 @@ def test_every_log_is_described_or_refused_in_one_line(shared_logs, monkeypatch,
             assert any(remedy in a.remedy for a in inventory.advice), path.name
 
 
-def test_leaving_out_any_topic_or_all_leaves_an_inventory(sample_log, tmp_path):
+def test_inventory_without_any_topic_is_made(sample_log, tmp_path):
     whole = load(sample_log)
     short = Log([take(t, range(0, len(t.fields["timestamp"]), 40)) for t in whole.topics])
     for name in sorted(short.names()):

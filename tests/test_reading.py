@@ -75,19 +75,19 @@ def refusal(monkeypatch, capsys, desk: Path, command: str) -> str:
 @posix
 @pytest.mark.parametrize("what", ["zero", "pipe", "socket"])
 @pytest.mark.parametrize("command", READERS)
-def test_what_is_no_regular_file_is_refused(desk, monkeypatch, capsys, command, what) -> None:
+def test_read_special_file_is_refused(desk, monkeypatch, capsys, command, what) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format(what))
     assert f"{what}: not a regular file" in err
 
 
 @pytest.mark.parametrize("command", READERS)
-def test_a_file_of_ten_gigabytes_is_refused_at_once(desk, monkeypatch, capsys, command) -> None:
+def test_read_10_gb_file_is_refused_without_reading(desk, monkeypatch, capsys, command) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format("sparse"))
     assert "sparse: 10,000 MB, more than the limit of " in err
 
 
 @posix
-def test_special_and_huge_files_in_a_folder_of_logs_are_passed_over(desk, monkeypatch, capsys):
+def test_files_by_sha256_ignores_special_and_huge_files(desk, monkeypatch, capsys):
     found = []
 
     def believed(work, reports, **_):
@@ -107,7 +107,7 @@ def test_special_and_huge_files_in_a_folder_of_logs_are_passed_over(desk, monkey
 # --- the limit, and its option ---
 
 
-def test_the_limit_of_a_log_can_be_set_for_one_command(desk, monkeypatch, capsys) -> None:
+def test_max_size_applies_to_one_command(desk, monkeypatch, capsys) -> None:
     monkeypatch.chdir(desk)
     assert 1_000_000 < (desk / "l.ulg").stat().st_size < 10_000_000
     before = max_log_bytes.get()
@@ -118,7 +118,7 @@ def test_the_limit_of_a_log_can_be_set_for_one_command(desk, monkeypatch, capsys
     assert run_main(monkeypatch, capsys, "info", "l.ulg", "--max-size", "10")[0] == 0
 
 
-def test_the_limit_is_the_last_byte_that_is_read(tmp_path) -> None:
+def test_read_file_at_limit_is_read_completely(tmp_path) -> None:
     path = tmp_path / "x"
     path.write_bytes(b"x" * 100)
     assert len(read_bytes_limited(path, LogError, 100)) == 100
@@ -127,7 +127,7 @@ def test_the_limit_is_the_last_byte_that_is_read(tmp_path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/kallsyms").exists(), reason="the file is Linux's")
-def test_a_file_that_says_it_is_empty_is_read_no_further_than_the_limit() -> None:
+def test_read_file_of_size_0_stops_at_limit() -> None:
     path = Path("/proc/kallsyms")
     assert path.stat().st_size == 0
     with pytest.raises(LogError, match="more than the limit"):
@@ -135,7 +135,7 @@ def test_a_file_that_says_it_is_empty_is_read_no_further_than_the_limit() -> Non
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-def test_text_as_every_system_writes_it(tmp_path, encoding) -> None:
+def test_read_text_accepts_utf8_and_utf16(tmp_path, encoding) -> None:
     path = tmp_path / "t"
     path.write_bytes("σ = 1\n".encode(encoding))
     assert read_text(path, LogError, 100) == "σ = 1\n"
@@ -149,7 +149,7 @@ def test_text_as_every_system_writes_it(tmp_path, encoding) -> None:
 
 @posix
 @pytest.mark.parametrize("command", READERS)
-def test_a_line_feed_in_a_name_makes_no_second_line(tmp_path, desk, monkeypatch, capsys, command):
+def test_read_error_name_with_line_feed_is_one_line(tmp_path, desk, monkeypatch, capsys, command):
     name = "a\nb\x1b[2J"
     (tmp_path / name).write_bytes(b"\xff\0 junk")
     for other in ("l.ulg", "s.tum", "r.pdf", "roster.csv"):
@@ -163,11 +163,11 @@ def test_a_line_feed_in_a_name_makes_no_second_line(tmp_path, desk, monkeypatch,
 
 @pytest.mark.parametrize("command", OF_FILES)
 @pytest.mark.parametrize("path", ["folder", ".", "..", "/"])
-def test_a_folder_is_refused_by_its_name_or_path(desk, monkeypatch, capsys, command, path) -> None:
+def test_read_folder_is_refused_with_its_name(desk, monkeypatch, capsys, command, path) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format(path))
     assert f"{path}: is a folder. Give a file." in err
 
 
-def test_errors_are_on_one_line() -> None:
+def test_errors_are_printed_on_one_line() -> None:
     assert str(Px4FuseError("a\r\nb c\td\x00\ud800")) == "a  b c d??"
     assert display_name(Path("logs") / "σ.ulg") == "σ.ulg"

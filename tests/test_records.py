@@ -30,7 +30,7 @@ RECORDS = [one for one in classes() if dataclasses.is_dataclass(one)]
 STRUCTS = [one for one in classes() if issubclass(one, msgspec.Struct)]
 
 
-def test_records_are_frozen() -> None:
+def test_records_of_package_are_frozen() -> None:
     assert len(RECORDS) > 50
     assert len(STRUCTS) > 50
     thawed = {one.__name__ for one in RECORDS if not one.__dataclass_params__.frozen}  # type: ignore[attr-defined]
@@ -38,7 +38,7 @@ def test_records_are_frozen() -> None:
     assert thawed == FILLED
 
 
-def test_a_frozen_record_refuses() -> None:
+def test_settings_assignment_raises() -> None:
     flight = px4fuse.Settings()
     with pytest.raises(dataclasses.FrozenInstanceError):
         flight.sigma_a_m_s2 = 1.0  # type: ignore[misc]

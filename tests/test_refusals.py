@@ -234,7 +234,9 @@ SPARED = {
     [*REFUSED.values(), *((command, "not overwritten") for command in SPARED.values())],
     ids=[*REFUSED, *(f"over {name}" for name in SPARED)],
 )
-def test_it_gives_one_line_and_writes_nothing(desk, monkeypatch, capsys, command, said):
+def test_commands_invalid_input_print_one_line_and_write_nothing(
+    desk, monkeypatch, capsys, command, said
+):
     monkeypatch.chdir(desk)
     before = contents(desk)
     typed = shlex.split(command.format(folder=Path(desk).name))
@@ -248,7 +250,7 @@ def test_it_gives_one_line_and_writes_nothing(desk, monkeypatch, capsys, command
     assert contents(desk) == before
 
 
-def test_what_nothing_comes_of_is_no_success(desk, monkeypatch, capsys):
+def test_estimates_without_result_exit_with_2(desk, monkeypatch, capsys):
     monkeypatch.chdir(desk)
     for command, said in (
         ("tune a.ulg --start 126", "no noise could be determined"),

@@ -80,16 +80,16 @@ def parsed(command: str) -> Request:
 
 @settings(deadline=None)
 @given(COMPARISONS | LOOPS)
-def test_the_command_line_of_a_request_gives_the_request(request: Request) -> None:
+def test_command_line_parsed_gives_the_request(request: Request) -> None:
     assert parsed(command_line(request)) == request
 
 
 @given(COMPARISONS | LOOPS)
-def test_a_request_survives_being_recorded(request: Request) -> None:
+def test_request_json_round_trip_is_equal(request: Request) -> None:
     assert msgspec.json.decode(msgspec.json.encode(request), type=Request) == request
 
 
-def test_what_is_recorded_names_no_folder() -> None:
+def test_request_without_paths_contains_file_names_only() -> None:
     request = ComparisonRequest(
         log="/home/eve/a.ulg", mavlink="b/c.tlog", position=PositionFile(path="../d.csv")
     )
@@ -109,7 +109,7 @@ def test_what_is_recorded_names_no_folder() -> None:
         ({"command": "compare", "log": "a", "system": 256}, "<= 255"),
     ],
 )
-def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: str) -> None:
+def test_request_invalid_json_is_refused(recorded: object, says: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=says):
         msgspec.convert(recorded, Request)
 
@@ -121,7 +121,7 @@ def test_what_px4fuse_cannot_have_recorded_is_refused(recorded: object, says: st
         (loop, requests.LOOP_OPTIONS, (LoopRequest,)),
     ],
 )
-def test_every_option_of_an_analysis_is_in_the_request(command, declared, kinds) -> None:
+def test_request_has_a_field_for_every_option(command, declared, kinds) -> None:
     """An option that the request forgets would be missing from every record."""
     about_outputs = {
         "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",

@@ -38,14 +38,14 @@ def assert_valid(text: str) -> None:
     assert to_json(read_results(text.encode())) == text
 
 
-def test_schema_is_itself_valid_and_says_what_it_knows():
+def test_schema_is_valid_and_has_all_types():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     kinds = [f"#/$defs/{kind.__name__}" for kind in KINDS.values()]
     assert [one["$ref"] for one in SCHEMA["oneOf"]] == kinds
 
 
 @pytest.mark.parametrize("one", [EXAMPLE, LOOP], ids=["compare", "loop"])
-def test_schema_takes_results_and_nothing_else(one):
+def test_schema_accepts_results_only(one):
     validator = jsonschema.Draft202012Validator(SCHEMA)
     assert validator.is_valid(json.loads(json.dumps(one)))
     for wrong in (
@@ -64,14 +64,14 @@ def test_schema_takes_results_and_nothing_else(one):
     ],
     ids=lambda options: next(iter(options)),
 )
-def test_results_of_every_kind_validate_and_render(sample_flight, options):
+def test_results_of_every_command_validate_and_render(sample_flight, options):
     made = document(sample_flight, **({"start_s": 40.0, "end_s": 70.0} | options))
     text = to_json(made[1])
     assert_valid(text)
     assert render(*made, text).startswith(b"%PDF-")
 
 
-def test_nothing_that_could_not_be_computed_is_zero(sample_flight):
+def test_results_without_truth_have_no_zero_for_missing(sample_flight):
     """One second of flight: no consistency statement, but its reason."""
     _, made = document(sample_flight, start_s=40.0, end_s=41.0)
     north = made.axes["north"]
@@ -81,7 +81,7 @@ def test_nothing_that_could_not_be_computed_is_zero(sample_flight):
     assert_valid(to_json(made))
 
 
-def test_no_number_is_written_that_is_none():
+def test_to_json_rejects_nan_and_infinity():
     made = decoded(EXAMPLE)
     for number in (math.nan, math.inf):
         broken = replace(made, settings=replace(made.settings, dt_s=number))
@@ -119,7 +119,7 @@ def test_no_number_is_written_that_is_none():
     ],
     ids=range(21),
 )
-def test_what_is_no_results(given, said):
+def test_read_results_invalid_file_is_refused(given, said):
     with pytest.raises(ResultsError, match=said) as raised:
         read_results(given, "r.json")
     assert str(raised.value).startswith("r.json ")
@@ -145,12 +145,12 @@ def test_what_is_no_results(given, said):
     ],
     ids=str,
 )
-def test_what_breaks_the_contract(values, said):
+def test_read_results_schema_violation_is_refused(values, said):
     with pytest.raises(ResultsError, match=f"does not follow the schema.*{said}|{said}"):
         decoded(changed(**values))
 
 
-def test_names_are_cleaned_as_texts_are():
+def test_read_results_cleans_keys_like_texts():
     nothing = {"what": "noises", "reason": "too short", "remedy": ""}
     assert list(decoded(changed(tuning={"a\u202eb": nothing})).tuning) == ["ab"]
 
@@ -164,7 +164,7 @@ def test_to_json_numbers_have_ten_significant_digits():
         assert to_json(json.loads(once)) == once
 
 
-def test_numbers_outside_their_bounds_are_absent_with_the_reason():
+def test_results_number_outside_bounds_is_absent_with_reason():
     """Optional numbers go alone, required ones with the part that may be missing."""
     results = read_results(json.dumps(EXAMPLE).encode())
     assert within_bounds(results) is results
@@ -186,7 +186,7 @@ def test_numbers_outside_their_bounds_are_absent_with_the_reason():
     assert_valid(to_json(found))
 
 
-def test_results_without_any_axis_within_bounds_are_refused():
+def test_results_without_valid_axis_are_refused():
     results = read_results(json.dumps(EXAMPLE).encode())
     wrong = replace(
         results.axes["aisle"], updates=replace(results.axes["aisle"].updates, input_gap_s=math.nan)

@@ -90,7 +90,7 @@ def test_loop_writes_report_results_path_and_graph(made, found) -> None:
     assert [each["accepted"] for each in found["loop"]["closures"]] == [True, False]
 
 
-def test_loop_report_names_whom_was_asked_and_no_folder_and_is_the_same_again(made, tmp_path):
+def test_loop_report_is_reproducible_without_paths(made, tmp_path):
     folder, _ = made
     pages = "".join(page.extract_text() for page in pypdf.PdfReader(folder / "r.pdf").pages)
     assert "Ana $x$ Müller" in pages
@@ -102,7 +102,7 @@ def test_loop_report_names_whom_was_asked_and_no_folder_and_is_the_same_again(ma
 
 
 @pytest.mark.parametrize("reference", [f"{LOG}:truth", str(LOG)])
-def test_the_written_path_scores_as_the_loop_said(made, found, reference) -> None:
+def test_loop_tum_file_has_the_reported_ate(made, found, reference) -> None:
     gated = found["loop"]["corrections"]["pose_graph_gated"]["scores"][TRUTH]
     again = results("evaluate", made[0] / "r.tum", reference, "--alignment", gated["alignment"])
     ours, theirs = (one["ate"]["translation_m"]["rmse"] for one in (gated, again))
@@ -110,7 +110,7 @@ def test_the_written_path_scores_as_the_loop_said(made, found, reference) -> Non
     assert again["association"]["poses"] == gated["association"]["poses"]
 
 
-def test_the_written_graph_is_solved_already(made, found, tmp_path) -> None:
+def test_loop_g2o_file_is_at_the_optimum(made, found, tmp_path) -> None:
     """A graph whose closures are all accepted; with a rejected one it would move."""
     graph = tmp_path / "g.g2o"
     written = results("loop", LOG, "--g2o", graph)["loop"]["corrections"]["pose_graph_gated"]
@@ -127,7 +127,7 @@ def test_the_written_graph_is_solved_already(made, found, tmp_path) -> None:
     assert cost == pytest.approx(corrections["pose_graph_all"]["cost"], rel=1e-3)
 
 
-def test_the_results_keep_the_command_that_makes_them_again(desk, tmp_path) -> None:
+def test_loop_results_contain_repeatable_command(desk, tmp_path) -> None:
     given = ["--landed-at", "0.1,-0.2,5", "--drift", "2"]
     given += ["--closure", "10,50", "--closure", " 20, 60,0.2"]
     found = results("loop", desk / "s.tum", *given)
@@ -166,7 +166,7 @@ def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_evaluate_with_other_settings_or_files_keeps_the_page(desk, tmp_path, monkeypatch):
+def test_evaluate_other_settings_or_files_keep_old_report(desk, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "other").mkdir()
     write(tmp_path / "other" / "s.tum", ROWS[:-50])
@@ -190,7 +190,9 @@ def test_evaluate_with_other_settings_or_files_keeps_the_page(desk, tmp_path, mo
     ("--json r.json", {"r.json"}),
     ("--json -", set()),
 ])  # fmt: skip
-def test_evaluate_writes_what_is_named(desk, tmp_path, monkeypatch, options, written) -> None:
+def test_evaluate_writes_only_the_named_files(
+    desk, tmp_path, monkeypatch, options, written
+) -> None:
     monkeypatch.chdir(tmp_path)
     result = run("evaluate", desk / "s.tum", desk / "l.ulg:truth", *options.split())
     assert result.exit_code == 0, result.output
@@ -200,7 +202,7 @@ def test_evaluate_writes_what_is_named(desk, tmp_path, monkeypatch, options, wri
     assert alone == ("ATE (m)" not in result.output)
 
 
-def test_a_loop_is_scored_against_what_is_given(desk) -> None:
+def test_loop_reference_gives_ate_of_each_path(desk) -> None:
     """Itself, a flight with other stamps, and a path without overlap, which fails nothing."""
 
     def scores(reference: str, way: str = "uncorrected") -> dict[str, Any]:
@@ -228,7 +230,7 @@ def turned_up(rows: list[str]) -> list[str]:
     return turned
 
 
-def test_a_track_with_z_up_scores_in_the_loop_as_evaluate_does(tmp_path) -> None:
+def test_loop_z_up_track_has_same_ate_as_evaluate(tmp_path) -> None:
     for name in ("a.tum", "truth.tum"):
         write(tmp_path / name, turned_up(ROWS))
     found = results("loop", tmp_path / "a.tum", "--reference", tmp_path / "truth.tum")["loop"]

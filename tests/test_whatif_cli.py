@@ -38,7 +38,7 @@ def swept(sample_log: Path) -> WhatIfAnalysis:
     return run_what_if(request)
 
 
-def test_results_have_the_three_side_by_side(sample_log: Path) -> None:
+def test_whatif_results_have_logged_replayed_and_changed(sample_log: Path) -> None:
     asked = "--set", "EKF2_EVP_NOISE=0.3", "--json", "-"
     text = done("whatif", sample_log, *asked).stdout
     said = json.loads(text)
@@ -50,7 +50,7 @@ def test_results_have_the_three_side_by_side(sample_log: Path) -> None:
     assert said["whatif"]["north"]["nis_mean"] < 0.3 * said["replayed"]["north"]["nis_mean"]
 
 
-def test_without_an_aid_from_a_time_on(sample_log: Path) -> None:
+def test_whatif_without_gnss_from_time_drifts_afterwards(sample_log: Path) -> None:
     asked = "--without", "ev_pos", "--from", "100", "--json", "-"
     said = json.loads(done("whatif", sample_log, *asked).stdout)
     jsonschema.validate(said, schema())
@@ -68,7 +68,7 @@ def test_without_an_aid_from_a_time_on(sample_log: Path) -> None:
     assert "EKF2 itself gives its position up" in note
 
 
-def test_aids_and_times_that_are_not_there_are_refused(asked: WhatIfAnalysis) -> None:
+def test_whatif_unknown_aid_or_time_is_refused(asked: WhatIfAnalysis) -> None:
     model = open_model(asked.flight)
     for without, said in (
         ({"baro_hgt": 60.0}, "baro_hgt: of this log the model fuses ev_pos."),
@@ -78,7 +78,7 @@ def test_aids_and_times_that_are_not_there_are_refused(asked: WhatIfAnalysis) ->
             what_if(model, [], without)
 
 
-def test_without_set_it_is_what_the_data_ask_for(asked: WhatIfAnalysis) -> None:
+def test_whatif_without_set_uses_ml_estimates(asked: WhatIfAnalysis) -> None:
     """The UWB's noise is 0.10 m, and its stamps are right."""
     assert asked.asked
     assert set(asked.changes) == {"EKF2_EVP_NOISE"}
@@ -91,7 +91,7 @@ def test_without_set_it_is_what_the_data_ask_for(asked: WhatIfAnalysis) -> None:
     assert all(len(cells) == len(column_heads(asked)) == 3 for cells in table.values())
 
 
-def test_a_sweep_changes_the_rest_as_set(swept: WhatIfAnalysis) -> None:
+def test_whatif_sweep_keeps_set_parameters(swept: WhatIfAnalysis) -> None:
     first, *values = swept.whatif.whatif
     assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
     assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])
@@ -106,7 +106,7 @@ def test_a_sweep_changes_the_rest_as_set(swept: WhatIfAnalysis) -> None:
     assert f"least at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
 
 
-def test_a_log_without_ekf2s_inside_says_why(sample_log: Path) -> None:
+def test_whatif_log_without_replay_data_gives_reason(sample_log: Path) -> None:
     with pytest.raises(MissingDataError, match="EKF2 replay: no estimator_states"):
         run_what_if(WhatIfRequest(log=str(sample_log.with_suffix(".tlog"))))
 
@@ -119,7 +119,7 @@ class TestFlownFlights:
         log = shared_logs / "simulated" / f"{name}.ulg"
         return run_what_if(WhatIfRequest(log=str(log)))
 
-    def test_the_noise_that_the_data_ask_for_ends_the_rejections(self, shared_logs: Path) -> None:
+    def test_ml_noise_ends_rejections(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.16.1_aisle_overconfident")
         assert set(found.changes) == {"EKF2_EVP_NOISE"}
         (cured,) = found.whatif.whatif
@@ -129,9 +129,7 @@ class TestFlownFlights:
         assert cured.position_rmse_to_truth_m < 0.4 * error(found.whatif.logged)
 
     @pytest.mark.parametrize("name", ["v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync"])
-    def test_the_delay_that_the_data_ask_for_brings_back_the_clean_error(
-        self, shared_logs: Path, name: str
-    ) -> None:
+    def test_estimated_delay_restores_position_rmse(self, shared_logs: Path, name: str) -> None:
         found = self.of(shared_logs, name)
         assert found.changes["EKF2_EV_DELAY"] == pytest.approx(250.0, abs=25.0)
         clean = self.of(shared_logs, "v1.16.1_aisle_nominal").whatif.logged
@@ -139,7 +137,7 @@ class TestFlownFlights:
         assert error(cured) < 1.2 * error(clean) < 0.5 * error(found.whatif.logged)
         assert not any("would reach EKF2 after" in note for note in found.whatif.notes)
 
-    def test_an_old_delay_is_taken_back(self, shared_logs: Path) -> None:
+    def test_previous_delay_is_reverted(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
         assert found.changes["EKF2_EV_DELAY"] == 0.0
         (cured,) = found.whatif.whatif
@@ -158,7 +156,7 @@ class TestFlownFlights:
             ("real/vladimireganov_ROS_PX4_MOCAP_square2", "fewer than EKF2 may have fused"),
         ],
     )  # fmt: skip
-    def test_without_agreement_there_is_no_what_if(
+    def test_replay_without_agreement_is_refused(
         self, shared_logs: Path, log: str, said: str
     ) -> None:
         with pytest.raises(MissingDataError, match=said):
@@ -173,7 +171,7 @@ def error(summary: Summary) -> float:
     return float(np.hypot(*parts))
 
 
-def test_what_is_chaotic_has_no_numbers(sample_flight: Flight) -> None:
+def test_unpredictable_change_has_no_numbers(sample_flight: Flight) -> None:
     name, sweep = sample_flight.log.name, Sweep("EKF2_EVP_GATE", 1.0, 5.0, 2)
     request = WhatIfRequest(log=name, changes={"EKF2_EVP_NOISE": 0.02}, sweep=sweep)
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")

@@ -27,7 +27,7 @@ def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
     return [result for _, result in sorted(heard, key=lambda one: one[0])], heard
 
 
-def test_one_bad_job_is_lost_alone():
+def test_run_bounded_failed_job_does_not_affect_others():
     before = os.environ.get("OMP_NUM_THREADS")
     jobs = [
         ("square", 1),
@@ -55,7 +55,7 @@ def test_one_bad_job_is_lost_alone():
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
-def test_what_hangs_is_ended():
+def test_run_bounded_hanging_job_ends_at_time_limit():
     results, _ = run([("hang", 0), ("square", 2), ("hang", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]
     late = JobFailure("it took longer than 3 s and was ended.")
@@ -63,7 +63,7 @@ def test_what_hangs_is_ended():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not enforce the limit")
-def test_what_eats_memory_is_ended():
+def test_run_bounded_large_job_ends_at_memory_limit():
     jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
     results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
     assert results == [4, JobFailure("it needed more memory than one file may take."), 9]
@@ -73,14 +73,14 @@ def test_what_eats_memory_is_ended():
     assert before != after
 
 
-def test_processes_are_replaced_after_some_jobs(monkeypatch):
+def test_run_bounded_replaces_process_after_job_count(monkeypatch):
     monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
     results, _ = run([("process", 0)] * 5, processes=1)
     assert len(set(results)) == 3
     assert results[0] == results[1] != results[2]
 
 
-def test_a_function_that_cannot_be_loaded_fails_and_ends(monkeypatch):
+def test_run_bounded_unknown_function_fails_each_job(monkeypatch):
     monkeypatch.setattr(act, "__module__", "test_workers_is_not_here")
     monkeypatch.setitem(sys.modules, "test_workers_is_not_here", sys.modules[__name__])
     results, _ = run([("square", 1), ("square", 2)])
@@ -89,7 +89,7 @@ def test_a_function_that_cannot_be_loaded_fails_and_ends(monkeypatch):
     )
 
 
-def test_who_stops_listening_ends_all():
+def test_run_bounded_close_ends_all_processes():
     jobs = [("square", 1), ("hang", 0)]
     with closing(run_bounded(act, jobs, processes=2, timeout_s=60, memory_bytes=None)) as work:
         assert next(work) == (0, 1)
@@ -117,7 +117,7 @@ def hanging(folder):
     return subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True)
 
 
-def test_modules_in_the_current_folder_are_not_imported(tmp_path):
+def test_worker_does_not_import_from_current_folder(tmp_path):
     """An instructor grades inside the folder of submissions; one of them is called types.py."""
     script = tmp_path / "program" / "script.py"
     script.parent.mkdir()
@@ -134,7 +134,7 @@ def test_modules_in_the_current_folder_are_not_imported(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_what_hangs_ends_with_a_parent_that_is_killed(tmp_path):
+def test_worker_parent_killed_ends_hanging_job(tmp_path):
     with hanging(tmp_path) as parent:
         parent.stdout.readline()
         parent.kill()
@@ -143,7 +143,7 @@ def test_what_hangs_ends_with_a_parent_that_is_killed(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process")
-def test_ctrl_c_ends_all(tmp_path):
+def test_worker_ctrl_c_ends_hanging_job(tmp_path):
     with hanging(tmp_path) as parent:
         worker = int(parent.stdout.readline())
         parent.send_signal(signal.SIGINT)

@@ -58,7 +58,7 @@ LOOP = ("loop", "s.tum", "--tum", "c.tum")
 
 
 @posix
-def test_a_named_pipe_is_written_to_and_stays(desk) -> None:
+def test_write_named_pipe_is_written_and_kept(desk) -> None:
     pipe = desk / "pipe"
     os.mkfifo(pipe)
     heard = []
@@ -72,7 +72,7 @@ def test_a_named_pipe_is_written_to_and_stays(desk) -> None:
 
 
 @posix
-def test_a_device_is_written_to_and_stays(desk) -> None:
+def test_write_device_is_written_and_kept(desk) -> None:
     """By a link, so that a failure replaces the link and not the machine's device."""
     link = desk / "null"
     link.symlink_to(os.devnull)
@@ -82,7 +82,7 @@ def test_a_device_is_written_to_and_stays(desk) -> None:
 
 
 @posix
-def test_a_socket_is_refused_and_stays(desk) -> None:
+def test_write_socket_is_refused_and_kept(desk) -> None:
     import socket
 
     with socket.socket(socket.AF_UNIX) as listening:
@@ -93,7 +93,7 @@ def test_a_socket_is_refused_and_stays(desk) -> None:
 
 
 @posix
-def test_symbolic_links_stay_and_lead_to_the_new_content(tmp_path) -> None:
+def test_write_symbolic_link_replaces_its_target(tmp_path) -> None:
     (tmp_path / "old").write_bytes(b"old")
     for link, target in (("a", "old"), ("b", "new"), ("c", "a")):
         (tmp_path / link).symlink_to(target)
@@ -107,7 +107,7 @@ def test_symbolic_links_stay_and_lead_to_the_new_content(tmp_path) -> None:
 
 
 @posix
-def test_standard_output_in_a_file_keeps_what_is_in_it(desk) -> None:
+def test_write_dev_stdout_appends_to_redirected_file(desk) -> None:
     """By a link, so that a failure replaces the link and not the machine's /dev/stdout."""
     out = desk / "out.txt"
     out.write_bytes(b"before\n")
@@ -123,7 +123,7 @@ def test_standard_output_in_a_file_keeps_what_is_in_it(desk) -> None:
 # --- each file complete or not at all ---
 
 
-def test_a_name_as_long_as_can_be_is_written(tmp_path) -> None:
+def test_write_longest_file_name_is_written(tmp_path) -> None:
     path = tmp_path / ("n" * 250 + ".json")
     write_all({path: b"x"})
     assert path.read_bytes() == b"x"
@@ -217,7 +217,7 @@ def test_signal_while_writing_names_the_written_files(desk, name, code) -> None:
     assert names(desk) == ["c.tum", "l.ulg", "pipe", "s.tum"]
 
 
-def test_who_is_stopped_after_writing_says_what_is_there(desk, monkeypatch, capsys) -> None:
+def test_signal_after_writing_names_the_written_files(desk, monkeypatch, capsys) -> None:
     from px4fuse.report import screen
 
     def stopped(*_: object) -> None:
@@ -251,7 +251,7 @@ def test_full_standard_output_names_the_written_files(desk, json_path, left, the
     assert names(desk) == [*there, "l.ulg", "s.tum"]
 
 
-def test_a_reader_of_the_results_that_leaves_is_no_reason_to_keep_the_files(desk) -> None:
+def test_json_to_closed_pipe_writes_other_files(desk) -> None:
     process = start(desk, *LOOP, "--json", "-", stdout=subprocess.PIPE)
     process.stdout.close()
     assert process.stderr.read() == b""
@@ -273,7 +273,7 @@ def test_folder_as_target_is_refused(tmp_path, capsysbinary) -> None:
 
 
 @pytest.mark.parametrize(("name", "said"), [("王小明", True), ("Ångström", False)])
-def test_a_name_that_no_font_has_is_said_before_the_report(
+def test_compare_name_without_font_warns_before_report(
     desk, monkeypatch, capsys, name: str, said: bool
 ) -> None:
     told = []
@@ -298,14 +298,14 @@ def test_a_name_that_no_font_has_is_said_before_the_report(
     ["compare l.ulg -o \x1b[31m.pdf", "extract l.ulg -o \x1b[31m", "simulate -o \x1b[31m.ulg",
      "answers l.ulg -o \u202e.toml"],
 )  # fmt: skip
-def test_what_was_written_is_told_without_acting_on_the_terminal(desk, command: str) -> None:
+def test_written_names_have_no_escape_sequences(desk, command: str) -> None:
     told = run(*command.split(" "))
     assert told.exit_code == 0
     assert not {"\x1b", "\u202e"} & set(told.output)
     assert any({"\x1b", "\u202e"} & set(path.name) for path in desk.iterdir())
 
 
-def test_extract_keeps_the_tables_of_two_logs_apart(desk) -> None:
+def test_extract_into_folder_of_other_log_is_refused(desk) -> None:
     make_log("v1.14", SECONDS).write(desk / "other.ulg")
     for _ in range(2):  # the same log again
         done("extract", "l.ulg", "-o", "tables")
@@ -318,7 +318,7 @@ def test_extract_keeps_the_tables_of_two_logs_apart(desk) -> None:
 
 
 @pytest.mark.parametrize("command", ["info", "extract"])
-def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
+def test_output_to_closed_pipe_exits_with_0(desk, command) -> None:
     """As in px4fuse info LOG | head -1, when head has gone before anything is printed."""
     options = ["-o", "tables"] if command == "extract" else []
     process = start(desk, command, "l.ulg", *options, stdout=subprocess.PIPE)
@@ -331,7 +331,7 @@ def test_a_reader_that_leaves_is_no_error(desk, command) -> None:
 # --- --clock-offset auto ---
 
 
-def test_auto_adds_nothing_where_zero_is_as_good(sample_log) -> None:
+def test_clock_offset_auto_not_significant_adds_nothing(sample_log) -> None:
     request = ComparisonRequest(log=str(sample_log), clock_offset_s="auto", axes=("north", "east"))
     found = run_comparison(request)
     assert found.settings.clock_offset_s == 0.0
@@ -340,7 +340,7 @@ def test_auto_adds_nothing_where_zero_is_as_good(sample_log) -> None:
 
 
 @pytest.mark.reallogs
-def test_auto_brings_late_stamps_to_the_truth(shared_logs) -> None:
+def test_clock_offset_auto_corrects_late_timestamps(shared_logs) -> None:
     request = ComparisonRequest(
         log=str(shared_logs / "simulated" / "v1.16.1_aisle_clock_late.ulg"), axes=("aisle",)
     )
@@ -357,14 +357,14 @@ def test_auto_brings_late_stamps_to_the_truth(shared_logs) -> None:
 
 @posix
 @pytest.mark.parametrize("words", ["--help", "lesson kalman"])
-def test_a_closed_standard_output_is_no_error(words: str) -> None:
+def test_output_closed_stdout_exits_with_0(words: str) -> None:
     command = ["sh", "-c", f"{sys.executable} -m px4fuse {words} >&-"]
     ended = subprocess.run(command, stderr=subprocess.PIPE, check=False)
     assert (ended.returncode, ended.stderr) == (0, b"")
 
 
 @posix
-def test_a_pipe_that_nobody_reads_is_not_waited_for(
+def test_write_pipe_without_reader_ends_after_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_log: Path
 ) -> None:
     monkeypatch.setattr("px4fuse.writing.READER_S", 0.1)

@@ -1,4 +1,4 @@
-"""``px4fuse answers``: the form about a flight, to fill in."""
+"""``px4fuse answers``: writes the answer form for a flight."""
 
 import hashlib
 from pathlib import Path
@@ -13,9 +13,10 @@ from px4fuse.cli.outputs import write_new
 @click.argument("log", type=InputPath())
 @options("answers")
 def answers(log: Path, output: Path | None) -> None:
-    """Write the form about a flight: what is wrong with it, what EKF2 did, three numbers.
+    """Write the answer form for a flight.
 
-    Fill it in and give it to px4fuse compare --answers.
+    The form has questions about the mistakes of the flight, the behaviour of EKF2, and three
+    numbers. Complete it and give it to px4fuse compare --answers.
     """
     from px4fuse.answers import form_name, form_text
     from px4fuse.reading import read_log_bytes

@@ -1,4 +1,4 @@
-"""``px4fuse batch``: many logs become one table."""
+"""``px4fuse batch``: compares many logs and writes one table."""
 
 import gc
 import sys
@@ -16,7 +16,7 @@ from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
 FAILED = "failed"
-# How a cluster of each kind is started, for people who have one: beside this file, as NAME.txt
+# --scheduler prints NAME.txt of this folder: how to start such a cluster
 CLUSTERS = ("slurm", "kubernetes")
 
 
@@ -38,25 +38,25 @@ def batch(
     fail_on: Literal["failed", Severity] | None,
     **option_values: Any,
 ) -> None:
-    """Compare many logs, as px4fuse compare does each, into one table.
+    """Run compare on many logs and collect one table.
 
     LOGS are files, folders, globs and URLs (s3://, gs://, https://, sftp://). Writes
-    fleet.html, fleet.csv, fleet.parquet and every log's results into DIR. A second run does only
-    what is new, and tries again what has failed; Ctrl-C keeps what is done.
+    fleet.html, fleet.csv, fleet.parquet and the results of each log to DIR. A second run processes
+    only new and failed logs. Ctrl-C keeps finished results.
     """
     if scheduler in CLUSTERS:
         click.echo(files("px4fuse.cli").joinpath(f"{scheduler}.txt").read_text("utf-8"), nl=False)
         return
     if output is None:
-        raise SettingsError("say with -o which folder the table goes to.")
+        raise SettingsError("batch requires an output folder: -o DIR.")
     if output.exists() and not output.is_dir():
-        raise OutputError(f"-o {output}: is not a folder. Give another place.")
+        raise OutputError(f"-o {output} is not a folder. Choose another name.")
     if scheduler is not None and workers is not None:
-        raise SettingsError("--workers is for this computer, and --scheduler for a cluster.")
+        raise SettingsError("--workers applies to this computer. Omit it with --scheduler.")
     from px4fuse.fleet.run import run
     from px4fuse.fleet.terminal import summary
 
-    gc.enable()  # a long run, of a library that leaves circles
+    gc.enable()  # the run is long, and Dask leaves reference cycles
     try:
         with outputs.progress() as step:
             fleet = run(
@@ -71,7 +71,7 @@ def batch(
                 **option_values,
             )
     except KeyboardInterrupt as stopped:
-        message = f"what is done is kept in {output}. The same command goes on from there."
+        message = f"finished results are in {output}. Run the same command to continue."
         raise outputs.Interrupted(stopped, message) from None
     outputs.write_and_print({}, summary(fleet), written=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
@@ -80,7 +80,10 @@ def batch(
         sys.exit(1)
 
 
-def _show_rate(step: outputs.ShowStep, since_s: float, what: str, done: int, of: int) -> None:
-    """How far it is, with its rate."""
-    per_minute = 60.0 * done / (time.monotonic() - since_s)
-    step(f"{what}, {per_minute:.3g} per minute" if done else what, done, of)
+def _show_rate(
+    step: outputs.ShowStep, start_s: float, activity: str, done_count: int, total_count: int
+) -> None:
+    """Show the progress with the number of logs per minute; ``start_s`` is monotonic time."""
+    per_minute = 60.0 * done_count / (time.monotonic() - start_s)
+    text = f"{activity}, {per_minute:.3g} per minute" if done_count else activity
+    step(text, done_count, total_count)

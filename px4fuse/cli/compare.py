@@ -1,4 +1,4 @@
-"""``px4fuse compare``: the main job."""
+"""``px4fuse compare``: checks EKF2 against the two-state Kalman filter."""
 
 import sys
 from pathlib import Path
@@ -19,7 +19,7 @@ SEVERITIES = get_args(Severity)
 @inputs.analysis_options
 @inputs.person_options
 @inputs.report_options(
-    "The report.  [default: reports/LOG.pdf, settings that are not at their defaults in its name]"
+    "Output report.  [default: reports/LOG.pdf; changed settings are part of the name]"
 )
 @inputs.options("compare")
 @inputs.open_option
@@ -31,10 +31,12 @@ def compare(
     checks: bool,
     **option_values: Any,
 ) -> None:
-    """Compare a flight's EKF2 with a two-state Kalman filter over IMU and position.
+    """Check EKF2 against a two-state Kalman filter and report mistakes.
 
-    LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Writes a PDF report and its
-    results as JSON, for example reports/LOG_sigma-z-0.05.pdf and .json.
+    LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Replays IMU and position through
+    a two-state Kalman filter (KF) and compares innovations and variances with EKF2. Names mistakes
+    with their fix. Writes a PDF report and the results as JSON, for example
+    reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import failed_checks, run_or_evaluate_aids
     from px4fuse.memory import release_free_memory
@@ -43,11 +45,11 @@ def compare(
 
     person = inputs.read_student(option_values)
     request = inputs.comparison_request(log, option_values)
-    outputs.report_paths(output, json_path)  # before the work, not after it
+    outputs.report_paths(output, json_path)  # fail early if the output cannot be written
     with outputs.progress(json_path) as step:
         outcome = run_or_evaluate_aids(request, step)
         results = outcome_results(request, outcome, person)
-        release_free_memory()  # before anything of the report is imported
+        release_free_memory()  # the import of the report modules needs memory
         if output is None and json_path != STANDARD_OUTPUT:
             output = outputs.default_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, outcome, step)
@@ -60,6 +62,7 @@ def compare(
     if fail_on is not None:
         failing_severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1]
         if any(
-            one.severity in failing_severities and one.caused_by is None for one in results.findings
+            finding.severity in failing_severities and finding.caused_by is None
+            for finding in results.findings
         ):
             sys.exit(1)

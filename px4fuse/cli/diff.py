@@ -1,4 +1,4 @@
-"""``px4fuse diff``: settings, numbers and findings that differ."""
+"""``px4fuse diff``: lists settings, numbers and findings that differ."""
 
 import sys
 from pathlib import Path
@@ -16,7 +16,7 @@ from px4fuse.cli import inputs, outputs
 def diff(a: Path, b: Path, json_path: Path | None) -> None:
     """List the settings, numbers and findings that differ from A to B.
 
-    A and B are each a flight log, a report (PDF) that px4fuse compare wrote, or its results (JSON).
+    A and B are flight logs, reports (PDF) of px4fuse compare, or their results (JSON).
 
     The exit code is 1 if a verdict is worse in B: the mean NIS or mean NEES of KF or EKF2 along an
     axis is consistent in A and not in B, or B has a new finding of severity error. A mean NIS is

@@ -15,14 +15,14 @@ from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, settings_name
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
-MAX_DELTA = 1e6
-# What the score takes by the names of the options
+MAX_DELTA = 1e6  # m, s or frames
+# Options that the function evaluate takes under the same name
 SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
 def delta(text: str) -> Delta:
-    """Read a distance, a time or a number of frames: ``5m``, ``10s``, ``1f``."""
+    """Parse an RPE delta: a distance, a time or a number of frames (``5m``, ``10s``, ``1f``)."""
     from px4fuse.trajectory.scores import Delta
 
     match = _DELTA.fullmatch(text.strip())
@@ -40,7 +40,7 @@ def delta(text: str) -> Delta:
 @inputs.options("evaluate", rpe={"type": delta, "multiple": True})
 @inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
 @inputs.max_size_option
-@inputs.report_options("The page.  [default: reports/A_against_B.pdf]")
+@inputs.report_options("Output report.  [default: reports/A_against_B.pdf]")
 @inputs.open_option
 def evaluate(
     estimate: Path,
@@ -49,11 +49,11 @@ def evaluate(
     json_path: Path | None,
     **option_values: Any,
 ) -> None:
-    """Score a trajectory against a reference: ATE and RPE, with intervals.
+    """Compute ATE and RPE of a trajectory against a reference.
 
-    Either is a trajectory file (TUM, EuRoC, ORB-SLAM3) or a part of a flight log: LOG:vio,
-    LOG:ekf2, LOG:kf (our filter) or LOG:truth. Writes a page (PDF) and the results (JSON); where
-    --json names a file and -o none, only that.
+    Both are trajectory files (TUM, EuRoC, ORB-SLAM3) or tracks of a flight log: LOG:vio,
+    LOG:ekf2, LOG:kf or LOG:truth. Prints errors with 95 % intervals. Writes a PDF report and the
+    results as JSON.
     """
     from px4fuse.loop.tracks import file_name, read_source
     from px4fuse.report.evaluation import write_evaluation
@@ -69,13 +69,13 @@ def evaluate(
         **option_values,
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
-        raise SettingsError(f"--max-gap {request.max_gap_s:g}: give more than 0 seconds.")
+        raise SettingsError(f"--max-gap {request.max_gap_s:g}: the value must be above 0 s.")
     outputs.report_paths(output, json_path)
     with outputs.progress(json_path) as step:
         step("reading")
         first = read_source(request.estimate, system=request.system)
         second = read_source(request.reference, default="truth", system=request.system)
-        step("scoring")
+        step("computing errors")
         score_result = score(
             first.trajectory,
             second.trajectory,

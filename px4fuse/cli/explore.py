@@ -1,4 +1,4 @@
-"""``px4fuse explore``: the filter's knobs, on a page that replays the flight."""
+"""``px4fuse explore``: writes a page with sliders that re-run KF in the browser."""
 
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,12 @@ from px4fuse.request import settings_name
 @inputs.options("explore")
 @inputs.open_option
 def explore(log: Path | None, output: Path | None, **option_values: Any) -> None:
-    """Write a web page with sliders for SIGMA_A, SIGMA_Z, DT and the clock offset.
+    """Write an interactive page with sliders for the filter settings.
 
-    LOG is a PX4 ULog or a MAVLink recording; without one it is the sample flight. The page is one
-    file that needs no network: it replays the filter in the browser at every move and shows what
-    that does to innovations, variances and errors, one step at a time if you like, and takes you on
-    a tour of the flight.
+    LOG is a PX4 ULog or a MAVLink recording; without LOG, the sample flight is used. Sliders for
+    SIGMA_A, SIGMA_Z, DT and the clock offset re-run the filter in the browser. Plots show
+    innovations, σ and errors; a step view shows each predict and update; a tour explains the main
+    effects. The page is one file and needs no network.
     """
     from px4fuse.analysis import run
 
@@ -31,7 +31,7 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
     with outputs.progress(target) as step:
         analysis = run(request, step)
         step("writing the page")
-        # Bokeh takes long to import, and bad input needs none of it
+        # imported late: Bokeh is slow to import, and an error above does not need it
         from px4fuse.explore.page import html_text
 
         content = html_text(analysis).encode()

@@ -1,4 +1,4 @@
-"""``px4fuse extract``: a log as tidy tables for one's own code."""
+"""``px4fuse extract``: exports a log as tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from px4fuse.reading import read_text
 if TYPE_CHECKING:
     import pandas as pd
 
-# Of flight.json
+# bytes; limit for flight.json of an earlier run
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 
@@ -33,14 +33,14 @@ def extract(
     format: Literal["csv", "parquet"] = "csv",  # noqa: A002 - the name of the option
     **option_values: Any,
 ) -> None:
-    """Write everything that a log holds as tidy tables, one file each.
+    """Export a log as tables (CSV or Parquet).
 
-    With data_dictionary.csv, which says the unit, frame, meaning, source topic and clock of every
-    column, and flight.json, which says what the log is and what is missing from it.
+    Writes one table per data type, data_dictionary.csv (unit, frame, meaning, topic and clock of
+    each column) and flight.json (log information and missing data).
     """
     check_output_folder(output)
     if output.exists() and not output.is_dir():
-        raise OutputError(f"{output}: is a file. Give a folder with -o.")
+        raise OutputError(f"{output} is a file. Give a folder with -o.")
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise OutputError(
             '--format parquet requires pyarrow. Run pip install "px4fuse[parquet]", or '
@@ -62,19 +62,19 @@ def extract(
     for name, table in tables.items():
         click.echo(f"  {f'{name}.{format}':44} {len(table):8} rows")
     click.echo("  data_dictionary.csv, flight.json")
-    for part in extraction.unavailable_parts(flight):
-        click.echo(f"Not in this log: {part.what} ({part.reason})")
+    for missing in extraction.unavailable_parts(flight):
+        click.echo(f"Not exported: {missing.what} ({missing.reason})")
 
 
 def _require_same_flight(folder: Path, sha256: str) -> None:
-    """Tables of two flights in one folder would pass for one."""
+    """Raise an OutputError if the folder contains the tables of another log."""
     try:
         with own_files():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         before = json.loads(text)["log"]
         other = before["sha256"] != sha256
         name = str(before["name"])
-    except (OutputError, ValueError, KeyError, TypeError):  # not one of ours
+    except (OutputError, ValueError, KeyError, TypeError):  # flight.json is not from px4fuse
         return
     if other:
         raise OutputError(
@@ -83,7 +83,7 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
 
 
 def _csv_bytes(table: pd.DataFrame) -> bytes:
-    # without a format, pandas writes the shortest text that reads back as the same float64
+    # by default pandas writes the shortest text that is read back as the same float64
     return table.to_csv(index=False, lineterminator="\n").encode()
 
 

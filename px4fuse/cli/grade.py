@@ -1,4 +1,4 @@
-"""``px4fuse grade``: a folder of reports becomes a class table."""
+"""``px4fuse grade``: verifies and grades the reports of a class."""
 
 from __future__ import annotations
 
@@ -49,13 +49,12 @@ def grade(
     jobs: int | None,
     write_rubric: Path | None,
 ) -> None:
-    """Verify and score reports: PDFs, folders of them, and zip files of learning platforms.
+    """Verify and grade the reports of a class.
 
-    Writes class.csv, class.html, a feedback text per student and files that learning platforms
-    import into DIR. What you write into its overrides.csv (id, item or total, points, comment)
-    counts and is never written over. A second run verifies again only what has changed, so that
-    a new rubric takes seconds. What students hand in is read within bounds of time and memory, and
-    nothing in it is executed.
+    SUBMISSIONS are PDFs, folders, or zip files of learning platforms. Writes class.csv, class.html,
+    one feedback text per student and grade files for the platforms to DIR. Entries in overrides.csv
+    (id, item or total, points, comment) replace computed points. A second run verifies only changed
+    reports. Submitted files are never executed and are read with time and memory limits.
     """
     from px4fuse.assignment.key import read_key
     from px4fuse.assignment.roster import read_people
@@ -69,11 +68,11 @@ def grade(
         return
     costs = late_rule(late) if late else None
     if costs is not None and due is None:
-        raise SettingsError("--late: say with --due when it was due.")
+        raise SettingsError("--late requires --due TIME.")
     if not submissions:
-        raise SettingsError("nothing to grade: give PDFs, folders or zip files.")
+        raise SettingsError("no submissions were given. Give PDFs, folders or zip files.")
     if output is None:
-        raise SettingsError("say with -o where the class table goes.")
+        raise SettingsError("grade requires an output folder: -o DIR.")
     _require_output_outside(output, (*submissions, *logs))
     answers = None if key is None else read_key(key)
     course = Course(
@@ -96,21 +95,21 @@ def grade(
                 submissions, course, output, processes=jobs, progress=partial(step, "grading")
             )
     except KeyboardInterrupt as stopped:
-        message = "but what is graded is kept. The same command goes on from there."
+        message = f"finished results are in {output}. Run the same command to continue."
         raise Interrupted(stopped, message) from None
     write_and_print({}, _page(outcome), written=outcome.written)
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
     if output.exists() and not output.is_dir():
-        raise OutputError(f"-o {output}: is not a folder. Give another place.")
-    whole = output.resolve()
-    above = [folder for folder in (whole, *whole.parents) if folder.is_dir()]
+        raise OutputError(f"-o {output} is not a folder. Choose another name.")
+    resolved = output.resolve()
+    parents = [folder for folder in (resolved, *resolved.parents) if folder.is_dir()]
     for path in input_paths:
-        if path.is_dir() and any(map(path.samefile, above)):
+        if path.is_dir() and any(map(path.samefile, parents)):
             raise OutputError(
-                f"-o {output} is inside {path}, which is an input. Its own output would be "
-                "graded. Choose another folder."
+                f"-o {output} is inside the input {path}, so the next run would read this output. "
+                "Choose another folder."
             )
         for file in files_below(path):
             add_input(file)
@@ -139,8 +138,8 @@ def _page(outcome: GradeOutcome) -> Page:
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.most_common())
     missing = sum(entry.counting is None for entry in outcome.entries)
     page.write(
-        f"{len(outcome.graded)} submissions: {status_counts or 'none'}; {missing} of "
-        f"{len(outcome.entries)} students handed in nothing; {outcome.reused} as verified before"
+        f"{len(outcome.graded)} submissions: {status_counts or 'none'}; no submission from "
+        f"{missing} of {len(outcome.entries)} students; {outcome.reused} reused from an earlier run"
     )
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)

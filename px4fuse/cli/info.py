@@ -1,4 +1,4 @@
-"""``px4fuse info``: what is in a log, and what can be done with it."""
+"""``px4fuse info``: lists the contents of a log and the possible analyses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from px4fuse.report.page import Cell, Page
     from px4fuse.request import ComparisonRequest
 
-SOURCES_HEAD = ("", "source", "samples", "Hz", "gaps", "span (s)")
+SOURCES_HEAD = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
 
 
 def _print_versions(context: click.Context, _: click.Parameter, is_requested: bool) -> None:
@@ -43,12 +43,16 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
     is_eager=True,
     expose_value=False,
     callback=_print_versions,
-    help="Print versions, system and libraries, for a bug report, and exit.",
+    help="Print the versions of px4fuse, system and libraries for a bug report, and exit.",
 )
 @json_option
 @recording_options
 def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
-    """Say what is in a log, what px4fuse can do with it, and what to log next time."""
+    """List the contents of a log and which analyses are possible.
+
+    Lists topics, rates and gaps, the possible analyses, the reasons why others are not possible,
+    and what to log on the next flight.
+    """
     from px4fuse.analysis import read_flight
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
@@ -56,7 +60,7 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     check_targets([json_path])
     with progress(json_path) as step:
         flight = read_flight(request, step)
-        step("looking at what is in it")
+        step("reading the contents")
         inventory = take_inventory(flight)
     contents = result_files(to_plain(inventory), json_path)
     write_and_print(contents, _page(inventory, request))
@@ -72,24 +76,25 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     for label, text in _log_facts(inventory):
         page.labelled(label, text)
     if inventory.flight.log.senders:
-        page.table(
-            ("sender", "what it is", "messages", "lost"), _sender_rows(inventory), right=(2, 3)
-        )
+        page.table(("sender", "type", "messages", "lost"), _sender_rows(inventory), right=(2, 3))
     page.table(SOURCES_HEAD, list(_source_rows(inventory)), right=(2, 3, 4, 5))
     answer_styles = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
     rows = [
         (answer_styles[option.possible], option.name, option.reason)
         for option in inventory.abilities
     ]
-    page.table(("", "", "What px4fuse can do with it"), rows)
+    page.table(("possible", "analysis", ""), rows)
     if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
         command = command_line(request, "compare", typed=True)
-        page.add("command", text=command, label="Compare")
+        page.add("command", text=command, label="Run")
     lists = {
-        "Next": [f"{one.remedy} ({'; '.join(one.improves)})" for one in inventory.advice],
+        "Action": [
+            f"{advice.remedy} ({'; '.join(advice.improves)})" for advice in inventory.advice
+        ],
         "Clocks": _clock_lines(inventory),
         "Not used": [
-            f"{one.name}, {one.count} messages: {one.reason}" for one in inventory.flight.unused
+            f"{topic.name}, {topic.count} messages: {topic.reason}"
+            for topic in inventory.flight.unused
         ],
         "Notes": inventory.notes,
     }
@@ -109,14 +114,14 @@ def _log_facts(inventory: Inventory) -> list[tuple[str, str]]:
         ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
         ("Vehicle", f"{version}{git}, {hardware}"),
         ("Data", f"{_duration_text(log.duration_s)}, {_start_text(inventory)}"),
-        ("Flying", _airborne_text(inventory)),
+        ("Airborne", _airborne_text(inventory)),
     ]
     if log.dropouts:
         lost_s = sum(dropout.duration_s for dropout in log.dropouts)
         longest_s = max(dropout.duration_s for dropout in log.dropouts)
         count = len(log.dropouts)
-        words = f"{count} of the logger, {lost_s:.2f} s in all, the longest {longest_s:.2f} s"
-        facts.append(("Dropouts", words))
+        text = f"{count} of the logger, {lost_s:.2f} s in total, the longest {longest_s:.2f} s"
+        facts.append(("Dropouts", text))
     facts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
         for file in inventory.flight.inputs
@@ -125,7 +130,7 @@ def _log_facts(inventory: Inventory) -> list[tuple[str, str]]:
 
 
 def _duration_text(seconds: float) -> str:
-    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "a single moment"
+    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "one point in time"
 
 
 def _start_text(inventory: Inventory) -> str:
@@ -137,9 +142,9 @@ def _start_text(inventory: Inventory) -> str:
 def _airborne_text(inventory: Inventory) -> str:
     airborne = inventory.flight.airborne
     if isinstance(airborne, Unavailable):
-        return "unknown, no land detector"
+        return "unknown (no land detector in the log)"
     if not airborne:
-        return "never, by the land detector"
+        return "never (land detector)"
     spans = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne]
     return join_first(spans, 3)
 
@@ -164,10 +169,10 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         part = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
-            yield part, ("none", MUTED_COLOUR), "", "", "", ""  # why not stands below
+            yield part, ("none", MUTED_COLOUR), "", "", "", ""  # the next table gives the reason
             continue
         yield (
-            f"{part:9}->" if source.chosen else part,
+            f"{part:8} (used)" if source.chosen else part,
             source.name,
             "" if source.samples is None else f"{source.samples}",
             "" if source.rate_hz is None else _format_short(source.rate_hz),
@@ -185,7 +190,7 @@ def _gaps_text(source: Source) -> str:
 
 
 def _format_short(value: float) -> str:
-    """Two digits or more, four characters as a rule."""
+    """Format a number with at least two digits, for a narrow column."""
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 
@@ -193,9 +198,9 @@ def _span_text(source: Source) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0
-    # adding zero makes of -0 a 0
+    # + 0.0 turns -0.0 into 0.0
     start, end = (round(time, digits) + 0.0 for time in (source.start_s, source.end_s))
-    return f"{start:.{digits}f}..{end:.{digits}f}"
+    return f"{start:.{digits}f} to {end:.{digits}f}"
 
 
 def _clock_lines(inventory: Inventory) -> list[str]:

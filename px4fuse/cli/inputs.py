@@ -1,6 +1,6 @@
-"""What commands take: kinds of options, and those that several share.
+"""Option types of the command line, and options that several commands share.
 
-A unit is not typed: who types it is told the number.
+Numbers are typed without their unit; for a number with a unit the error shows the right number.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 def column_names(text: str) -> tuple[str, ...]:
-    """Read names or numbers of columns, with commas between them."""
+    """Parse comma-separated names or numbers of columns."""
     return tuple(text.split(","))
 
 
@@ -49,7 +49,7 @@ Option = Callable[[Callable[..., None]], Callable[..., None]]
 
 
 def _combine_options(*options: Option) -> Option:
-    """Several options as one, in the order in which the help lists them."""
+    """Combine several options into one decorator; the help lists them in this order."""
 
     def add(command: Callable[..., None]) -> Callable[..., None]:
         for option in reversed(options):
@@ -60,26 +60,28 @@ def _combine_options(*options: Option) -> Option:
 
 
 class NonEmptyPath(click.Path):
-    """A file or folder; an empty name, which would be the current folder, is a slip."""
+    """Path of a file or folder; an empty name is rejected, as it would mean the current folder."""
 
     def __init__(self, path_type: type[Path | str] = Path) -> None:
         super().__init__(path_type=path_type)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert what was typed."""
+        """Convert the typed text to a path."""
         if value == "":
             self.fail("the name is empty.", param, ctx)
         return super().convert(value, param, ctx)
 
 
 class InputPath(NonEmptyPath):
-    """A file or folder to read, which is registered before the command begins.
+    """File or folder to read; it is registered as input before the command begins.
+
+    A log may be followed by the name of a track: ``LOG:vio``.
 
     A log may have a part of it after a colon, as ``LOG:vio``.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert what was typed."""
+        """Convert the typed text to a path and register the file."""
         path = super().convert(value, param, ctx)
         file, colon, _ = str(path).rpartition(":")
         add_input(Path(file) if colon and not Path(path).exists() else Path(path))
@@ -87,16 +89,16 @@ class InputPath(NonEmptyPath):
 
 
 class TypedQuantity(click.ParamType["float | str"]):
-    """A number in a unit.
+    """Number in a fixed unit.
 
     Parameters
     ----------
     unit : str
         One of :data:`px4fuse.units.NAMES`.
     example : float
-        Shown where what was typed cannot be understood.
+        Number in the error message if the typed text is not a number.
     auto : bool
-        Also take the word ``auto``.
+        Accept ``auto`` in addition.
     """
 
     name = "number"
@@ -105,24 +107,25 @@ class TypedQuantity(click.ParamType["float | str"]):
         self.unit, self.example, self.auto = unit, example, auto
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        """Its unit, as the help shows what to type."""
+        """Return the unit, which --help shows for the value."""
         unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
         return f"{unit}|auto" if self.auto else unit
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
-        """Convert what was typed."""
+        """Convert the typed text to a number, or to "auto"."""
         if self.auto and value == AUTO:
             return str(value)
-        name = NAMES[self.unit]
+        unit = f" in {NAMES[self.unit]}" if self.unit else ""
         try:
             number = float(value)
         except ValueError:
             parsed = in_unit(value, self.unit)
             example_text = f"{self.example if parsed is None else parsed:.12g}"
             self.fail(
-                f"{value!r}: give {name}, as {example_text}{', or auto' if self.auto else ''}.",
+                f"{value!r} is not a number{unit}. Give for example {example_text}"
+                f"{', or auto' if self.auto else ''}.",
                 param,
                 ctx,
             )
@@ -140,20 +143,20 @@ def option(
     name: str = "",
     **more: Any,
 ) -> Option:
-    """An option of the command below: what it takes and its default are its parameter's there.
+    """Declare an option; its type and default are those of the command's parameter of that name.
 
     Parameters
     ----------
     typed : str
-        As the help has it: "-o, --output FILE".
+        Names and metavar as shown by --help: "-o, --output FILE".
     meaning : str
-        Its help.
+        Help text.
     least, most : float, optional
-        Of a number.
+        Limits of a number.
     name : str
-        Of its parameter, where that is called otherwise.
+        Name of the parameter, if it differs from the option.
     **more
-        As click has them: what it takes where the command has no parameter of its name.
+        Further arguments of ``click.option``.
     """
     names, _, metavar = typed.replace(", ", ",").partition(" ")
     field = name or names.rpartition("--")[2].replace("-", "_")
@@ -176,7 +179,7 @@ def option(
 
 
 class _OptionRow(Struct, frozen=True):
-    """A row of ``options.toml``; as :func:`option` takes it."""
+    """Row of ``options.toml``: arguments of :func:`option`."""
 
     typed: str
     meaning: str
@@ -188,29 +191,29 @@ _TABLES = table(__file__, "options.toml", dict[str, dict[str, _OptionRow]])
 
 
 def options(title: str, **more: Mapping[str, Any]) -> Option:
-    """The options of a table of ``options.toml``; of some more, as click has it."""
+    """Declare the options of a table of ``options.toml``; ``more``: further arguments by option."""
     return _combine_options(
         *(
-            option(one.typed, one.meaning, one.least, one.most, name=name, **more.get(name, {}))
-            for name, one in _TABLES[title].items()
+            option(row.typed, row.meaning, row.least, row.most, name=name, **more.get(name, {}))
+            for name, row in _TABLES[title].items()
         )
     )
 
 
 def request_options(kind: type[Struct], options: Mapping[str, Declared]) -> Option:
-    """The options of some fields of a request: what each takes and its default are the field's."""
+    """Declare options for fields of a request, with the type and default of each field."""
     hints, defaults = get_type_hints(kind), {field.name: field for field in fields(kind)}
     return _combine_options(
         *(
-            _declared_option(name, one, hints[name], defaults[name].default)
-            for name, one in options.items()
-            if one.meaning
+            _declared_option(name, declared, hints[name], defaults[name].default)
+            for name, declared in options.items()
+            if declared.meaning
         )
     )
 
 
 def _declared_option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
-    """One of them; the parameters of a position file begin with what file they are about."""
+    """Declare the option of one field; parameters of a position file begin with ``position``."""
     name = declared.name[2:].replace("-", "_") if declared.name.startswith("--position") else field
     details = {"default": default or None} if default is not NODEFAULT else {}
     details |= _click_type(hint) | {"help": declared.meaning, "metavar": declared.metavar}
@@ -227,7 +230,7 @@ def _declared_option(field: str, declared: Declared, hint: Any, default: Any) ->
 
 
 def _click_type(hint: Any) -> dict[str, Any]:
-    """What a parameter of a type takes: of a Literal one of its words, of a tuple several."""
+    """Return click's arguments for a type hint: a Literal is a choice, a tuple is repeatable."""
     types = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     inner = next(member for member in types if member is not NoneType)
     if get_origin(inner) is tuple:
@@ -245,28 +248,28 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(before))
 
 
-# It says what this machine can take, not what is analysed, so it is no setting of the analysis
+# A limit of this computer, not a setting of the analysis, so it is not part of the request
 max_size_option = option(
     "--max-size MB",
-    f"Largest log that is read.  [default: {max_log_bytes.get() // 1_000_000}]",
+    f"Maximum size of a log.  [default: {max_log_bytes.get() // 1_000_000}]",
     1,
     expose_value=False,
     callback=_set_max_size,
 )
-#: The results, which stand beside a report where there is one
+#: --json
 json_option = option(
     "--json FILE",
-    "The results as JSON; - prints them alone on standard output. Without -o, no report is "
-    "written then.  [default: beside the report, where there is one]",
+    "Write the results as JSON; - prints them to standard output. With --json and without -o, no "
+    "report is written.  [default: beside the report]",
     name="json_path",
 )
 
 
 def _open_flag(option_text: str, name: str) -> Option:
-    """That what was written is to be opened; :func:`~px4fuse.cli.outputs.write_and_print` does."""
+    """Declare a flag to open the output; :func:`~px4fuse.cli.outputs.write_and_print` opens it."""
     return option(
         option_text,
-        "Open what was written, in the program for it.",
+        "Open the written file in its default program.",
         name=name,
         is_flag=True,
         expose_value=False,
@@ -274,44 +277,44 @@ def _open_flag(option_text: str, name: str) -> Option:
     )
 
 
-#: Of every command that writes something to look at
+#: --open of commands that write a report or a page
 open_option = _open_flag("--open, --show", "opened")
-#: Of the command whose --open is of a loop that did not close
+#: --show of px4fuse loop, whose --open means an open loop
 show_option = _open_flag("--show", "shown")
-#: Whose report it is
+#: Student, notes and answers
 person_options = options("person", notes={"type": InputPath()}, answers={"type": InputPath()})
 
 
 def report_options(meaning: str) -> Option:
-    """Of every command that makes a report: the PDF and its results."""
+    """Declare -o for the PDF report and --json for its results."""
     return _combine_options(option("-o, --output FILE.pdf", meaning), json_option)
 
 
 system_option = request_options(EvaluationRequest, {"system": OPTIONS["system"]})
 _FILTER_GROUP = request_options(ComparisonRequest, FILTER_OPTIONS)
 _CLOCK_GROUP = request_options(ComparisonRequest, CLOCK_OPTION)
-#: Of commands that read a flight as it was recorded
+#: Recordings of one flight, for commands that read it as logged
 flight_options = _combine_options(request_options(ComparisonRequest, RECORDINGS), max_size_option)
-#: Which recordings of the flight are read, and how
+#: Recordings of one flight, position file and clock offset
 recording_options = _combine_options(
     request_options(ComparisonRequest, RECORDINGS),
     request_options(PositionFile, POSITION_OPTIONS),
     _CLOCK_GROUP,
     max_size_option,
 )
-#: Of every command that runs the filter: settings, segment and recordings
+#: Settings, segment and recordings, for commands that run KF
 analysis_options = _combine_options(_FILTER_GROUP, recording_options)
-#: Of an analysis that hold for many logs: no other files of one flight
+#: Settings that apply to many logs, so without the files of one flight
 settings_options = _combine_options(_FILTER_GROUP, system_option, _CLOCK_GROUP, max_size_option)
 
 
 def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRequest:
-    """What :func:`recording_options`, or :func:`analysis_options` with them, gave as a request.
+    """Make a request of the values of :func:`recording_options` or :func:`analysis_options`.
 
     Raises
     ------
     SettingsError
-        An option is about a position file, and none is given.
+        An option for a position file is given without --position.
     """
     return ComparisonRequest(log=str(log), position=_position_file(option_values), **option_values)
 
@@ -330,7 +333,7 @@ def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
 
 
 def typed_parameters() -> Iterator[click.Parameter]:
-    """What was typed of the running command, and not left at its default."""
+    """Yield the parameters that were typed, not those at their defaults."""
     context = click.get_current_context()
     for parameter in context.command.params:
         if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
@@ -338,12 +341,12 @@ def typed_parameters() -> Iterator[click.Parameter]:
 
 
 def read_student(option_values: dict[str, Any]) -> Student:
-    """Whose report it is, taken out of what :func:`person_options` gave.
+    """Take the values of :func:`person_options` out of the options and read their files.
 
     Raises
     ------
     SettingsError
-        The notes or the answers cannot be read, or the notes cannot be drawn.
+        The notes or the answers cannot be read, or the notes cannot be printed.
     """
     from msgspec import UNSET
 
@@ -353,10 +356,10 @@ def read_student(option_values: dict[str, Any]) -> Student:
     name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
     path, form, notes = option_values.pop("notes"), option_values.pop("answers"), ""
     if path is not None:
-        from px4fuse.report.notes import parse  # the report takes long to import
+        from px4fuse.report.notes import parse  # slow to import
 
         notes = read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
-        parse(notes, f"--notes {path}")  # before the analysis
+        parse(notes, f"--notes {path}")  # report errors before the analysis
     answers = UNSET if form is None else read_answers(form)
     person = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
     _warn_missing_fonts(person.name + person.id + person.notes)
@@ -364,7 +367,7 @@ def read_student(option_values: dict[str, Any]) -> Student:
 
 
 def _warn_missing_fonts(text: str) -> None:
-    """Say before all work that the report will lack characters, and what to install."""
+    """Warn before the analysis if no installed font has a character of the text."""
     if text.isascii():
         return
     from px4fuse.report.fonts import font_advice, missing_characters
@@ -374,5 +377,5 @@ def _warn_missing_fonts(text: str) -> None:
 
 
 def replace_unencodable(text: str) -> str:
-    """Text without the stray bytes that a terminal may hand over."""
+    """Replace bytes of a command line that are not valid text."""
     return text.encode(errors="replace").decode()

@@ -1,4 +1,4 @@
-"""``px4fuse loop``: the loop-closure error of a flight or a trajectory, and its correction."""
+"""``px4fuse loop``: measures and corrects the loop closure error."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from px4fuse.writing import STANDARD_OUTPUT
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# Nobody's tape is longer
+# m; limit for --landed-at, longer than any tape measure
 MAX_LANDING_DISTANCE_M = 10_000.0
-# What may be given with a pose graph
+# Parameters that are allowed with a pose graph
 GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
 
 
 def _parse_numbers(text: str, expected: str, most: float) -> list[float]:
-    """Two or three finite numbers between commas."""
+    """Parse two or three comma-separated finite numbers of at most ``most``."""
     try:
         numbers = [float(text_part) for text_part in text.split(",")]
     except ValueError:
@@ -42,14 +42,14 @@ def _parse_numbers(text: str, expected: str, most: float) -> list[float]:
 
 
 def parse_landing(text: str) -> Landing:
-    """Read ``FORWARD,RIGHT`` or ``FORWARD,RIGHT,DEG``."""
+    """Parse ``FORWARD,RIGHT`` (m) or ``FORWARD,RIGHT,DEG``."""
     return Landing(
         *_parse_numbers(text, "FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG", MAX_LANDING_DISTANCE_M)
     )
 
 
 def parse_closure(text: str) -> GivenClosure:
-    """Read ``T1,T2`` or ``T1,T2,SIGMA``."""
+    """Parse ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
     return GivenClosure(*_parse_numbers(text, "T1,T2 in s, or T1,T2,SIGMA", sys.float_info.max))
 
 
@@ -65,7 +65,7 @@ def parse_closure(text: str) -> GivenClosure:
 @inputs.request_options(LoopRequest, LOOP_OPTIONS)
 @inputs.max_size_option
 @inputs.person_options
-@inputs.report_options("The report.  [default: reports/SOURCE_loop.pdf]")
+@inputs.report_options("Output report.  [default: reports/SOURCE_loop.pdf]")
 @inputs.options("loop-writes")
 @inputs.show_option
 def loop(
@@ -76,11 +76,11 @@ def loop(
     g2o: Path | None,
     **option_values: Any,
 ) -> None:
-    """Measure how far a loop fails to close, and correct its path.
+    """Measure and correct the loop closure error of odometry.
 
-    SOURCE is a flight log (its visual-inertial odometry, or EKF2's track; LOG:vio, LOG:ekf2 and
-    LOG:kf choose), a trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is solved.
-    Writes a report (PDF) and its results as JSON, except of a pose graph.
+    SOURCE is a flight log (its VIO, or EKF2; LOG:vio, LOG:ekf2 and LOG:kf select the track), a
+    trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is optimised. Writes a PDF
+    report and the results as JSON, except for a pose graph.
     """
     from px4fuse.analysis import run_loop
     from px4fuse.loop.tracks import file_name, is_g2o, split_part
@@ -90,7 +90,9 @@ def loop(
     person = inputs.read_student(option_values)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
-            raise SettingsError(f"{name} -: only --json can print", "Give a file name.")
+            raise SettingsError(
+                f"{name} -: only --json can write to standard output", "Give a file name."
+            )
     if is_g2o(split_part(str(source))[0]):
         _solve_graph(source, json_path, g2o, True if option_values["robust"] else None)
         return
@@ -109,7 +111,7 @@ def loop(
 
 
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
-    """What the command's options gave, as a request."""
+    """Make a request of the values of the command's options."""
     del option_values["robust"]
     return LoopRequest(
         source=str(source), came_back=not option_values.pop("opened"), **option_values
@@ -117,7 +119,7 @@ def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
 
 
 def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
-    """The corrected path and the solved graph, as files for other tools."""
+    """Return the corrected path (TUM) and the optimised graph (g2o) as files."""
     from px4fuse.errors import MissingDataError
     from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import g2o_text
@@ -128,7 +130,7 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
         best = loop_result.best
         if best is loop_result.odometry:
             raise MissingDataError(
-                f"--tum {display_name(tum)}: no corrected path exists: no loop closure was "
+                f"--tum {display_name(tum)}: no corrected path exists, as no loop closure was "
                 "accepted. Give a closure (--closure) or the landing place (--landed-at)."
             )
         contents[tum] = tum_text(from_z_down(best.trajectory, loop_result.original_frame)).encode()
@@ -140,17 +142,17 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
-    """Solve a pose graph from a file."""
+    """Optimise a pose graph file and write the results."""
     from px4fuse.loop.tracks import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
     from px4fuse.results.build import graph_results
     from px4fuse.trajectory.graph.analysis import analyse_graph
 
-    path, part = split_part(str(source))
-    if part is not None:
+    path, track = split_part(str(source))
+    if track is not None:
         raise SettingsError(
-            f"{display_name(source)}: a pose graph has no part {part!r}", "Leave it out."
+            f"{display_name(source)}: a pose graph has no track {track!r}", f"Omit :{track}."
         )
     for parameter in inputs.typed_parameters():
         if parameter.name not in GRAPH_PARAMETERS:
@@ -159,7 +161,7 @@ def _solve_graph(
                     f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose "
                     "graph."
                 ),
-                "Only --g2o FILE and --json FILE are.",
+                "Use only --g2o FILE, --json FILE and --robust.",
             )
     outputs.check_targets([json_path, g2o])
     with outputs.progress(json_path) as step:

@@ -1,4 +1,4 @@
-"""What commands write and show: files, standard output, and how far they are."""
+"""Output of commands: files, standard output and progress."""
 
 from __future__ import annotations
 
@@ -26,57 +26,57 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Limit of the name of a report in bytes, and what is kept of a longer one: file systems take 255
+# bytes; limit for the name of a report (file systems allow 255), and the kept part of a longer one
 LONGEST_NAME, LONGEST_STEM = 200, 180
 # Name and id on a report without a student
-NOBODY = ("", "")
-# Columns of a line that no paragraph fills
+NO_PERSON = ("", "")
+# characters; longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
-# Under it a run keeps which files it has written, for what is said where it then ends early
+# Key in click's context: files that this run has written, for the message if it ends early
 WRITTEN_KEY = "px4fuse.written"
-# And under this one whether what was written is to be opened
+# Key in click's context: True if the output is to be opened
 OPEN_KEY = "px4fuse.opened"
-# What is looked at first, of all that a command writes
+# Types of files that --open opens, in this order
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 
-class Interrupted(Exception):  # noqa: N818 - no error of anybody
-    """The run was ended from outside.
+class Interrupted(Exception):  # noqa: N818 - the user ended the run, no error
+    """End of a run by Ctrl-C or a signal.
 
     Parameters
     ----------
     stopped : KeyboardInterrupt
-        With the number of the signal, where it was not Ctrl-C.
-    left : str
-        What the run leaves.
+        Contains the number of the signal, except for Ctrl-C.
+    written : str
+        Sentence about the files that the run has written.
     """
 
-    def __init__(self, stopped: KeyboardInterrupt, left: str) -> None:
-        super().__init__(f"interrupted, {left}")
+    def __init__(self, stopped: KeyboardInterrupt, written: str) -> None:
+        super().__init__(f"interrupted; {written}")
         self.exit_code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
 
 
 class ShowStep(Protocol):
-    """Says what is being done, and how much of it is done where that can be counted."""
+    """Function that shows the current activity, with counts if its parts can be counted."""
 
     def __call__(self, activity: str, done_count: int = 0, total_count: int | None = None) -> None:
-        """Show it."""
+        """Show the activity."""
 
 
 def show_nothing(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
-    """Show nothing."""
+    """Do nothing: no progress is shown."""
 
 
 @contextmanager
 def progress(output: Path | None = None) -> Iterator[ShowStep]:
-    """A bar on a terminal about what is being done, and what remains where that can be counted.
+    """Show a progress bar on the terminal with the current activity and the remaining time.
 
-    Nothing in a pipe, nor where the output has standard output to itself.
+    Nothing is shown in a pipe, or if the output is written to standard output.
     """
     from rich.console import Console
 
     console = Console(stderr=True)
-    # an older rich ends a disabled bar with an empty line
+    # older versions of rich end a disabled bar with an empty line
     if not console.is_terminal or output == STANDARD_OUTPUT:
         yield show_nothing
         return
@@ -103,12 +103,12 @@ def progress(output: Path | None = None) -> Iterator[ShowStep]:
 
 
 def default_report(stem: str, settings: str, results: Results) -> Path:
-    """Path of a report without -o: the name of the log and the settings that are not defaults.
+    """Return the path of a report without -o: log name and changed settings.
 
     Raises
     ------
     OutputError
-        A file of that name exists that is not a report of the same files and student.
+        A file of that name exists and is not a report of the same files and student.
     """
     from px4fuse.results.contract import file_hashes_in, to_json
     from px4fuse.results.reading import read_results
@@ -116,8 +116,8 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
 
     name = f"{stem}{settings}"
     if len(os.fsencode(name)) > LONGEST_NAME:
-        kept = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
-        name = f"{kept}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
+        short_stem = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
+        name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
     for file, read in ((path, attached_results), (path.with_suffix(".json"), read_results)):
         if not file.exists():
@@ -128,51 +128,49 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
             is_same = False
         else:
             is_same = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
-            is_same &= _person(old) in (NOBODY, _person(results))
+            is_same &= _person(old) in (NO_PERSON, _person(results))
         if not is_same:
             raise OutputError(
-                (
-                    f"{file}: exists and is not a report of the same files and student by this "
-                    "version; it was not replaced"
-                ),
-                "Name the report with -o.",
+                f"{file} exists and is not a report of the same files and student by this version; "
+                "it was not overwritten",
+                "Choose another name with -o.",
             )
     return path
 
 
 def _person(results: Results) -> tuple[str, str]:
-    """Name and id on a report."""
+    """Return name and id of the student on a report."""
     student = getattr(results, "student", None)
-    return NOBODY if student is None else (student.name, student.id)
+    return NO_PERSON if student is None else (student.name, student.id)
 
 
 def web_page(output: Path | None, default: Path) -> Path:
-    """Where a web page goes.
+    """Return the path of a web page.
 
     Raises
     ------
     OutputError
-        The name does not end as that of a web page, or as :func:`check_targets` says.
+        The name does not end in .html or .htm; also errors of :func:`check_targets`.
     """
     target = output or default
     if target.suffix.lower() not in (".html", ".htm") and target != STANDARD_OUTPUT:
-        raise OutputError(f"{target}: a web page. Give a name that ends in .html with -o.")
+        raise OutputError(f"{target}: the output is a web page. Give a name ending in .html (-o).")
     check_targets([target])
     return target
 
 
 def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
-    """Where a report and its results go: the results beside it, unless --json names a file.
+    """Return the paths of a report and its results, which are beside it unless --json names a file.
 
-    Of a report whose name will be found, what is known by now.
+    A report without -o is missing from the list: its name is determined later.
 
     Raises
     ------
     OutputError
-        The report is no PDF, or as :func:`check_targets` says.
+        The name does not end in .pdf; also errors of :func:`check_targets`.
     """
     if output is not None and output.suffix.lower() != ".pdf":
-        raise OutputError(f"{output}: the report is a PDF. Give a name that ends in .pdf with -o.")
+        raise OutputError(f"{output}: the output is a PDF. Give a name ending in .pdf (-o).")
     results_path = json_path
     if output is not None and json_path in (None, STANDARD_OUTPUT):
         results_path = output.with_suffix(".json")
@@ -188,17 +186,17 @@ def result_files(
     subject: object = None,
     step: ShowStep = show_nothing,
 ) -> dict[Path, bytes]:
-    """Results where --json says, and a document as a PDF that holds them and has them beside it.
+    """Return the contents of the results (JSON) and of the report (PDF) by their paths.
 
     Parameters
     ----------
     results : Struct or dict
     json_path, output : Path or None
-        As given with --json and -o.
+        Values of --json and -o.
     subject : object, optional
-        What the results are of, which is drawn.
+        Analysis that the report shows.
     step : callable
-        Told what is being done.
+        Shows the progress.
     """
     from px4fuse.results.contract import to_json
 
@@ -206,7 +204,7 @@ def result_files(
     if output is not None and subject is not None:
         from px4fuse.report.pdf import render
 
-        step("drawing the report")
+        step("writing the report")
         output, results_path = report_paths(output, json_path)
         contents |= {output: render(subject, results, text), results_path: text.encode()}
     if json_path is not None:
@@ -215,12 +213,12 @@ def result_files(
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write results.
+    """Write all outputs of a command and remember them for messages.
 
     Raises
     ------
     OutputError
-        As :func:`check_targets`, or a target cannot be written.
+        A target cannot be written; also errors of :func:`check_targets`.
     """
     check_targets(contents)
     written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_KEY, [])
@@ -228,43 +226,43 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
 
 
 def written_so_far(context: click.Context) -> str:
-    """List the files that this run has written, for a run that ends early."""
+    """List the files that this run has written, for the message if it ends early."""
     written: list[Path] = context.meta.get(WRITTEN_KEY, [])
     return f"{written_before(written)}." if written else "nothing was written."
 
 
 def write_new(path: Path, content: bytes) -> None:
-    """Write a file that is not there yet, and say so.
+    """Write a file that does not exist yet, and print its name.
 
     Raises
     ------
     OutputError
-        It is there.
+        The file exists.
     """
     if path.exists():
-        raise OutputError(f"{path}: exists already; it was not overwritten. Give another name.")
+        raise OutputError(f"{path} exists and was not overwritten. Choose another name.")
     write_and_print({path: content})
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:
-    """Refuse outputs before the analysis.
+    """Reject impossible output paths before the analysis begins.
 
     Raises
     ------
     OutputError
-        Two targets are the same file, a target is a folder or one of the inputs so far, or its
+        Two targets are the same file, a target is a folder or an input of this command, or its
         path is not possible.
     """
     files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
     if len({file.resolve() for file in files}) < len(files):
-        raise OutputError("two outputs name the same file. Give each a name of its own.")
+        raise OutputError("two outputs have the same file name. Give each another name.")
     for target in files:
         try:
             if stat.S_ISDIR(target.stat().st_mode):
-                raise OutputError(f"{target}: is a folder. Give a file name.")
+                raise OutputError(f"{target} is a folder. Give a file name.")
         except FileNotFoundError:
             continue
-        except OSError as error:  # a name that is too long, a file in the place of a folder
+        except OSError as error:  # the name is too long, or a parent is a file
             raise OutputError(
                 f"{target} cannot be written ({error.strerror}). Choose another place."
             ) from error
@@ -277,10 +275,18 @@ def write_and_print(
     request: Request | None = None,
     written: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs; then print the results and the names of the files; open one on request.
+    """Write all outputs, print the results and the file names, and open one file if requested.
 
-    Nothing is told where the results have standard output to themselves. Commands in the words are
-    printed so that they run, where the request is given. ``written`` is what is there already.
+    Parameters
+    ----------
+    contents : mapping from Path to bytes
+        With standard output among the paths, nothing else is printed.
+    page : Page, optional
+        Results to print.
+    request : Request, optional
+        Completes the commands on the page, so that they can be pasted.
+    written : iterable of Path
+        Files that were written before.
     """
     from px4fuse.report.screen import print_line, show
 
@@ -300,10 +306,10 @@ def write_and_print(
 
 
 def terminal() -> Console:
-    """Standard output for people; a reader that has gone, as with ``| head``, is no error.
+    """Return a console on standard output; it raises BrokenPipeError if the reader has ended.
 
-    As wide as the terminal. In a pipe lines do not wrap, unless COLUMNS is their width, a number
-    above 0: a paragraph is one line.
+    Lines have the width of the terminal. In a pipe a paragraph is one line, unless the environment
+    variable COLUMNS gives the width.
     """
     from rich.console import Console
 

@@ -1,4 +1,4 @@
-"""``px4fuse practice``: flights with hidden mistakes, to find them by the knobs."""
+"""``px4fuse practice``: writes a quiz page with simulated flights and hidden mistakes."""
 
 import secrets
 import sys
@@ -12,7 +12,9 @@ from px4fuse.cli.outputs import OPEN_KEY, progress, web_page, write_and_print
 
 @click.command()
 @options("practice")
-@click.option("--open/--no-open", "opened", default=None, help="Open it.  [default: on a terminal]")
+@click.option(
+    "--open/--no-open", "opened", default=None, help="Open the page.  [default: on a terminal]"
+)
 @click.pass_context
 def practice(
     ctx: click.Context,
@@ -22,10 +24,10 @@ def practice(
     level: int = 1,
     flights: int = 10,
 ) -> None:
-    """Find what is wrong with simulated flights, ten in a row.
+    """Write a quiz page with simulated flights and hidden mistakes.
 
-    Simulates flights with hidden mistakes and writes one page: look, turn the knobs to prove it,
-    choose what is wrong, then see the truth. Practice, not an exam: the answers are in the page.
+    For each flight: inspect the plots, test a setting, choose the mistake, then see the solution.
+    For practice only: the page contains the solutions.
     """
     seed = secrets.randbelow(10**6) if seed is None else seed
     target = web_page(output, Path("reports", f"practice_{seed}.html"))

@@ -1,4 +1,4 @@
-"""``px4fuse sample``: the sample flights, to try things on."""
+"""``px4fuse sample``: writes the sample logs."""
 
 from pathlib import Path
 
@@ -13,12 +13,12 @@ INSTALL = 'pip install "px4fuse[samples]"'
 
 
 def sample_log() -> Path:
-    """The sample flight where no log is given: here if it is here, else the installed one.
+    """Return the path of the sample log, from ./sample_logs or else from the installed package.
 
     Raises
     ------
     MissingDataError
-        There is none.
+        The sample logs are not installed.
     """
     from importlib.resources import as_file, files
 
@@ -33,17 +33,17 @@ def sample_log() -> Path:
                 sample_path = installed
         except ModuleNotFoundError:
             raise MissingDataError(
-                "No log was given, and the sample flights are not installed.",
+                "No log was given, and the sample logs are not installed.",
                 f"Give a LOG, or run {INSTALL}.",
             ) from None
-    click.echo(f"No log was given: this is the sample flight, {SAMPLE}.", err=True)
+    click.echo(f"No log was given: the sample log {SAMPLE} is used.", err=True)
     return sample_path
 
 
 @click.command()
 @options("sample")
 def sample(output: Path = FOLDER) -> None:
-    """Write the sample flights: an aisle with UWB, a loop on visual-inertial odometry."""
+    """Write the sample logs (aisle with UWB, loop with VIO) to a folder."""
     from importlib.resources import files
 
     from px4fuse.errors import MissingDataError, OutputError
@@ -51,10 +51,10 @@ def sample(output: Path = FOLDER) -> None:
     from px4fuse.request import ComparisonRequest, command_line
 
     try:
-        flights = [one for one in files("px4fuse_samples").iterdir() if one.is_file()]
+        logs = [file for file in files("px4fuse_samples").iterdir() if file.is_file()]
     except ModuleNotFoundError:
-        raise MissingDataError("the sample flights are not installed", f"Run {INSTALL}.") from None
-    contents = {output / one.name: one.read_bytes() for one in sorted(flights, key=str)}
+        raise MissingDataError("the sample logs are not installed", f"Run {INSTALL}.") from None
+    contents = {output / file.name: file.read_bytes() for file in sorted(logs, key=str)}
     for path, content in contents.items():
         if path.is_file() and path.read_bytes() != content:
             raise OutputError(
@@ -64,5 +64,5 @@ def sample(output: Path = FOLDER) -> None:
     first = next(path for path in contents if path.suffix == ".ulg")
     command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
     page = Page()
-    page.add("command", text=command, label="Next")
+    page.add("command", text=command, label="Run")
     write_and_print(contents, page)

@@ -1,4 +1,4 @@
-"""``px4fuse simulate``: flights with known truth and chosen mistakes."""
+"""``px4fuse simulate``: flights with known ground truth and chosen mistakes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _DEFAULT = Scenario()
 MIXED = "mixed"
 OUTDOOR: Kind = "outdoor"
 SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
-# What goes with --assignment, and what goes with nothing else
+# Options that require --assignment, and all options that are allowed with it
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes", "preview")
 ASSIGNMENT_OPTIONS = (
     "output",
@@ -49,7 +49,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 
 
 def _scenario_options(command: Command) -> Command:
-    """The options that set a real number of the scenario; its field has the default and help."""
+    """Add an option for each number of the scenario; its field has the default and the help."""
     for field, quantity in reversed(quantities(Scenario).items()):
         if not quantity.meaning:
             continue
@@ -62,11 +62,11 @@ def _scenario_options(command: Command) -> Command:
 
 
 class WithMistakes(click.Command):
-    """A command whose help ends with the table of mistakes."""
+    """Command whose help ends with the table of mistakes."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the mistakes."""
-        with formatter.section("Mistakes (without =VALUE: a clear case)"):
+        """Add the table of mistakes to the help."""
+        with formatter.section("Mistakes [value without =VALUE]"):
             formatter.write_dl(
                 [
                     (
@@ -98,15 +98,15 @@ def simulate(
     yaw: Yaw | None,
     **chosen: Any,
 ) -> None:
-    """Simulate a flight with known truth and chosen mistakes, for exercises and exams.
+    """Simulate a flight with known ground truth and chosen mistakes.
 
-    Writes a PX4 ULog that every px4fuse command reads. It says that it was simulated but not which
-    mistakes were made, so that it can be handed out; with ground truth, unless --no-truth. Its
-    EKF2 is px4fuse's model of EKF2, not PX4's, and the log says so.
+    Writes a PX4 ULog for exercises and exams, with ground truth unless --no-truth. The log states
+    that it is simulated, but not which mistakes it contains. EKF2 in it is px4fuse's model, not
+    PX4's code.
 
     For example, px4fuse simulate -o s07.ulg --seed 7 --mistake nlos=5% --answer s07.json
 
-    With --assignment every student of a class gets a flight:
+    With --assignment, writes one flight per student:
     px4fuse simulate --assignment roster.csv -o flights
     """
     _check_options(assignment)
@@ -119,7 +119,7 @@ def simulate(
     if kind == MIXED:
         raise SettingsError(f"--kind {MIXED} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
-        raise OutputError(f"{output}: the log is a ULog. Give a name that ends in .ulg with -o.")
+        raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_targets([output, answer])
     parsed = parse(mistake)
     chosen |= {"seed": seed, "passes": passes, "yaw": yaw}
@@ -133,7 +133,7 @@ def simulate(
     from px4fuse.simulation import flights
 
     with progress() as step:
-        step("flying")
+        step("simulating")
         simulation = flights.simulate(scenario, parsed)
         step("writing the log")
         contents = {output: flights.to_ulog(simulation)}
@@ -143,7 +143,7 @@ def simulate(
 
 
 def _check_options(assignment: Path | None) -> None:
-    """Refuse options that do not go together."""
+    """Reject options that cannot be combined."""
     if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR:
         raise SettingsError(
             f"--kind {OUTDOOR} is not available with --assignment.",
@@ -152,10 +152,8 @@ def _check_options(assignment: Path | None) -> None:
     for parameter in typed_parameters():
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
-                (
-                    f"{parameter.opts[0]} is not available with --assignment, which draws it for "
-                    "each student."
-                ),
+                f"{parameter.opts[0]} is not available with --assignment, which draws it at random "
+                "for each student",
                 "Omit it.",
             )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:
@@ -185,7 +183,7 @@ def _write_assignment(
     truth: bool,
     preview: bool,
 ) -> None:
-    """Write a flight for everyone and the answer key, or only say what would be drawn."""
+    """Write one flight per student and the answer key, or only print what would be drawn."""
     from px4fuse.assignment import assignment
     from px4fuse.assignment.drawing import EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     from px4fuse.assignment.roster import read_roster
@@ -198,20 +196,20 @@ def _write_assignment(
     drawn_flights: list[tuple[tuple[str, ...], float | None]]
     if preview:
         previews = assignment.preview(students, key_file, secret, kind, count)
-        drawn_flights = [(one.typed, one.difficulty) for one in previews]
+        drawn_flights = [(drawing.typed, drawing.difficulty) for drawing in previews]
         rows = [
             (
                 student.student_id,
                 student.name,
-                one.scenario.kind,
-                " ".join(one.typed) or "none",
-                f"{one.difficulty:.2f}",
+                drawing.scenario.kind,
+                " ".join(drawing.typed) or "none",
+                f"{drawing.difficulty:.2f}",
             )
-            for student, one in zip(students, previews, strict=True)
+            for student, drawing in zip(students, previews, strict=True)
         ]
         page.table(("student", "name", "flight", "mistakes", "difficulty"), rows, right=(4,))
         ends["Preview"] = (
-            "Nothing was written. Not for students: this says what is wrong in every flight."
+            "nothing was written. Not for students: the table lists the mistakes of each flight."
         )
     else:
         with progress() as step:
@@ -222,24 +220,24 @@ def _write_assignment(
         drawn_flights = [(answer.mistakes, answer.difficulty) for answer in key.answers]
         at, key_at = (to_one_line(str(path)) for path in (folder, key_file))
         existing_count = len(drawn_flights) - written
-        ends["Flights"] = f"{at} ({written} written, {existing_count} were there already)"
-        ends["Answers"] = f"{key_at} (not for students: it says what is wrong in every flight)"
+        ends["Flights"] = f"{at} ({written} written, {existing_count} existed already)"
+        ends["Answers"] = f"{key_at} (not for students: it lists the mistakes of each flight)"
         if key.secret:
             ends["Secret"] = (
-                "made up, and kept in the answers: the same flights can be made again, and later "
-                "students added, while that file is there"
+                "generated, and stored in the answers. With that file the same flights can be "
+                "written again, and students can be added later."
             )
     counts = Counter(
-        one.partition("=")[0] for typed, _ in drawn_flights for one in typed or ("none",)
+        mistake.partition("=")[0] for typed, _ in drawn_flights for mistake in typed or ("none",)
     )
     difficulties = [difficulty for _, difficulty in drawn_flights if difficulty is not None]
     page.advice(
         {
             "Class": f"{len(drawn_flights)} student{'s' * (len(drawn_flights) != 1)}, {kind}",
             "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
-            "How hard": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
-            f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g} for everyone: the smallest size that px4fuse finds in 19 "
-            "of 20 flights over the size that was drawn, of the hardest mistake",
+            "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
+            f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g}: size that px4fuse detects in 19 "
+            "of 20 flights, divided by the drawn size, for the most difficult mistake",
             **ends,
         }
     )
@@ -247,7 +245,7 @@ def _write_assignment(
 
 
 def _page(simulation: Simulation, answer: Path | None) -> Page:
-    """What was simulated."""
+    """Describe the simulated flight for the terminal."""
     from px4fuse.report.page import Page
 
     scenario, page = simulation.scenario, Page()
@@ -270,9 +268,9 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
         f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names
     ]
     page.labelled("Mistakes", *(mistake_texts or ["none"]))
-    page.labelled("Truth", "in the log" if scenario.truth else "not in the log")
-    none = "none: there is nothing of it in the log"
-    page.labelled("EKF2", "px4fuse's model of it" if scenario.ekf2 else none)
+    page.labelled("Truth", "logged" if scenario.truth else "not logged")
+    none = "not simulated and not in the log"
+    page.labelled("EKF2", "px4fuse's model of EKF2" if scenario.ekf2 else none)
     if answer is not None:
         page.labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
     return page

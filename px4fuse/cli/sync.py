@@ -1,4 +1,4 @@
-"""``px4fuse sync``: the clock offset between position source and IMU."""
+"""``px4fuse sync``: time offset between position source and IMU."""
 
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ from px4fuse.cli.outputs import check_targets, progress, result_files, write_and
 @analysis_options
 @json_option
 def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
-    """Estimate what must be added to the position source's time stamps, with its interval.
+    """Estimate the time offset between position source and IMU.
 
-    From the acceleration that the IMU felt; EKF2 and its attitude are not asked. LOG is a PX4 ULog
-    or a MAVLink recording.
+    Estimates the seconds to add to the timestamps of the position source, with a 95 % interval,
+    from IMU and positions alone (EKF2's attitude is not used). LOG is a PX4 ULog or a MAVLink
+    recording.
     """
     from px4fuse.analysis import prepare_comparison
     from px4fuse.comparison.estimates import noises_and_clock
@@ -41,7 +42,8 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
             else advice["Next"].capitalize()
         )
         raise MissingDataError(
-            f"{name}: no clock offset could be determined: {clock_result.reason}", remedy
+            f"{name}: the time offset cannot be estimated from this flight ({clock_result.reason})",
+            remedy,
         )
     results = sync_results(request, compared, clock_result)
     page = Page()

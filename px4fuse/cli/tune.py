@@ -1,4 +1,4 @@
-"""``px4fuse tune``: the noises that the data ask for."""
+"""``px4fuse tune``: maximum-likelihood estimates of SIGMA_A and SIGMA_Z."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ TUNING_HEAD = (
     "lag 1\nbefore after",
 )
 TUNING_NOTE = (
-    "gain: log-likelihood per measurement above the chosen settings; held out: the same on "
-    "the second half, tuned on the first; lag 1: autocorrelation of the innovations."
+    "gain: increase of the log-likelihood per measurement over the chosen settings. held out: gain "
+    "on the second half of the data with noises estimated on the first half. lag 1: "
+    "autocorrelation of the innovations."
 )
 
 
@@ -35,10 +36,10 @@ TUNING_NOTE = (
 @analysis_options
 @json_option
 def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
-    """Find the SIGMA_A and SIGMA_Z of greatest likelihood, with their 95 % intervals.
+    """Estimate SIGMA_A and SIGMA_Z by maximum likelihood.
 
-    --sigma-a and --sigma-z are what they are compared with. LOG is a PX4 ULog or a MAVLink
-    recording.
+    Prints the maximum-likelihood estimates with 95 % intervals, and compares them with --sigma-a
+    and --sigma-z. LOG is a PX4 ULog or a MAVLink recording.
     """
     from px4fuse.analysis import prepare_comparison
     from px4fuse.comparison.estimates import tuned as tuned_noises
@@ -55,17 +56,19 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     ]
     if len(missing) == len(tuned):
         name, reason = compared.flight.log.name, missing[0].reason
-        raise MissingDataError(f"{name}: no noise could be determined: {reason}", missing[0].remedy)
+        raise MissingDataError(
+            f"{name}: SIGMA_A and SIGMA_Z cannot be estimated: {reason}", missing[0].remedy
+        )
     results = tuning_results(request, compared, tuned)
     write_and_print(result_files(results, json_path), _page(compared, tuned), request)
 
 
 def noise_text(noise: Noise) -> str:
-    """Format a noise and its 95 % interval, without the unit."""
+    """Format a noise estimate and its 95 % interval, without the unit."""
     if noise.value is None:
         ends = (("at most", noise.high), ("at least", noise.low))
-        known = (f"{word} {end:.2g}" for word, end in ends if end is not None)
-        return next(known, "not determinable")
+        bounds = (f"{word} {end:.2g}" for word, end in ends if end is not None)
+        return next(bounds, "not identifiable")
     low = "0" if noise.low is None else f"{noise.low:.2g}"
     high = "?" if noise.high is None else f"{noise.high:.2g}"
     return f"{noise.value:.3g} ({low}-{high})"
@@ -83,9 +86,9 @@ def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> P
             continue
         validation, consistencies = tuning.held_out, (tuning.before, tuning.after)
         lags = [
-            f"{one.lag1_autocorrelation:+.2f}"
-            for one in consistencies
-            if not isinstance(one, Unavailable)
+            f"{consistency.lag1_autocorrelation:+.2f}"
+            for consistency in consistencies
+            if not isinstance(consistency, Unavailable)
         ]
         lag_text = " ".join(lags) if len(lags) == len(consistencies) else ""
         gain = "" if isinstance(validation, Unavailable) else f"{validation.gain_nats:+.3f}"

@@ -1,4 +1,4 @@
-"""``px4fuse verify``: whether a report's numbers are what its log gives, and the report redrawn."""
+"""``px4fuse verify``: repeats the analysis of a report and compares all numbers and pages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from px4fuse.verification.model import Verdict
 
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
-# A flight of ten minutes takes about one; what takes longer than this was made to
+# s; the analysis of a flight of 10 minutes takes about 60 s
 TIMEOUT_S = 1800.0
 
 
@@ -29,22 +29,19 @@ TIMEOUT_S = 1800.0
 @click.argument("report", type=InputPath(), metavar="REPORT.pdf")
 @click.argument("logs", type=InputPath(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@report_options("Write the report, drawn again from the log.")
+@report_options("Write the report again, from the log.")
 @open_option
 def verify(
     report: Path, logs: tuple[Path, ...], output: Path | None, json_path: Path | None
 ) -> None:
-    """Check that the numbers of REPORT.pdf are what its log gives, and draw the report again.
+    """Verify that the numbers of REPORT.pdf follow from its log.
 
-    LOG is the flight log and whatever was read besides it, or folders of such; they are found by
-    their SHA-256. The analysis is run again with the recorded settings. REPORT.pdf is compared
-    with the redrawn report part by part; differences are listed: read the redrawn report (-o).
-    Without LOG nothing is verified.
+    LOG is the flight log with all files used besides it, or folders with them; px4fuse finds them
+    by SHA-256. Repeats the analysis with the recorded settings and lists numbers and pages that
+    differ; -o writes the report again from the log. Verifies the numbers, not the author. Without
+    LOG nothing is verified.
 
-    This proves that the numbers belong to the log, not who wrote them.
-
-    Exit code 0: verified; 1: numbers differ, page differs, other log, or cannot verify; 2: bad
-    input.
+    Exit code 0: verified; 1: differences, other log or not verifiable; 2: invalid input.
     """
     from px4fuse.verification.intake import MAX_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
@@ -57,8 +54,8 @@ def verify(
         files = files_by_sha256(logs)
         check_targets([json_path, output])
         if logs and not files:
-            raise LogError("there is no file in what was given as LOG.")
-        step("running the analysis again")
+            raise LogError("LOG contains no files. Give the flight log or its folder.")
+        step("repeating the analysis")
         verdict = run_one_bounded(partial(verify_report, pdf=content, logs=files), read, TIMEOUT_S)
     if isinstance(verdict, JobFailure):
         raise LogError(f"{display_name(report)}: cannot be verified: {verdict.reason}")
@@ -72,7 +69,7 @@ def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
     from px4fuse.verification.verification import LIMIT
 
     values = asdict(verdict)
-    for name in ("redrawn", "remedy", "missing"):  # which are for whoever grades a class
+    for name in ("redrawn", "remedy", "missing"):  # used by grade only
         del values[name]
     return {
         "schema": SCHEMA,
@@ -94,12 +91,16 @@ def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
     colour = colours.get(verdict.outcome, SEVERITY_COLOURS["error"])
     page.write(f"{one_line(name, 200)}: {verdict.outcome}", bold=True, colour=colour)
     sentences = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT]
-    sentences += [f"{d.path}: {d.recorded}, recomputed {d.recomputed}" for d in verdict.differences]
+    sentences += [
+        f"{d.path}: report {d.recorded}, re-computed {d.recomputed}" for d in verdict.differences
+    ]
     for text in sentences:
         page.write(text, indent=12.0)
     if output is not None and not verdict.redrawn:
-        page.write("Nothing was redrawn, since the analysis was not run again.")
+        page.write("The report was not re-created: the analysis was not repeated.")
     elif output is None and verdict.pages:
-        page.write("Read the redrawn report instead: -o writes it.")
+        page.write(
+            "Action: write the report again from the log with -o FILE.pdf, and read that one."
+        )
     page.write(LIMIT, colour=MUTED_COLOUR)
     return page

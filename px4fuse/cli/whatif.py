@@ -1,4 +1,4 @@
-"""``px4fuse whatif``: what EKF2 would have done with other parameters."""
+"""``px4fuse whatif``: replays EKF2 with changed parameters."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ def whatif(
     json_path: Path | None,
     **option_values: Any,
 ) -> None:
-    """Replay EKF2 from LOG as flown and with other parameters, side by side.
+    """Replay EKF2 with changed parameters.
 
-    By a model of EKF2 that is started from the log, and believed only where it reproduces what EKF2
-    logged. For example, px4fuse whatif log.ulg --set EKF2_EVP_NOISE=0.1. Without
-    --set, --sweep and --without, with the measurement noise and the delay that the data ask for
-    (see tune and sync). --without gnss_pos --from 60 goes on from there without that aid.
+    Replays EKF2 from LOG as flown and with the changes, side by side. Uses px4fuse's model of EKF2
+    and reports results only if the model reproduces the logged innovations. For example,
+    px4fuse whatif log.ulg --set EKF2_EVP_NOISE=0.1. Without --set, --sweep and --without, uses the
+    maximum-likelihood noise and delay (see tune and sync). --without gnss_pos --from 60 removes
+    GNSS positions from 60 s on.
     """
     from px4fuse.analysis import run_what_if
     from px4fuse.report.whatif import summary
@@ -43,7 +44,7 @@ def whatif(
 
     outputs.check_targets([json_path])
     if since is not None and not without:
-        raise SettingsError("--from says when --without begins: give that too.")
+        raise SettingsError("--from requires --without AID.")
     request = WhatIfRequest(
         log=str(log),
         changes=_parse_changes(changes),
@@ -62,9 +63,11 @@ def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
-            raise SettingsError(f"--set {text}: give NAME=VALUE, for example EKF2_EVP_NOISE=0.1.")
+            raise SettingsError(
+                f"--set {text} is not NAME=VALUE. Give for example --set EKF2_EVP_NOISE=0.1."
+            )
         if name in changes:
-            raise SettingsError(f"--set {name} is given twice.")
+            raise SettingsError(f"--set {name} is given twice. Give it once.")
         changes[name] = _parse_number(f"--set {text}", name, value)
     return changes
 
@@ -91,5 +94,6 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
     except ValueError as error:
         unit = PARAMETERS[name].unit.replace("^2", "²") if name in PARAMETERS else ""
         parsed = in_unit(value, unit)
-        problem = " is not a number" if parsed is None else f": give {NAMES[unit]}, as {parsed:g}"
-        raise SettingsError(f"{option_text}: {value!r}{problem}.") from error
+        of_unit = f" in {NAMES[unit]}" if unit else ""
+        problem = "" if parsed is None else f"{of_unit}. Give {parsed:g}"
+        raise SettingsError(f"{option_text}: {value!r} is not a number{problem}.") from error

@@ -1,4 +1,4 @@
-"""Many logs: one table with a row per log and axis; and the differences between two."""
+"""Many logs in one table (``batch``), and differences between two (``diff``)."""
 
-# For one log, by default
+# s; default time limit for one log
 TIMEOUT_S = 600.0

@@ -1,4 +1,4 @@
-"""Settings, numbers and findings that differ between two comparisons: ``px4fuse diff``."""
+"""Differences between two comparisons in settings, numbers and findings: ``px4fuse diff``."""
 
 import math
 import shlex
@@ -19,11 +19,11 @@ from px4fuse.plain import format_factor, format_number
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
-# Limits of √(mean NEES) of a consistent filter, as a factor; errors of one flight are correlated,
-# so that no 95 % band is known
+# Limit of √(mean NEES) of a consistent filter, and its inverse. The errors of one flight are
+# correlated, so there is no 95 % band
 NEES_SIGMA_OFF = 1.5
 NAMES = {"kf": "KF", "ekf2": "EKF2"}
-# Settings and facts about the flight, and their path in the results
+# Settings and flight data that diff compares, with their path in the results
 SETTINGS = {
     "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
     "SIGMA_Z (m)": "settings.sigma_z_m",
@@ -48,15 +48,15 @@ def diff(
     Parameters
     ----------
     a, b : str or Path
-        Each a flight log, a report of ``px4fuse compare`` or its results as JSON. A log is
-        analysed with the settings of the other one's results, if there are any.
+        Flight logs, reports of ``px4fuse compare`` or results as JSON. A log is
+        analysed with the settings of the other report or results, if there is one.
     progress : callable
         Receives the name of each step.
 
     Raises
     ------
     LogError, MissingDataError, ResultsError
-        A file cannot be read, is not of ``px4fuse compare``, or both are the same.
+        A file cannot be read, is not from ``px4fuse compare``, or both are the same file.
     """
     return changes(*read_inputs(Path(a), Path(b), progress))
 
@@ -88,26 +88,26 @@ def _compared(side: DiffInput) -> contract.Compared:
 
 
 def _settings(a: Results, b: Results) -> Iterator[contract.SettingChange]:
-    """Settings, facts about the flight and parameters of PX4 that differ."""
-    one, other = (
-        {what: at(side, place) for what, place in SETTINGS.items()} | _parameters(side)
-        for side in (a, b)
+    """Yield settings, flight data and PX4 parameters that differ."""
+    values_a, values_b = (
+        {name: at(results, path) for name, path in SETTINGS.items()} | _parameters(results)
+        for results in (a, b)
     )
-    for what in {**one, **other}:
-        if (first := one.get(what)) != (second := other.get(what)):
-            yield contract.SettingChange(what, first, second)
+    for name in {**values_a, **values_b}:
+        if (first := values_a.get(name)) != (second := values_b.get(name)):
+            yield contract.SettingChange(name, first, second)
 
 
-def _parameters(found: Results) -> dict[str, float]:
-    """Parameters of PX4 in the log, and those of the EKF2 replay, to six digits (float32)."""
-    known = (at(found, "ekf2_replay.settings") or {}) | dict(found.log.parameters)
-    return {name: float(f"{known[name]:.6g}") for name in sorted(known)}
+def _parameters(results: Results) -> dict[str, float]:
+    """Return the PX4 parameters of log and EKF2 replay, rounded to 6 digits (logged as float32)."""
+    parameters = (at(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
+    return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
 
 def number_changes(
     first: Mapping[str, Number], second: Mapping[str, Number]
 ) -> Iterator[contract.NumberChange]:
-    """Numbers that differ, and those that only one side has.
+    """Yield the numbers that differ, and those that only one side has.
 
     Parameters
     ----------
@@ -124,12 +124,12 @@ def number_changes(
             )
         ):
             continue
-        known = a or b
-        assert known is not None
+        number = a or b
+        assert number is not None
         yield contract.NumberChange(
             path=path,
-            label=known.label,
-            unit=known.unit,
+            label=number.label,
+            unit=number.unit,
             a=None if a is None else a.value,
             b=None if b is None else b.value,
             a_interval=None if a is None else a.interval,
@@ -138,42 +138,48 @@ def number_changes(
 
 
 def _findings(a: Results, b: Results) -> Iterator[contract.FindingChange]:
-    """Findings that only one of the two has, by id and severity."""
+    """Yield the findings that only one of the two has, compared by id and severity."""
     both: tuple[tuple[Results, Results, contract.Which], ...]
     both = ((b, a, "B"), (a, b, "A"))
-    for mine, other, only_in in both:
-        known = {(one.id, one.severity) for one in other.findings}
-        for one in mine.findings:
-            if (one.id, one.severity) not in known:
-                yield contract.FindingChange(one.id, one.severity, one.message, only_in)
+    for results, other, only_in in both:
+        ids = {(finding.id, finding.severity) for finding in other.findings}
+        for finding in results.findings:
+            if (finding.id, finding.severity) not in ids:
+                yield contract.FindingChange(finding.id, finding.severity, finding.message, only_in)
 
 
 def _worse(a: Results, b: Results, findings: Iterable[contract.FindingChange]) -> Iterator[str]:
-    """Verdicts that are worse in B, a sentence each."""
+    """Yield a sentence for each verdict that is worse in B, and for each new error."""
     before, after = _verdicts(a), _verdicts(b)
-    for what, (was, was_consistent) in before.items():
-        value, consistent = after.get(what, (was, True))
-        if was_consistent and not consistent:
-            ratio = value**0.5
-            off = f"{format_factor(max(ratio, 1.0 / ratio))} times too"
-            said = (
-                f"overconfident, σ {off} small" if ratio > 1.0 else f"underconfident, σ {off} large"
+    for name, (value_a, was_consistent) in before.items():
+        value_b, is_consistent = after.get(name, (value_a, True))
+        if was_consistent and not is_consistent:
+            ratio = value_b**0.5
+            factor = f"{format_factor(max(ratio, 1.0 / ratio))} times too"
+            verdict = (
+                f"overconfident, σ {factor} small"
+                if ratio > 1.0
+                else f"underconfident, σ {factor} large"
             )
-            yield f"{what}: {format_number(was)} (consistent) → {format_number(value)} ({said})."
-    errors = [one.id for one in findings if (one.only_in, one.severity) == ("B", "error")]
+            values = f"{format_number(value_a)} (consistent) → {format_number(value_b)}"
+            yield f"{name}: {values} ({verdict})."
+    errors = [
+        finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")
+    ]
     for error in dict.fromkeys(errors):
         yield f"New finding of severity error: {error}."
 
 
-def _verdicts(found: Results) -> dict[str, tuple[float, bool]]:
-    """Mean NIS and mean NEES by filter and axis, and True if consistent."""
+def _verdicts(results: Results) -> dict[str, tuple[float, bool]]:
+    """Return mean NIS and mean NEES by filter and axis, each with True if consistent."""
     verdicts: dict[str, tuple[float, bool]] = {}
-    for axis, result in (at(found, "axes") or {}).items():
+    for axis, result in (at(results, "axes") or {}).items():
         for name, label in NAMES.items():
-            one = result.filters[name]
-            if isinstance(one, FilterSummary):
-                verdicts[f"Mean NIS of {label}, {axis}"] = one.nis_mean, not is_inconsistent(one)
-            if (nees := at(one, "truth.nees_position_mean")) is not None:
+            summary = result.filters[name]
+            if isinstance(summary, FilterSummary):
+                is_consistent = not is_inconsistent(summary)
+                verdicts[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
+            if (nees := at(summary, "truth.nees_position_mean")) is not None:
                 consistent = NEES_SIGMA_OFF**-2 <= nees <= NEES_SIGMA_OFF**2
                 verdicts[f"Mean NEES of {label}, {axis}"] = nees, consistent
     return verdicts

@@ -1,7 +1,7 @@
-"""Jobs in bounded processes of this computer, or spread by Dask over a cluster.
+"""Execution of jobs on this computer or on a Dask cluster.
 
-Either way a job runs in a process of :mod:`px4fuse.workers`, which may hang, crash or
-take all memory: a cluster's workers only start these.
+Each job runs in a process of :mod:`px4fuse.workers`, with limits of time and memory; the workers of
+a cluster start these processes.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from px4fuse.workers import Job, JobFailure, Result
 if TYPE_CHECKING:
     from distributed import Client
 
-CONNECT_S = 15.0
-# Jobs that a cluster's worker takes at once: to import what they need takes a process 2 s
+CONNECT_S = 15.0  # s to wait for the scheduler
+# Jobs per Dask task: the imports of a process take 2 s, so several jobs share one process
 JOBS_PER_TASK = 4
 
 
 @contextmanager
 def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
-    """A client of the cluster that does the work; None where this computer does it.
+    """Connect to a Dask cluster; yields None if this computer does the work.
 
     Parameters
     ----------
     scheduler : str, optional
-        Address of a Dask scheduler that runs; without one, the client that this session has, as in
-        a notebook, or none.
+        Address of a running Dask scheduler; by default the Dask client of this Python session, if
+        there is one.
 
     Raises
     ------
     SettingsError
-        Dask is not installed, the scheduler does not answer or has no workers, or its workers
-        have another px4fuse.
+        Dask is not installed, the scheduler does not answer or has no workers, or a worker
+        has another version of px4fuse.
     """
     if scheduler is None:
         client = _session_client()
@@ -57,14 +57,14 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
             "--scheduler requires Dask.", 'Run pip install "px4fuse[batch]".'
         ) from error
     try:
-        # one that fails must not become the session's own
+        # a failed client must not become the default client of this session
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SettingsError(
             f"--scheduler {scheduler}: no Dask scheduler answers ({one_line(str(error), 120)}).",
             "Start one with: dask scheduler",
         ) from error
-    # a scheduler that goes is said here, in one line: Dask would print its tracebacks
+    # without this, Dask prints tracebacks when the scheduler ends
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
         _check(client)
         yield client
@@ -77,13 +77,13 @@ def _session_client() -> Client | None:
 
     try:
         client: Client = default_client()
-    except ValueError:  # this session has none
+    except ValueError:  # this session has no client
         return None
     return client
 
 
 def _check(client: Client) -> None:
-    """Refuse workers that cannot do this work."""
+    """Raise an error if the cluster has no workers or other versions of px4fuse."""
     address = client.scheduler_info()["address"]
     try:
         client.wait_for_workers(1, timeout=CONNECT_S)
@@ -108,21 +108,21 @@ def run_jobs(
     jobs: Sequence[Job],
     processes: int | None = None,
 ) -> Generator[tuple[Job, Result | JobFailure]]:
-    """What comes of every job, as it comes.
+    """Yield each job with its result, in the order in which jobs finish.
 
     Parameters
     ----------
     client : Client or None
-        Of a cluster; None for processes of this computer.
+        Client of a cluster; None for processes of this computer.
     work : callable
-        :func:`~px4fuse.workers.run_bounded` with its function and bounds.
+        :func:`~px4fuse.workers.run_bounded` with its function and limits.
     processes : int, optional
-        At once on this computer; by default one per core.
+        Parallel processes on this computer; by default the number of cores.
 
     Raises
     ------
     Px4FuseError
-        The cluster is gone.
+        The connection to the scheduler was lost.
     """
     if client is None:
         for index, result in work(jobs, processes=processes):
@@ -138,8 +138,8 @@ def run_jobs(
         for future in as_completed(list(futures)):
             chunk = futures.pop(future)
             if future.status not in ("finished", "error"):
-                raise Px4FuseError("the scheduler is gone.")
-            error = future.exception()  # its worker ended several times, or cannot load the job
+                raise Px4FuseError("the connection to the Dask scheduler was lost.")
+            error = future.exception()  # the worker ended several times, or cannot load the job
             failed = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
             results = [failed] * len(chunk) if error else future.result()
             yield from zip(chunk, results, strict=True)
@@ -149,8 +149,8 @@ def run_jobs(
 
 
 def _run_several(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
-    """What a cluster's worker does: some jobs, one by one in a process apart from its own."""
-    # by Dask's default a worker's process is a daemon, which may have no children
+    """Run some jobs one by one in a separate process, on a worker of a cluster."""
+    # the process of a Dask worker is a daemon by default, which must not have children
     multiprocessing.current_process().daemon = False
     results_by_index = dict(work(jobs, processes=1))
     return [results_by_index[index] for index in range(len(jobs))]

@@ -1,4 +1,4 @@
-"""What ``diff`` compares: a log, the results attached to a report, or results as JSON."""
+"""Inputs of ``diff``: a log, a report with its attached results, or results as JSON."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,15 +21,14 @@ from px4fuse.verification.intake import attached_results
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# A log is analysed with these settings of the other one's results, and with more of them where
-# they are of the same log
+# Settings of the other input with which a log is analysed; the second list only for the same log
 _FILTER_FIELDS = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
 _SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
 
 
 @dataclass(frozen=True)
 class DiffInput:
-    """One of two comparisons; ``given`` is the name of the file."""
+    """One of the two inputs of diff; ``given`` is the file name."""
 
     given: str
     kind: Kind
@@ -39,18 +38,18 @@ class DiffInput:
 def read_inputs(
     a: Path, b: Path, progress: Progress = lambda _: None
 ) -> tuple[DiffInput, DiffInput]:
-    """Read both; a log is analysed with the settings of the other one's results, if it has some.
+    """Read both inputs; a log is analysed with the settings of the other input's results.
 
     Raises
     ------
     LogError, MissingDataError
-        A log cannot be read, or nothing of it can be judged.
+        A log cannot be read, or does not contain the required data.
     ResultsError
-        A report or results cannot be read, are not of ``px4fuse compare``, or both are one file.
+        An input cannot be read, is not from ``px4fuse compare``, or both are the same file.
     """
     first, second = (_read_attached(path) for path in (a, b))
     if a.samefile(b):
-        raise ResultsError(f"{display_name(a)}: A and B are the same file. Give two.")
+        raise ResultsError(f"{display_name(a)}: A and B are the same file. Give two files.")
     return (
         first or _analyse_log(a, second, progress),
         second or _analyse_log(b, first, progress),
@@ -58,7 +57,7 @@ def read_inputs(
 
 
 def _read_attached(path: Path) -> DiffInput | None:
-    """The results in a file; None of a log."""
+    """Read the results from a report or a JSON file; None for a log."""
     name, head = display_name(path), read_head(path, 64, LogError)
     is_report = head.startswith(b"%PDF-")
     if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
@@ -66,13 +65,13 @@ def _read_attached(path: Path) -> DiffInput | None:
     limit = MAX_REPORT_BYTES if is_report else MAX_RESULTS_BYTES
     advice = "Reports are below 2 MB" if is_report else "Give results of px4fuse compare"
     content = read_bytes_limited(path, ResultsError, limit, size_remedy=advice)
-    found = (attached_results if is_report else read_results)(content, name)
-    if not isinstance(found, Results):
+    results = (attached_results if is_report else read_results)(content, name)
+    if not isinstance(results, Results):
         raise ResultsError(
-            f"{name} contains {found.schema.name}, which px4fuse diff cannot compare. "
+            f"{name} contains {results.schema.name}, which px4fuse diff cannot compare. "
             "Give a log, or a report or results of px4fuse compare."
         )
-    return DiffInput(name, "report" if is_report else "results", found)
+    return DiffInput(name, "report" if is_report else "results", results)
 
 
 def _analyse_log(path: Path, other: DiffInput | None, progress: Progress) -> DiffInput:
@@ -84,7 +83,7 @@ def _analyse_log(path: Path, other: DiffInput | None, progress: Progress) -> Dif
             request, **{name: getattr(other.results.request, name) for name in fields}
         )
     result = run_or_evaluate_aids(request, progress)
-    text = to_json(outcome_results(request, result))  # the same digits as in a report
+    text = to_json(outcome_results(request, result))  # rounds numbers as in a report
     results = read_results(text.encode())
     assert isinstance(results, Results)
     return DiffInput(display_name(path), "log", results)

@@ -1,4 +1,4 @@
-"""What a worker does with one log: reads it where it lies and gives back rows and files."""
+"""Job of a worker: reads one log and returns its rows, results and report."""
 
 import re
 from dataclasses import dataclass
@@ -8,27 +8,27 @@ import msgspec
 
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError
 from px4fuse.fleet.logs import local_file
-from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, axis_rows, finding_columns, log_columns
+from px4fuse.fleet.rows import FAILED, NOT_COMPARED, Row, axis_rows, finding_columns, log_columns
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.request import ComparisonRequest, with_options
 
 
 @dataclass(frozen=True)
 class Job:
-    """One log and what to do with it.
+    """Log to compare, with the settings and limits.
 
     Attributes
     ----------
     address : str
         Absolute path or URL.
     request : ComparisonRequest
-        Its settings count.
+        Settings of the analysis; its log is replaced by ``address``.
     reports : bool
-        Whether the PDF is made too.
+        True to write the PDF report, too.
     max_bytes : int
-        Largest log that is read.
+        Maximum size of a log (bytes).
     known : frozenset of str
-        SHA-256 of logs of this size that need not be compared again.
+        SHA-256 of logs of this size whose results exist already.
     """
 
     address: str
@@ -40,16 +40,16 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one log.
+    """Rows, results and report of one log.
 
     Attributes
     ----------
     sha256 : str
-        Of the log; empty where it could not be read.
+        SHA-256 of the log; empty if it could not be read.
     rows : tuple of Row
-        An axis each; one where the log could not be compared, none where it is known.
+        One per axis; one if the log could not be compared; none if its results exist already.
     results, report : bytes
-        JSON and PDF; empty where there is none.
+        JSON and PDF; empty if not written.
     """
 
     sha256: str
@@ -64,7 +64,7 @@ def analyse(job: Job) -> Outcome:
     Returns
     -------
     Outcome
-        Also of a log that cannot be compared: its one row says why.
+        For a log that cannot be compared, one row with the reason.
     """
     sha256 = ""
     max_log_bytes.set(job.max_bytes)
@@ -75,21 +75,21 @@ def analyse(job: Job) -> Outcome:
                 return Outcome(sha256)
             outcome = _compare_log(job, path, sha256)
             if _sha256(path) != sha256:
-                again = "Run the same command again when it is complete."
-                raise LogError("it changed while it was read", again)
+                remedy = "Run the same command again when the file is complete."
+                raise LogError("the file changed while it was read", remedy)
             return outcome
     except Px4FuseError as error:
         return Outcome(sha256, (refused_row(error, FAILED) | {"log_sha256": sha256},))
 
 
 def refused_row(error: Px4FuseError, status: str, name: str = "") -> Row:
-    """The row of a log that could not be compared: what is wrong, and what to do."""
+    """Return the row of a log that could not be compared, with reason and action."""
     reason = with_options(error.reason).removeprefix(f"{name}: ")
     return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
 
 
 def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
-    # only workers need all of it
+    # imported here: only workers need these modules
     from px4fuse.analysis import AidsOnlyAnalysis, read_flight, run_or_evaluate_aids  # noqa: PLC0415
     from px4fuse.findings import find_aids  # noqa: PLC0415
     from px4fuse.results.build import log_record, results  # noqa: PLC0415
@@ -106,7 +106,7 @@ def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
             missing_data = MissingDataError(
                 analysis.missing_data.reason, analysis.missing_data.remedy
             )
-            return Outcome(sha256, (common | refused_row(missing_data, NOT_JUDGED, path.name),))
+            return Outcome(sha256, (common | refused_row(missing_data, NOT_COMPARED, path.name),))
         contract_results = results(request, analysis)
         text, report = to_json(contract_results), b""
         if job.reports:
@@ -114,7 +114,7 @@ def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
 
             report = render(analysis, contract_results, text)
     except Px4FuseError as error:
-        status = NOT_JUDGED if isinstance(error, MissingDataError) else FAILED
+        status = NOT_COMPARED if isinstance(error, MissingDataError) else FAILED
         return Outcome(sha256, (common | refused_row(error, status, path.name),))
     return Outcome(sha256, tuple(axis_rows(contract_results)), text.encode(), report)
 
@@ -125,7 +125,7 @@ def _sha256(path: Path) -> str:
 
 
 def file_stem(name: str, sha256: str) -> str:
-    """Name of a log's files: its own as far as any file system takes it, and its hash.
+    """Return a file name for the outputs of a log: its safe name and the start of its hash.
 
     >>> file_stem("Flug 3.ulg", "ab" * 32)
     'Flug_3-abababababab'

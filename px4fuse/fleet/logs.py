@@ -1,4 +1,4 @@
-"""The logs of a fleet, wherever they lie: files, folders, globs, and URLs that fsspec knows."""
+"""Search for logs in files, folders, globs and URLs (fsspec)."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from px4fuse.results.reading import one_line
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-#: What is taken from a folder; a file that is named itself may be called anything
+#: Suffixes of logs in a folder; a file that is given by its name may have any suffix
 SUFFIXES = (".ulg", ".tlog", ".bin")
 
 
 @dataclass(frozen=True, order=True)
 class FoundLog:
-    """A log before it is read.
+    """Log that was found but not read yet.
 
     Attributes
     ----------
     name : str
-        Without its folder.
+        File name without folder.
     log : str
-        As a person gave it.
+        Path or URL relative to the argument.
     address : str
         Absolute path or URL, as a worker opens it.
     size_bytes : int or None
-        None where the file system does not say.
+        None if the file system does not provide it.
     """
 
     name: str
@@ -45,7 +45,7 @@ class FoundLog:
 
 
 def find_logs(patterns: Iterable[str]) -> list[FoundLog]:
-    """Logs by what a person gave, each once, in the order of their names.
+    """Find the logs in files, folders, globs and URLs, each once, sorted by name.
 
     Parameters
     ----------
@@ -55,17 +55,17 @@ def find_logs(patterns: Iterable[str]) -> list[FoundLog]:
     Raises
     ------
     SettingsError
-        There is no log in one of them, or a package is missing that its kind of URL requires.
+        A pattern matches no log, or a URL requires a package that is not installed.
     """
     logs_by_address = {log.address: log for pattern in patterns for log in _logs_in(pattern)}
     if not logs_by_address:
-        raise SettingsError("no logs: give files, folders, globs or URLs.")
+        raise SettingsError("no logs were given. Give files, folders, globs or URLs.")
     return sorted(logs_by_address.values())
 
 
 def _logs_in(pattern: str) -> list[FoundLog]:
     if not pattern:
-        raise SettingsError("the name of a log is empty", "Give files, folders or URLs.")
+        raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     files, root = _file_system(pattern)
     try:
         if files.isdir(root):
@@ -75,14 +75,14 @@ def _logs_in(pattern: str) -> list[FoundLog]:
                 for path, info in all_files.items()
                 if PurePosixPath(path).suffix.lower() in SUFFIXES
             }
-        elif files.exists(root):  # of a device or pipe its worker says that it is none
+        elif files.exists(root):  # the worker rejects a device or a pipe
             infos = {root: files.info(root) if files.isfile(root) else {}}
         else:
             all_files = (
                 files.glob(root, detail=True) if any(sign in pattern for sign in "*?[") else {}
             )
             infos = {path: info for path, info in all_files.items() if info["type"] == "file"}
-    # OSError, and what the package of each kind of URL defines: no account, no such bucket
+    # OSError, or an exception of the package for this URL (no account, no such bucket)
     except Exception as error:
         raise SettingsError(
             f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
@@ -105,7 +105,7 @@ def _logs_in(pattern: str) -> list[FoundLog]:
 
 @contextmanager
 def local_file(address: str) -> Iterator[Path]:
-    """A log as a file of this computer; what is fetched for it is deleted afterwards.
+    """Provide a log as a local file; a downloaded file is deleted at the end.
 
     Parameters
     ----------
@@ -115,9 +115,9 @@ def local_file(address: str) -> Iterator[Path]:
     Raises
     ------
     LogError
-        It is too large.
+        The log is too large.
     SettingsError
-        A package is missing that its kind of URL requires.
+        The URL requires a package that is not installed.
     """
     files, path = _file_system(address)
     if _is_local(files):
@@ -126,8 +126,8 @@ def local_file(address: str) -> Iterator[Path]:
     size, limit = files.info(path).get("size"), max_log_bytes.get()
     if size is not None and size > limit:
         raise LogError(
-            (f"The file has {size / 1000000.0:,.0f} MB; the limit is {limit / 1000000.0:,.0f} MB."),
-            "Raise it with --max-size MB.",
+            f"the file has {size / 1e6:,.0f} MB; the limit is {limit / 1e6:,.0f} MB",
+            "Increase the limit with --max-size MB.",
         )
     with TemporaryDirectory(prefix="px4fuse-") as folder:
         local = Path(folder, _name(path))
@@ -140,12 +140,12 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
 
     try:
         files, path = url_to_fs(address)
-    except ImportError as error:  # its cause names the module, which is the package's name
-        package = getattr(error.__cause__, "name", None) or "the package that it names"
+    except ImportError as error:  # the cause contains the name of the missing package
+        package = getattr(error.__cause__, "name", None) or "the package of this URL type"
         raise SettingsError(
             f"{address}: this type of URL requires a package.", f'Run pip install "{package}".'
         ) from error
-    except ValueError as error:  # of a protocol that nobody knows
+    except ValueError as error:  # unknown protocol
         raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
     return files, path
 
@@ -157,5 +157,5 @@ def _is_local(files: AbstractFileSystem) -> bool:
 
 
 def _name(path: str) -> str:
-    """Without its folder, and without what a URL asks for."""
+    """Return the file name of a path or URL, without the query of a URL."""
     return PurePosixPath(path.partition("?")[0]).name or "log"

@@ -1,4 +1,4 @@
-"""A fleet as one web page: a sortable table with a log per row."""
+"""Web page of ``px4fuse batch``: a sortable table with one row per log."""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -8,15 +8,15 @@ from typing import Any
 import pandas as pd
 
 from px4fuse.findings import finding_title
-from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, PLACES
+from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, PLACES
 from px4fuse.plain import format_factor, format_number, join_first
 from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Part, Row
 from px4fuse.webpage.safe import clean, local_link
 
-STATUS_STYLES = {"done": "good", "not judged": "open", "failed": "bad"}
-FILE_LINKS = (("The report (PDF)", "report"), ("The results (JSON)", "results"))
-# Unfolded, the table's columns stand under their own names: those of each axis, and the others
+STATUS_STYLES = {DONE: "good", NOT_COMPARED: "open", FAILED: "bad"}
+FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
+# Columns of the table that an opened row shows, by axis and for the whole log
 AXIS_COLUMNS = [name for name, place in PLACES.items() if "{" in place]
 LOG_COLUMNS = [
     name
@@ -35,38 +35,39 @@ LOG_COLUMNS = [
     )
 ]
 FILTERS = (
-    ("Status", "status", "Every status"),
-    ("Vehicle", "vehicle", "Every vehicle"),
-    ("Firmware", "firmware", "Every firmware"),
-    ("Finding", "finding", "Whatever was found"),
-    ("To set", "remedy", "Whatever is missing"),
+    ("Status", "status", "All"),
+    ("Vehicle", "vehicle", "All"),
+    ("Firmware", "firmware", "All"),
+    ("Finding", "finding", "All"),
+    ("Action", "remedy", "All"),
 )
-# What speaks for a log: along the aisle where that is known, else both horizontal axes
+# Limit of the ratio of actual and reported σ, either way, of a consistent filter
+CONSISTENT_RATIO = 1.25
+# Axes that represent a log: the aisle if known, else north and east, else down
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
-#: One log: every column that its rows have something in, from the main axes first, and
-#: ``factors`` ("kf" and "ekf2": how many times √S is overstated, by the mean NIS of all updates
-#: of the main axes), ``status`` (the best of its axes), ``lacking`` (why something could not be
-#: judged, and what to set), ``axes`` (their rows), ``findings`` (ids) and ``tags`` (what filters
-#: look for, with the words for it)
+#: One log: the non-empty columns of its rows (main axes first), and ``factors`` ("kf" and "ekf2":
+#: reported √S over actual, from the mean NIS of the main axes), ``status`` (the best of its axes),
+#: ``lacking`` (reasons and actions for missing results), ``axes`` (their rows), ``findings`` (ids)
+#: and ``tags`` (filter values with their labels)
 Log = Mapping[str, Any]
 
 
 def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
-    """Lay out a fleet as one HTML file.
+    """Write the table of logs as one HTML file.
 
     Parameters
     ----------
     table : DataFrame
-        A row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`; a log that
-        could not be read has one row without an axis.
+        One row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`; a log that
+        could not be read has one row without axis.
     made_with : str
-        Name and version of the program.
+        Name and version of px4fuse.
 
     Returns
     -------
     str
-        Write it as UTF-8. The same for the same input: nothing depends on the day.
+        To write as UTF-8. It depends on the input only, not on the date.
     """
     logs = logs_of(table)
     names = short_names(logs)
@@ -103,11 +104,11 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Vehicle", "line", visible_from="desk"),
             Column("Firmware", "line", visible_from="desk"),
             Column("Status"),
-            Column("Variance S, ours", "number"),
-            Column("Variance S, EKF2", "number", visible_from="tablet"),
-            Column("SIGMA_Z (m)", "number", visible_from="tablet"),
-            Column("Clock offset (s)", "number", visible_from="desk"),
-            Column("RMSE between (m)", "number", visible_from="desk"),
+            Column("σ of KF", "number"),
+            Column("σ of EKF2", "number", visible_from="tablet"),
+            Column("SIGMA_Z estimate (m)", "number", visible_from="tablet"),
+            Column("Time offset (s)", "number", visible_from="desk"),
+            Column("KF - EKF2, RMS (m)", "number", visible_from="desk"),
             Column("Findings", "rank", visible_from="desk"),
         ),
         rows=rows,
@@ -117,8 +118,8 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     )
 
 
-def _figure(value: float | None, words: Callable[[float], str]) -> Cell:
-    return Cell() if value is None else frame.number_cell(value, words(value))
+def _figure(value: float | None, format_value: Callable[[float], str]) -> Cell:
+    return Cell() if value is None else frame.number_cell(value, format_value(value))
 
 
 def _details(log: Log) -> tuple[Part, ...]:
@@ -130,11 +131,11 @@ def _details(log: Log) -> tuple[Part, ...]:
     heads = ["", *(axis["axis"] for axis in log["axes"])]
     return (
         frame.list_part(
-            "Not judged", [reason for reason, _ in log["lacking"] if reason], warn=True
+            "Missing results", [reason for reason, _ in log["lacking"] if reason], warn=True
         ),
-        frame.list_part("What to set", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
-        frame.list_part("What happened", list(filter(None, log.get("story", "").splitlines()))),
-        frame.list_part("Findings", [f"{finding_title(one)} ({one})" for one in log["findings"]]),
+        frame.list_part("Actions", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
+        frame.list_part("Summary", list(filter(None, log.get("story", "").splitlines()))),
+        frame.list_part("Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]),
         frame.table_part("Axes", heads if axes else (), axes, range(1, len(heads))),
     )
 
@@ -155,13 +156,15 @@ def _format_value(value: str | float) -> str:
 
 
 def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """What the logs have, most frequent first."""
+    """Return the filters of the page with their options, most frequent first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
-    words_of: Mapping[str, str] = {tag: words for log in logs for tag, words in log["tags"].items()}
+    label_by_tag: Mapping[str, str] = {
+        tag: label for log in logs for tag, label in log["tags"].items()
+    }
     filters = []
     for label, kind, all_label in FILTERS:
         options = [
-            (tag, f"{clean(words_of[tag], 60)} ({count})")
+            (tag, f"{clean(label_by_tag[tag], 60)} ({count})")
             for tag, count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]
@@ -170,11 +173,11 @@ def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
     return filters
 
 
-# -------------------- the table by logs
+# -------------------- one entry per log
 
 
 def logs_of(table: pd.DataFrame) -> list[Log]:
-    """One per log, in the order of the table."""
+    """Combine the rows of each log into one entry, in the order of the table."""
     rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
     present = (table.notna() & (table != "")).to_numpy()
     for row, is_present in zip(table.to_dict("records"), present, strict=True):
@@ -195,16 +198,16 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
         log |= row
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     log |= {
-        "name": log.get("name") or PurePosixPath(log["log"]).name or "nameless",
+        "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
         "factors": {
             filter_name: factor
             for filter_name in ("kf", "ekf2")
             if (factor := _mean_sigma_ratio(main, f"{filter_name}_nis_mean")) is not None
         },
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
-        "lacking": tuple(dict.fromkeys(one for one in reasons_and_remedies if any(one))),
+        "lacking": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": axes,
-        "findings": [part for part in log.get("findings", "").split(FINDING_SEPARATOR) if part],
+        "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
     }
     return log | {"tags": _tags(log)}
 
@@ -222,25 +225,25 @@ def _mean_sigma_ratio(axes: Sequence[Mapping[str, Any]], name: str) -> float | N
 def _tags(log: Log) -> dict[str, str]:
     tags = {f"status:{log['status']}": log["status"]}
     for name in ("vehicle", "firmware"):
-        tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"no {name} named")
+        tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
     tags |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
-    return tags | {f"remedy:{remedy}": remedy or "no advice" for _, remedy in log["lacking"]}
+    return tags | {f"remedy:{remedy}": remedy or "no action" for _, remedy in log["lacking"]}
 
 
 def short_names(logs: Sequence[Log]) -> dict[str, str]:
-    """Long ids of flight controllers by their last digits, where these tell them apart."""
+    """Shorten long ids of flight controllers to their last digits if these are unique."""
     long_ids = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
     short_ids = {vehicle: f"…{vehicle[-8:]}" for vehicle in long_ids}
     return short_ids if len(set(short_ids.values())) == len(short_ids) else {}
 
 
 def describe_sigma_ratio(factor: float) -> str:
-    """By how much a filter's √S is off.
+    """Describe the reported σ of a filter, from its ratio to the actual one.
 
-    >>> [describe_sigma_ratio(factor) for factor in (1.004, 3.2, 0.25)]
-    ['right', '3.2 × too large', '4 × too small']
+    >>> [describe_sigma_ratio(factor) for factor in (1.2, 3.2, 0.25)]
+    ['consistent', '3.2 × too large', '4 × too small']
     """
     ratio = max(factor, 1.0 / factor)
-    if ratio < 1.01:
-        return "right"
+    if ratio <= CONSISTENT_RATIO:
+        return "consistent"
     return f"{format_factor(ratio)} × too {'large' if factor > 1.0 else 'small'}"

@@ -1,4 +1,4 @@
-"""Results of a comparison → rows of the fleet's table, and how that table is written."""
+"""Rows of the table of ``px4fuse batch``, made of results, and their formats."""
 
 import csv
 from collections.abc import Iterable, Mapping
@@ -15,44 +15,44 @@ from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, Log
 from px4fuse.spreadsheet import neutralise_formulas
 
-DONE, NOT_JUDGED, FAILED = "done", "not judged", "failed"
+DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Which tuning speaks for an axis
+# Tuning result of each axis
 _TUNING_OF_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
 def read_rows(name: str) -> list[dict[str, str]]:
-    """Rows of a table of this folder, by the titles of its columns."""
+    """Read a CSV file of this folder as dicts by column title."""
     with files("px4fuse.fleet").joinpath(name).open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 _COLUMNS = read_rows("columns.csv")
-#: Columns of the table and where each stands in the results; empty where it is put together
+#: Columns of the table with their path in the results; empty if the value is composed
 PLACES = {row["column"]: row["place"] for row in _COLUMNS}
-#: Types of the columns; absent numbers are NA, absent texts are empty
+#: Types of the columns; missing numbers are NA, missing texts are empty
 COLUMNS = {row["column"]: row["type"] for row in _COLUMNS}
 
 Row = dict[str, Any]
 
 
-def at(found: object, path: str) -> Any:
-    """What stands at a place in the results; None where there is nothing."""
+def at(results: object, path: str) -> Any:
+    """Return the value at a path in the results; None if there is none."""
 
-    def below(part: Any, name: str) -> Any:
-        if isinstance(part, tuple):
-            return part[int(name)]
-        return part.get(name) if isinstance(part, Mapping) else getattr(part, name, None)
+    def below(parent: Any, name: str) -> Any:
+        if isinstance(parent, tuple):
+            return parent[int(name)]
+        return parent.get(name) if isinstance(parent, Mapping) else getattr(parent, name, None)
 
-    return reduce(below, path.split("."), found)
+    return reduce(below, path.split("."), results)
 
 
 def axis_rows(results: ComparisonResults) -> list[Row]:
-    """Rows of one log, an axis each; columns that are not in them are absent.
+    """Return the rows of one log, one per axis; columns without a value are absent.
 
-    A factor says how many times √S is overstated (above 1) or understated (below 1), as
-    ``sigma_factor`` in the results. SIGMA_Z and SIGMA_A are what the data ask for, north and
-    east together. The clock offset is there where it is determinable.
+    A factor is reported σ over actual σ, as ``sigma_factor`` in the results: above 1 the filter is
+    underconfident. SIGMA_Z and SIGMA_A are the maximum-likelihood estimates, for north and east
+    together. The clock offset is present if it is determinable.
     """
     common = log_columns(results.log) | finding_columns(results.findings, results.aids)
     common["story"] = "\n".join(results.story)
@@ -62,7 +62,7 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
         unavailable = next((f for f in axis.filters.values() if isinstance(f, Unavailable)), None)
         row = common | {
             "axis": name,
-            "status": NOT_JUDGED if isinstance(axis.filters["kf"], Unavailable) else DONE,
+            "status": NOT_COMPARED if isinstance(axis.filters["kf"], Unavailable) else DONE,
             "reason": f"{unavailable.what}: {unavailable.reason}" if unavailable else "",
             "remedy": unavailable.remedy if unavailable else "",
         }
@@ -75,18 +75,18 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 
 
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
-    """Causes among the findings, and the verdict on each aid that EKF2 fused."""
-    causes = [one for one in findings if one.caused_by is None]
+    """Return the findings that are causes, and the verdict on each aid that EKF2 fused."""
+    causes = [finding for finding in findings if finding.caused_by is None]
     fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "idle"]
     return {
         "aids": FINDING_SEPARATOR.join(fused),
-        "findings": FINDING_SEPARATOR.join(one.id for one in causes),
-        "severities": sorted({one.severity for one in causes}),
+        "findings": FINDING_SEPARATOR.join(finding.id for finding in causes),
+        "severities": sorted({finding.severity for finding in causes}),
     }
 
 
 def log_columns(log: Log) -> Row:
-    """What is known of a log once it is read."""
+    """Return the columns that describe the log."""
     start, values = utc_time(log.start_unix_s), {"log": log}
     places = {name: place for name, place in PLACES.items() if place.startswith("log.")}
     return {name: at(values, place) for name, place in places.items()} | {
@@ -96,14 +96,14 @@ def log_columns(log: Log) -> Row:
 
 
 def fleet_table(rows: Iterable[Row]) -> pd.DataFrame:
-    """The fleet's table: all columns in their order, with their types."""
+    """Make the table of all rows, with all columns in order and with their types."""
     texts = dict.fromkeys((name for name, kind in COLUMNS.items() if kind == "str"), "")
-    known = [texts | clean_row(row) for row in rows]
-    return pd.DataFrame(known, columns=list(COLUMNS)).astype(COLUMNS)
+    filled_rows = [texts | clean_row(row) for row in rows]
+    return pd.DataFrame(filled_rows, columns=list(COLUMNS)).astype(COLUMNS)
 
 
 def clean_row(row: Row) -> Row:
-    """A row without what is absent, and what is not UTF-8 in a file's name replaced."""
+    """Drop missing values, and replace bytes of file names that are not UTF-8."""
     return {
         name: value.encode(errors="replace").decode() if isinstance(value, str) else value
         for name, value in row.items()
@@ -112,7 +112,7 @@ def clean_row(row: Row) -> Row:
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
-    """The table for Excel and LibreOffice, in which no text of a log acts as a formula."""
+    """Write the table as CSV for Excel and LibreOffice, without active formulas."""
     texts = {
         name: table[name].map(neutralise_formulas)
         for name, kind in COLUMNS.items()

@@ -1,4 +1,4 @@
-"""Logs → the fleet's table: each log compared by a worker, its rows kept, the table written."""
+"""Run of ``px4fuse batch``: compares each log in a worker, caches its rows, writes the table."""
 
 import io
 from collections import defaultdict
@@ -22,32 +22,32 @@ from px4fuse.fleet.engine import connect_cluster, run_jobs
 from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, refused_row
 from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
-from px4fuse.fleet.rows import FAILED, NOT_JUDGED, Row, clean_row, csv_bytes, fleet_table
+from px4fuse.fleet.rows import FAILED, NOT_COMPARED, Row, clean_row, csv_bytes, fleet_table
 from px4fuse.input_files import check_output_folder
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.workers import MEMORY_BYTES, JobFailure, run_bounded
 from px4fuse.writing import write_all
 
-# Columns of the files of a log, relative to the folder
+# Columns with the files of a log, relative to the output folder
 FILES = ("results", "report")
-_RESUME_NOTE = "What is done is kept: the same command goes on from there."
+_RESUME_NOTE = "Finished results are kept. Run the same command to continue."
 
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """What came of many logs.
+    """Table of many logs, and the files of the run.
 
     Attributes
     ----------
     table : DataFrame
-        A row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`.
+        One row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`.
     reused : int
-        How many logs an earlier run has compared.
+        Number of logs whose results are from an earlier run.
     severities : frozenset of str
-        Of all findings.
+        Severities of all findings.
     """
 
     table: pd.DataFrame
@@ -57,7 +57,7 @@ class Fleet:
 
 
 class CachedRows(msgspec.Struct, frozen=True):
-    """The rows of a log, of one px4fuse and one set of settings."""
+    """Rows of a log for one version of px4fuse and one set of settings."""
 
     sha256: str
     px4fuse: str
@@ -67,23 +67,24 @@ class CachedRows(msgspec.Struct, frozen=True):
 
     @property
     def file(self) -> str:
-        """Where it is kept, relative to the fleet's folder."""
+        """Path of the cache file, relative to the output folder."""
         return f"rows/{self.sha256}.json"
 
 
 @dataclass(frozen=True)
 class _Run:
-    """Where a run writes, what its rows rest on, and what is known of its logs so far."""
+    """State of a run: output folder, version, settings, and the logs processed so far."""
 
     output: Path
     px4fuse: str
     settings: str
-    hash_of: dict[str, str] = field(default_factory=dict)  # by address, of those that have rows
-    first_of: dict[str, FoundLog] = field(default_factory=dict)  # by hash, whose rows stand for all
-    failed_rows: dict[str, Row] = field(
-        default_factory=dict
-    )  # by address, rows of those that failed
-    reused: set[str] = field(default_factory=set)
+    # SHA-256 of logs with rows, by address
+    hash_of: dict[str, str] = field(default_factory=dict)
+    # First log of each SHA-256; logs with the same content are compared once
+    first_of: dict[str, FoundLog] = field(default_factory=dict)
+    # Rows of logs that failed, by address
+    failed_rows: dict[str, Row] = field(default_factory=dict)
+    reused: set[str] = field(default_factory=set)  # SHA-256
 
 
 def batch(
@@ -91,11 +92,11 @@ def batch(
     output: str | Path | None = None,
     *,
     reports: bool = False,
-    **how: Any,
+    **settings: Any,
 ) -> pd.DataFrame:
     """Compare many logs, on this computer or a Dask cluster.
 
-    In a session with a Dask client of its own (``distributed.Client``), that one's cluster does
+    If the Python session has a Dask client (``distributed.Client``), its cluster does
     the work.
 
     Parameters
@@ -103,39 +104,39 @@ def batch(
     paths : str, Path or iterable of them
         Files, folders, globs and URLs.
     output : str or Path, optional
-        Folder for the table and every log's results; a second run does only what is new. Without
-        it nothing is kept.
+        Folder for the table and the results of each log; a second run processes only new logs. By
+        default no file is kept.
     reports : bool
-        Also every log's PDF.
+        True to write a PDF report for each log.
     timeout_s : float
         For one log.
     scheduler : str, optional
         Address of a Dask scheduler.
     workers : int, optional
-        Processes on this computer; by default one per core.
+        Processes on this computer; by default the number of cores.
     memory_gb : float
-        Address space for one log, of which libraries take 0.6 GB; Linux alone enforces it.
+        Address space for one log, of which libraries use 0.6 GB; enforced on Linux only.
     progress : callable
-        Told what is being done, how many logs are done, and of how many.
-    **how
-        The above by name, and arguments of :func:`px4fuse.compare`, as ``sigma_z_m``.
+        Called with the activity, the number of finished logs, and the number of all logs.
+    **settings
+        The arguments above, and those of :func:`px4fuse.compare`, such as ``sigma_z_m``.
 
     Returns
     -------
     DataFrame
-        A row per log and axis; one that says why for a log that could not be compared.
+        One row per log and axis; one row with the reason for a log that could not be compared.
 
     Raises
     ------
     SettingsError
-        There are no logs, a setting is out of range, or the cluster cannot do this.
+        There are no logs, a setting is out of range, or the cluster is not usable.
     OutputError
         A result cannot be written.
     """
     sources = (paths,) if isinstance(paths, str | Path) else paths
     with TemporaryDirectory(prefix="px4fuse-") as scratch:
         folder = Path(scratch if output is None else output)
-        fleet = run(map(str, sources), folder, reports=reports and output is not None, **how)
+        fleet = run(map(str, sources), folder, reports=reports and output is not None, **settings)
     return fleet.table if output is not None else fleet.table.assign(results="", report="")
 
 
@@ -151,35 +152,39 @@ def run(
     progress: Progress = lambda what, done, of: None,
     **settings: Any,
 ) -> Fleet:
-    """As :func:`batch`, with what else there is to say of a run.
+    """Compare many logs like :func:`batch`, and return the table with details of the run.
 
-    What ends the run early (Ctrl-C, a full disk, a cluster that is gone) costs what was not done
-    by then; what was done is in the folder, and in the table as far as it can be written.
+    If the run ends early (Ctrl-C, full disk, lost cluster), the finished results are in the folder,
+    and in the table if it can be written.
 
     Raises
     ------
     SettingsError
-        As :func:`batch`.
+        See :func:`batch`.
     OutputError
         A result cannot be written.
     Px4FuseError
-        The cluster is gone.
+        The connection to the cluster was lost.
     """
     if find_spec("fsspec") is None or find_spec("pyarrow") is None:
-        raise SettingsError("many logs require more", 'Run pip install "px4fuse[batch]".')
+        raise SettingsError(
+            "batch requires fsspec and pyarrow", 'Run pip install "px4fuse[batch]".'
+        )
     logs = find_logs(paths)
     check_output_folder(output)
     try:
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
-        raise SettingsError(f"no such setting ({error}).") from error
+        raise SettingsError(f"unknown setting ({error}).") from error
     if request.mavlink is not None or request.position is not None:
-        raise SettingsError("`mavlink` and `position` belong to one flight, not to many.")
+        raise SettingsError(
+            "`mavlink` and `position` are files of one flight and not available for many logs."
+        )
     sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
-    Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)  # refuses what is out of range
+    Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)  # raises if out of range
     state = _Run(output, metadata.version("px4fuse"), command_line(request))
     hashes_by_size = _cached_hashes(state, reports)
-    of_address = {log.address: log for log in logs}
+    log_by_address = {log.address: log for log in logs}
     jobs = [
         Job(
             log.address,
@@ -199,7 +204,7 @@ def run(
         try:
             try:
                 for number, (job, outcome) in enumerate(work, 1):
-                    _cache_outcome(state, of_address[job.address], outcome)
+                    _cache_outcome(state, log_by_address[job.address], outcome)
                     progress(f"comparing, {len(state.failed_rows)} failed", number, len(jobs))
             finally:
                 fleet = _write_fleet(state, logs)
@@ -209,7 +214,7 @@ def run(
 
 
 def _cached_hashes(state: _Run, reports: bool) -> dict[int | None, set[str]]:
-    """Hashes of the logs of which everything is there, by their size."""
+    """Return the SHA-256 of logs whose results and files exist, by file size."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached in load_cached_rows(state.output, state.px4fuse, state.settings):
         first = cached.rows[0]
@@ -220,20 +225,20 @@ def _cached_hashes(state: _Run, reports: bool) -> dict[int | None, set[str]]:
 
 
 def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[CachedRows]:
-    """What a folder keeps of this px4fuse and these settings."""
+    """Yield the cached rows of this px4fuse version and these settings."""
     for file in sorted((folder / "rows").glob("*.json")):
         try:
             cached = msgspec.json.decode(file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
-            continue  # not ours, or of another px4fuse: the log is done again
+            continue  # not a cache file of this version: the log is compared again
         if (cached.px4fuse, cached.settings) == (px4fuse, settings):
             yield cached
 
 
 def _cache_outcome(state: _Run, log: FoundLog, outcome: Outcome | JobFailure) -> None:
-    """Keep what came of a log."""
+    """Store the outcome of a log in the state and in the output folder."""
     if isinstance(outcome, JobFailure):
-        remedy = "Allow more with --timeout or --memory, or look at it with px4fuse compare."
+        remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
         outcome = Outcome("", (refused_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
     if outcome.rows and outcome.rows[0]["status"] == FAILED:
         state.failed_rows[log.address] = outcome.rows[0]
@@ -248,7 +253,7 @@ def _cache_outcome(state: _Run, log: FoundLog, outcome: Outcome | JobFailure) ->
 
 
 def _write_log(state: _Run, log: FoundLog, outcome: Outcome) -> None:
-    """Write a log's files and its rows together."""
+    """Write the results, the report and the cached rows of a log."""
     stem = f"results/{file_stem(log.name, outcome.sha256)}"
     named_contents = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
     files = {
@@ -262,7 +267,7 @@ def _write_log(state: _Run, log: FoundLog, outcome: Outcome) -> None:
 
 
 def _write_fleet(state: _Run, logs: Iterable[FoundLog]) -> Fleet:
-    """Make the table of all that is known by now, and write it."""
+    """Write the table of all logs that are finished so far."""
     severities: set[str] = set()
     rows_of = {
         cached.sha256: cached.rows
@@ -276,9 +281,9 @@ def _write_fleet(state: _Run, logs: Iterable[FoundLog]) -> Fleet:
         first = state.first_of[sha256]
         if first is log and sha256 in rows_of:
             return rows_of[sha256]
-        status, reason = NOT_JUDGED, f"the same file as {first.log}, whose rows stand for both"
+        status, reason = NOT_COMPARED, f"same file as {first.log}; not analysed again"
         if first is log:
-            status, reason = FAILED, "another run in this folder has replaced its rows"
+            status, reason = FAILED, "another run in this folder replaced the rows of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def rows() -> Iterator[Row]:

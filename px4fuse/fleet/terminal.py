@@ -15,26 +15,29 @@ from px4fuse.results.contract import ChangeResults, Interval
 if TYPE_CHECKING:
     from px4fuse.fleet.run import Fleet
 
-# Reasons why logs are not compared, and findings
+# Maximum number of listed reasons, and of listed findings
 MAX_SHOWN = 8
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def summary(fleet: Fleet) -> Page:
-    """What could not be compared, both filters by axis, and findings."""
+    """Format logs that could not be compared, the σ of both filters by axis, and findings."""
     page, logs = Page(), fleet.table.drop_duplicates("log")
     uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
     causes = uncompared.agg(["count", "first"]).reset_index()
     sorted_causes = causes.sort_values("count", ascending=False, kind="stable")
     for cause in sorted_causes.head(MAX_SHOWN).to_dict("records"):
-        prefix = "" if cause["count"] == 1 else f"{cause['count']} logs, one is "
+        prefix = "" if cause["count"] == 1 else f"{cause['count']} logs, for example "
         text = "{first}: {status}: {reason}. {remedy}".format_map(cause).rstrip()
         page.write(prefix + text, colour=RED if cause["status"] == FAILED else YELLOW)
     if len(sorted_causes) > MAX_SHOWN:
-        page.write(f"{len(sorted_causes) - MAX_SHOWN} more reasons are in fleet.html.")
+        page.write(f"{len(sorted_causes) - MAX_SHOWN} further reasons are in fleet.html.")
     heads = [
-        f"{filter_name}\n{what}" for filter_name in ("ours", "EKF2") for what in ("logs", "factor")
+        f"{filter_name}\
+{title}"
+        for filter_name in ("KF", "EKF2")
+        for title in ("logs", "factor")
     ]
     lines = []
     for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
@@ -44,45 +47,50 @@ def summary(fleet: Fleet) -> Page:
         lines.append((str(axis), *cells))
     if lines:
         page.table(("axis", *heads), lines, right=(1, 2, 3, 4))
-        factor_note = "factor: median of how many times √S is overstated (above 1)"
+        factor_note = "factor: median of reported σ / actual σ (above 1: underconfident)"
         page.write(factor_note, colour=MUTED_COLOUR)
     finding_ids = logs["findings"].str.split(FINDING_SEPARATOR).explode()
     for finding, count in finding_ids[finding_ids != ""].value_counts().head(MAX_SHOWN).items():
         page.write(f"{count} × {finding_title(str(finding))}")
     counts = logs["status"].value_counts()
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
-    again = " The same command tries those that failed again." if FAILED in counts else ""
-    page.write(f"{len(logs)} logs: {status_counts}; {fleet.reused} as before.{again}")
+    again = " Run the same command to repeat failed logs." if FAILED in counts else ""
+    page.write(
+        f"{len(logs)} logs: {status_counts}; {fleet.reused} reused from an earlier run.{again}"
+    )
     return page
 
 
 def differences(results: ChangeResults) -> Page:
-    """Settings, numbers and findings that differ, and verdicts that are worse in B."""
+    """Format settings, numbers and findings that differ, and verdicts that are worse in B."""
     page = Page()
     for name, side in (("A", results.a), ("B", results.b)):
-        of = "" if side.given == side.log else f", {side.kind} of {side.log}"
-        said = f"{side.given}{of}; SHA-256 {side.log_sha256[:12]}, px4fuse {side.px4fuse}"
-        page.labelled(name, said)
+        log = side.kind if side.given == side.log else f"{side.kind} of {side.log}"
+        versions = f"SHA-256 {side.log_sha256[:12]}, px4fuse {side.px4fuse}"
+        page.labelled(name, f"{side.given} ({log}), {versions}")
     if results.settings:
-        settings = [(one.name, _plain(one.a), _plain(one.b)) for one in results.settings]
+        settings = [
+            (setting.name, _plain(setting.a), _plain(setting.b)) for setting in results.settings
+        ]
         page.table(("setting", "A", "B"), settings)
     rows = []
-    for one in results.numbers:
-        factor, unit = (100.0, "%") if one.unit == "share" else (1.0, one.unit)
+    for number in results.numbers:
+        factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
         cells = [
             cell
-            for value, interval in ((one.a, one.a_interval), (one.b, one.b_interval))
+            for value, interval in ((number.a, number.a_interval), (number.b, number.b_interval))
             for cell in (_value(value, factor), _range(interval))
         ]
-        rows.append((one.label, *cells, unit))
+        rows.append((number.label, *cells, unit))
     if rows:
         page.table(NUMBER_HEADS, rows, right=(1, 2, 3, 4))
     least = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(f"Numbers that differ by less than {least} are not listed.", colour=MUTED_COLOUR)
-    for found in results.findings:
-        label = "New" if found.only_in == "B" else "Gone"
-        colour = SEVERITY_COLOURS[found.severity]
-        page.labelled(label, words(f"{found.severity}: {found.message}", 8.0, colour))
+    for finding in results.findings:
+        styled = words(
+            f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
+        )
+        page.labelled(f"Only {finding.only_in}", styled)
     for text in results.worse:
         page.labelled("Worse", words(text, 8.0, RED))
     if not results.worse:

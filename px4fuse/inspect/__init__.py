@@ -1,1 +1,1 @@
-"""What is in a log, and the log as tables."""
+"""Contents of a log: list for ``info`` and tables for ``extract``."""

@@ -1,4 +1,4 @@
-"""What is in a log, what can be done with it, and what to change before the next flight."""
+"""Contents of a log, possible analyses, and advice on logging for the next flight."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -24,9 +24,9 @@ from px4fuse.request import with_options
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
-# What is told of a flight as it is
+# Fields of Flight that are written without change
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
-# How a part is named for a person, by its name in Flight.streams
+# Displayed names of the parts of a flight, by their names in Flight.streams
 PART_NAMES = {
     "imu": "IMU",
     "attitude": "attitude",
@@ -35,23 +35,23 @@ PART_NAMES = {
     "ekf2_variance": "EKF2 variance",
     "ekf2_innovations": "innovations",
     "ekf2_fusing": "fusion flags",
-    "truth": "truth",
+    "truth": "ground truth",
     "airborne": "land detector",
 }
-# What compare does with EKF2 and the truth, and the part that each needs
+# Analyses of compare that need EKF2 or ground truth, with the part of the flight that they need
 PARTS_OF_COMPARE = {
     "EKF2 states": "ekf2_state",
     "EKF2 variances": "ekf2_variance",
-    "EKF2 innovations": "ekf2_innovations",
-    "truth": "truth",
+    "EKF2 consistency": "ekf2_innovations",
+    "error": "truth",
 }
-NO_AXIS = Unavailable("comparison", "no position to compare on", "")
+NO_AXIS = Unavailable("comparison", "the log contains no position to compare with", "")
 Spans = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """One thing that px4fuse can or cannot do with the log, and with what or why not."""
+    """Analysis of px4fuse, with the data that it uses or the reason why it is not possible."""
 
     name: str
     possible: bool
@@ -60,7 +60,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """What to do before the next flight, and for what."""
+    """Action before the next flight, and the data that it improves."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -68,15 +68,15 @@ class LoggingAdvice:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Intervals between samples that are longer than ``limit_s``.
+    """Gaps: intervals between samples that are longer than ``limit_s``.
 
     Attributes
     ----------
     count : int
     total_s, longest_s : float
-        Of those intervals; 0 where there is none.
+        Sum and maximum of the gaps; 0 without gaps.
     limit_s : float
-        Of the IMU as the filter takes it (0.1 s, five intervals), else one second or five
+        IMU: 0.1 s or five median intervals, whichever is longer (as in KF). Others: 1 s or five
         intervals, whichever is longer.
     """
 
@@ -88,30 +88,30 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Source:
-    """One part of the flight and where it was read from, or why it is not there.
+    """Part of the flight with its topics, or the reason why it is missing.
 
     Attributes
     ----------
     part : str
         "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PART_NAMES`.
     name : str
-        The name of a position track, else the first topic; empty where unavailable.
+        Name of a position track, else the first topic; empty if unavailable.
     topics : tuple of str
     clock, log : str
-        Which clock its time stamps were given on, and the file's name.
+        Clock of its timestamps, and name of the file.
     samples : int or None
-        None where the reader keeps no samples of it (land detector).
+        None if the reader keeps no samples of it (land detector).
     rate_hz : float or None
-        Between gaps; None below two samples.
+        Rate between gaps; None with less than two samples.
     gaps : Gaps or None
     start_s, end_s : float or None
-        First and last sample, seconds from the first data.
+        First and last sample, in seconds after the first data.
     chosen : bool
-        Whether ``px4fuse compare`` takes this position.
+        True if ``px4fuse compare`` uses this position.
     description : str
-        Of a position: what it is.
+        Description of a position track.
     unavailable : str
-        Why the part is not there; empty where it is.
+        Reason why the part is missing; empty if it is available.
     """
 
     part: str
@@ -131,25 +131,25 @@ class Source:
 
 @dataclass(frozen=True)
 class Inventory:
-    """What ``px4fuse info`` says.
+    """Contents of a log, as ``px4fuse info`` shows them.
 
     Attributes
     ----------
     flight : Flight
-        With EKF2's innovations of the position that compare takes.
+        With the EKF2 innovations of the position that compare uses.
     start_utc : str or None
-        ISO 8601, of time zero.
+        UTC of the first data, ISO 8601.
     sources : tuple of Source
-        Every part of the flight, every position track, best first.
+        All parts of the flight and all position tracks, most direct track first.
     source_reason : str
-        Why compare takes its position source, or why it finds none.
+        Reason for the position source of compare, or for its absence.
     segment : Segment or None
-        What compare would analyse.
-    abilities : tuple of Ability
-    advice : tuple of Advice
-        Most important first, each remedy once.
+        Segment that compare analyses.
+    abilities : tuple of AnalysisOption
+    advice : tuple of LoggingAdvice
+        Most important first, each action once.
     notes : tuple of str
-        What the reader had to do, and what EKF2 means here.
+        Notes of the reader about damage, clocks and the estimator.
     """
 
     flight: Flight
@@ -163,12 +163,12 @@ class Inventory:
 
 
 def take_inventory(flight: Flight) -> Inventory:
-    """Take stock of a flight.
+    """List the contents of a flight, the possible analyses and the advice on logging.
 
     Parameters
     ----------
     flight : Flight
-        Any: also one of which every part is unavailable.
+        May lack any part.
     """
     compared, reason, remedy = None, "", ""
     try:
@@ -178,7 +178,7 @@ def take_inventory(flight: Flight) -> Inventory:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
         remedy = with_options(error.remedy)
         if not isinstance(error, MissingDataError):
-            remedy = "Record more of the flight: the logger from arming on (SDLOG_MODE 0)."
+            remedy = "Record the whole flight: set SDLOG_MODE to 0 (logging from arming)."
     if compared is not None:
         flight = flight_for_source(flight, compared.source)
     log = flight.log
@@ -193,7 +193,7 @@ def take_inventory(flight: Flight) -> Inventory:
         advice=_logging_advice(flight, compared, remedy),
         notes=(
             *log.damage,
-            *(("the log ends in flight: the landing is not in it",) if is_cut else ()),
+            *(("the log ends in flight and does not contain the landing",) if is_cut else ()),
             *log.notes,
             *(() if compared is None else compared.source.notes),
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
@@ -202,7 +202,7 @@ def take_inventory(flight: Flight) -> Inventory:
 
 
 def to_plain(inventory: Inventory) -> dict[str, Any]:
-    """The inventory for JSON: what is not known is absent."""
+    """Convert the inventory to JSON types; unknown values are absent."""
     inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
     flight: Flight = inventory_fields.pop("flight")
     flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
@@ -213,9 +213,9 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
 
 
 def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | Spans | Unavailable]:
-    """All but the positions, by their names in Flight.streams; of EKF2 that is missing the state.
+    """Return all parts except positions, by their names in Flight.streams.
 
-    Innovations are those of the axis that has most of them.
+    Without EKF2, its state stands for all of its parts. Innovations are of the axis with the most.
     """
     ekf2, truth = flight.ekf2, flight.truth
     data_by_part = {"imu": flight.imu, "attitude": flight.attitude}
@@ -250,7 +250,7 @@ def _source(
     stream: Stream | PositionTrack | None,
     **about: Any,
 ) -> Source:
-    """A part, what is said of it, and the streams that it was read from."""
+    """Describe a part of the flight: samples, rate, gaps, topics and clock."""
     if isinstance(data, Unavailable):
         return Source(part, unavailable=data.reason)
     if stream is not None:
@@ -290,7 +290,7 @@ def _gaps(frame: pd.DataFrame, *, of_imu: bool) -> Gaps:
 def _abilities(
     flight: Flight, compared: Comparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
-    """What compare does, with what, or why not."""
+    """Yield the analyses of compare, aids and what-if, each with its data or reason."""
     acceleration: object = ned_acceleration(flight)
     rows_by_name: dict[str, tuple[object, str]] = {}
     if compared is None:
@@ -298,13 +298,13 @@ def _abilities(
     else:
         source, segment = compared.source, compared.segment
         count, span = len(within(source.samples, segment)), (segment.start_s, segment.end_s)
-        description = "our filter on {}, {} samples, {:.1f} s to {:.1f} s"
+        description = "KF with {}, {} samples, {:.1f} s to {:.1f} s"
         yield AnalysisOption("compare", True, description.format(source.name, count, *span))
         acceleration, rows_by_name = compared.lines[0].acceleration, _ekf2_and_truth_rows(compared)
     slow = " ".join(finding.message for finding in imu.rates(flight))
     if isinstance(acceleration, Unavailable):
-        slow = f"{acceleration.reason}; velocity is held constant"
-    acceleration_text = "IMU turned into NED by the attitude, gravity removed"
+        slow = f"{acceleration.reason}; KF assumes constant velocity"
+    acceleration_text = "IMU rotated into NED with the attitude, gravity removed"
     yield AnalysisOption("acceleration", not slow, slow or acceleration_text)
     data_by_part = _data_by_part(flight)
     for name, key in PARTS_OF_COMPARE.items():
@@ -316,31 +316,29 @@ def _abilities(
     aids, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
         rates = (f"{a.label} {_rate_text(ekf2.aids[n].samples)}" for n, a in aids.items())
-        description = f"each judged by its own innovations: {', '.join(rates)}"
+        description = ", ".join(rates)
     yield _ability("aids", aids, description)
     inputs = prepare_inputs(flight)
     if not isinstance(inputs, Unavailable):
         replayed_s = sum(float(np.ptp(stretch.time_s)) for stretch in inputs.stretches)
-        description = (
-            f"EKF2 replayed on {inputs.aid.label} for {replayed_s:.0f} s, also otherwise set"
-        )
-    yield _ability("what if", inputs, description)
+        description = f"EKF2 replay with {inputs.aid.label}, {replayed_s:.0f} s"
+    yield _ability("what-if", inputs, description)
 
 
 def _rate_text(samples: pd.DataFrame) -> str:
-    """Format the rate of samples (Hz); a single sample has none."""
+    """Format the rate of samples (Hz); "1 sample" for a single one."""
     return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
 
 
 def _ability(name: str, part: object, description: str) -> AnalysisOption:
-    """What is said of what is done with a part, or why it is not done."""
+    """Return an analysis with its description, or with the reason if the part is missing."""
     if isinstance(part, Unavailable):
         return AnalysisOption(name, False, part.reason)
     return AnalysisOption(name, True, description)
 
 
 def _ekf2_and_truth_rows(compared: Comparison) -> dict[str, tuple[object, str]]:
-    """What compare did with EKF2 and the truth along its first axis, and what is said of it."""
+    """Return result and description of each analysis with EKF2 or ground truth."""
     first, truth = next(iter(compared.axes.values())), compared.flight.truth
     innovations = {name: axis.ekf2_innovations for name, axis in compared.axes.items()}
     counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
@@ -354,11 +352,14 @@ def _ekf2_and_truth_rows(compared: Comparison) -> dict[str, tuple[object, str]]:
             f"{_count_text(first.ekf2_state)} of position and velocity",
         ),
         "EKF2 variances": (first.ekf2_variance, _count_text(first.ekf2_variance)),
-        "EKF2 innovations": (
-            next((one for one in summaries if not isinstance(one, Unavailable)), summaries[0]),
-            f"two-sided consistency: {', '.join(counts)}",
+        "EKF2 consistency": (
+            next(
+                (summary for summary in summaries if not isinstance(summary, Unavailable)),
+                summaries[0],
+            ),
+            f"innovations: {', '.join(counts)}",
         ),
-        "truth": (
+        "error": (
             first.truth,
             f"RMSE and NEES of {quantities_text} against {getattr(truth, 'name', '')}",
         ),
@@ -372,20 +373,21 @@ def _count_text(part: pd.DataFrame | Unavailable) -> str:
 def _logging_advice(
     flight: Flight, compared: Comparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Remedies of what compare finds about the recording and of all that is missing, each once."""
+    """Collect the actions of findings about the recording and of missing data, each once."""
     findings = [*recording.loss(flight), *recording.clocks_set_back(flight)]
     needs = [(remedy, "position")] if remedy else []
     if compared is not None:
         findings += [*missing.source_as_sent(compared), *ekf2_not_fusing.detect(compared)]
         findings += [*missing.innovations(compared), *recording.dropouts(compared)]
     findings += imu.rates(flight)
-    needs += [(one.remedy, finding_title(one.id)) for one in findings]
-    # no other autopilot than PX4 could have recorded more of its estimator
-    of_all = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
+    needs += [(finding.remedy, finding_title(finding.id)) for finding in findings]
+    # advice about the estimator's log is for PX4 only
+    main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     needs += [
         (part.remedy, part.what)
         for part in unavailable_parts(flight)
-        if part is not NO_POSITION and (flight.log.has_ulog or any(part is one for one in of_all))
+        if part is not NO_POSITION
+        and (flight.log.has_ulog or any(part is main_part for main_part in main_parts))
     ]
     improves: dict[str, dict[str, None]] = {}
     for action, what in needs:

@@ -1,4 +1,4 @@
-"""A flight as tidy tables, each column described in a data dictionary."""
+"""Tables of a flight for ``px4fuse extract``, with a data dictionary of all columns."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,7 +20,7 @@ from px4fuse.plain import to_json_types
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
 DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
-# What a file name may not hold on some system, or what is awkward in a shell
+# Characters that are not allowed or need quotes in a file name
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_NAME = 80
 NO_POSITION = Unavailable(
@@ -32,7 +32,7 @@ NO_POSITION = Unavailable(
 
 @dataclass(frozen=True)
 class DescribedTable:
-    """One table, and its rows of the data dictionary."""
+    """Table with its rows of the data dictionary."""
 
     name: str
     data: pd.DataFrame
@@ -40,7 +40,7 @@ class DescribedTable:
 
 
 def with_best_source(flight: Flight) -> Flight:
-    """The flight with EKF2's innovations of the position that compare would take."""
+    """Return the flight with the EKF2 innovations of the position that compare uses."""
     try:
         return flight_for_source(flight, choose_source(flight)[0])
     except MissingDataError:
@@ -48,24 +48,24 @@ def with_best_source(flight: Flight) -> Flight:
 
 
 def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
-    """Everything in a flight as tidy tables: one row per sample, one documented unit per column.
+    """Return a flight as tables with one row per sample and one documented unit per column.
 
     Returns
     -------
     mapping from table name to DataFrame
-        The first column of a time series is ``time_s``. Names are safe as file names. Parts that
+        The first column of a time series is ``time_s``. Names are valid file names. Parts that
         are unavailable have no table; see :func:`unavailable_parts`.
     """
     return {table.name: table.data for table in _tables(flight)}
 
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:
-    """One row per column of every table, in order.
+    """Return the data dictionary: one row per column of every table.
 
     Returns
     -------
     DataFrame
-        Columns table, column, unit (ASCII, so that every spreadsheet reads it), frame, meaning,
+        Columns table, column, unit (ASCII, readable by every spreadsheet), frame, meaning,
         source_topic, clock.
     """
     frames = [table.columns for table in _tables(flight)]
@@ -75,7 +75,7 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
 
 
 def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
-    """Parts of the flight that have no table, and why."""
+    """List the parts of the flight without a table, with reasons."""
     ekf2 = flight.ekf2
     sections: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
@@ -90,7 +90,7 @@ def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
 
 
 def description(flight: Flight) -> dict[str, Any]:
-    """What the log is and what is missing from it, for JSON: what is not known is absent."""
+    """Return information about the log and the missing data as JSON types."""
     ekf2 = flight.ekf2
     description_fields: dict[str, Any] = {
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
@@ -111,7 +111,7 @@ def description(flight: Flight) -> dict[str, Any]:
 
 @cache
 def _column_descriptions() -> pd.DataFrame:
-    """Unit, frame and meaning of every column, by table."""
+    """Read unit, frame and meaning of every column, by table."""
     with files("px4fuse.inspect").joinpath("columns.csv").open(encoding="utf-8") as file:
         return pd.read_csv(file, index_col="table", keep_default_na=False)
 
@@ -121,18 +121,18 @@ def _table(
     data: pd.DataFrame,
     origin: tuple[tuple[str, ...], str] = ((), ""),
     of: str = "",
-    **words: str,
+    **values: str,
 ) -> DescribedTable:
-    """A table with the columns that are described for it, or for ``of``.
+    """Make a table with the columns that columns.csv lists for ``name``, or for ``of``.
 
     Parameters
     ----------
     origin : (tuple of str, str)
-        Topics and clock that it was read from.
-    **words
-        What stands in braces in the descriptions.
+        Topics and clock of the data.
+    **values
+        Values for the names in braces in the descriptions.
     """
-    columns = _column_descriptions().loc[of or name].map(lambda cell: cell.format(**words))
+    columns = _column_descriptions().loc[of or name].map(lambda cell: cell.format(**values))
     topics, clock = origin
     columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
     return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
@@ -141,7 +141,7 @@ def _table(
 def _stream_table(
     flight: Flight, name: str, data: pd.DataFrame | Unavailable
 ) -> Iterator[DescribedTable]:
-    """A time series that is named as its stream; nothing where it is unavailable."""
+    """Yield the table of a time series; nothing if it is unavailable."""
     if isinstance(data, pd.DataFrame):
         yield _table(name, _with_time_column(data), _origin(flight, name))
 
@@ -159,9 +159,9 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
         (imu, clock), (attitude, _) = _origin(flight, "imu"), _origin(flight, "attitude")
         yield _table("acceleration_ned", _with_time_column(data), ((*imu, *attitude), clock))
     for name, track in _named_tracks(flight):
-        words = {"frame": track.frame, "description": track.description}
+        values = {"frame": track.frame, "description": track.description}
         origin = (track.topics, track.clock)
-        yield _table(name, _with_time_column(track.samples), origin, "position", **words)
+        yield _table(name, _with_time_column(track.samples), origin, "position", **values)
         if track.orientation is not None:
             orientation_table = _with_time_column(track.orientation)
             yield _table(
@@ -169,7 +169,7 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
                 orientation_table,
                 origin,
                 "orientation",
-                **words,
+                **values,
             )
     if isinstance(flight.ekf2, Ekf2):
         yield from _ekf2(flight, flight.ekf2)
@@ -186,12 +186,12 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
         yield _table("parameters", pd.DataFrame(parameters.items(), columns=["name", "value"]))
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
-        # NaN where they do tell the time
+        # a float column: distinct_stamps is NaN for a usable clock
         yield _table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
 def _parameters(flight: Flight) -> dict[str, float]:
-    """Every parameter that an analysis reads."""
+    """Return the logged parameters that any analysis uses."""
     logged_values = dict(flight.log.parameters)
     if isinstance(flight.ekf2, Ekf2):
         for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
@@ -223,7 +223,7 @@ def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
     yield _table("resets", resets, origin)
-    # the first instance holds from the beginning, which a reader stamps minus infinity
+    # readers give the first instance the time minus infinity
     begin = min(float(ekf2.state.index[0]), 0.0)
     rows = [(max(time, begin), number) for time, number in ekf2.instances]
     instances = _numeric_table(["time_s", "instance"], rows).astype({"instance": np.int64})
@@ -231,10 +231,10 @@ def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Every position track with the name of its table, each name once whatever its case."""
+    """Yield each position track with a unique table name, ignoring case."""
     used_names: set[str] = set()
     for track in flight.positions:
-        # the first word is ours, so that none of the names that Windows reserves can result
+        # the prefix avoids file names that Windows reserves (con, aux, ...)
         stem = _UNSAFE.sub("_", f"position_{track.name}")[:MAX_NAME].rstrip("_")
         name, number = stem, 1
         while name.lower() in used_names:
@@ -245,6 +245,6 @@ def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
 
 
 def _origin(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
-    """Topics and clock that a part was read from."""
+    """Return topics and clock of a part."""
     stream = flight.streams.get(part)
     return ((), "") if stream is None else (stream.topics, stream.clock)

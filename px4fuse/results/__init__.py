@@ -1,1 +1,1 @@
-"""The contract: what is written as JSON, its schema, and how it is read back."""
+"""Results: the JSON contract, its schema, and how results are written and read."""

@@ -1,4 +1,4 @@
-"""What a command found → results, as the contract has them."""
+"""Conversion of an analysis to the results of the JSON contract."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -29,7 +29,7 @@ from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import SolvedGraph
 
-# Parts of an analysis that are written as they are
+# Fields of an analysis that are written without change
 _COPIED_FIELDS = (
     "axes",
     "horizontal",
@@ -48,7 +48,7 @@ _COPIED_FIELDS = (
 def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
-    """Everything that the report says."""
+    """Return all results of a comparison, as the report shows them."""
     findings = find(analysis)
     return within_bounds(
         contract.ComparisonResults(
@@ -65,7 +65,7 @@ def results(
 def outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """What ``px4fuse compare`` found; of a flight without a position source EKF2's aids alone."""
+    """Return the results of ``px4fuse compare``; without a position source, of EKF2's aids only."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
     return within_bounds(
@@ -84,7 +84,7 @@ def tuning_results(
     comparison: Comparison,
     tuned: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    """What ``px4fuse tune`` found."""
+    """Return the results of ``px4fuse tune``."""
     common = _flight_fields("px4fuse-tuning", request, comparison, "tune")
     return within_bounds(contract.TuningResults(**common, tuning=to_serializable(tuned)))
 
@@ -92,7 +92,7 @@ def tuning_results(
 def sync_results(
     request: ComparisonRequest, comparison: Comparison, clock: ClockOffset | Unavailable
 ) -> contract.SyncResults:
-    """What ``px4fuse sync`` found."""
+    """Return the results of ``px4fuse sync``."""
     common = _flight_fields("px4fuse-sync", request, comparison, "sync")
     return within_bounds(contract.SyncResults(**common, clock=to_serializable(clock)))
 
@@ -100,7 +100,7 @@ def sync_results(
 def whatif_results(
     request: WhatIfRequest, counterfactual: WhatIfAnalysis
 ) -> contract.WhatIfResults:
-    """What ``px4fuse whatif`` found."""
+    """Return the results of ``px4fuse whatif``."""
     whatif_result, first = counterfactual.whatif, counterfactual.first
     return within_bounds(
         contract.WhatIfResults(
@@ -120,7 +120,7 @@ def whatif_results(
 def loop_results(
     request: LoopRequest, loop: Loop, student: Student = NO_STUDENT
 ) -> contract.LoopResults:
-    """What ``px4fuse loop`` found."""
+    """Return the results of ``px4fuse loop``."""
     return within_bounds(
         contract.LoopResults(
             schema=schema_of(contract.LOOP),
@@ -136,7 +136,7 @@ def loop_results(
 
 
 def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contract.EvaluationResults:
-    """What ``px4fuse evaluate`` found."""
+    """Return the results of ``px4fuse evaluate``."""
     return within_bounds(
         contract.EvaluationResults(
             schema=schema_of("px4fuse-evaluation"),
@@ -149,7 +149,7 @@ def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contrac
 
 
 def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
-    """What ``px4fuse loop`` found about a pose graph; edges by the vertex numbers of the file."""
+    """Return the results of ``px4fuse loop`` for a pose graph, with the file's vertex numbers."""
     return within_bounds(
         contract.GraphResults(
             schema_of("px4fuse-graph"), to_serializable(solved), provenance(command)
@@ -158,7 +158,7 @@ def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
 
 
 def log_record(flight: Flight) -> Log:
-    """The log of a flight and what was joined with it."""
+    """Return the record of a flight's log, with joined files and clocks."""
     return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 
@@ -168,7 +168,7 @@ def _common_fields(
     flight: Flight,
     command: str | None = None,
 ) -> dict[str, Any]:
-    """What all results of a flight have: which they are, what was asked of which log, versions."""
+    """Return the fields that all results of a flight have: schema, request, log, provenance."""
     return {
         "schema": schema_of(name),
         "request": request.without_paths(),
@@ -180,7 +180,7 @@ def _common_fields(
 def _flight_fields(
     name: str, request: ComparisonRequest, comparison: Comparison, command: str | None = None
 ) -> dict[str, Any]:
-    """What the results of every command on one flight's comparison have in common."""
+    """Return the fields that all results of a comparison have, with source and settings."""
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
     origin, parameters = track.origin, comparison.flight.log.parameters
     placed_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
@@ -191,9 +191,13 @@ def _flight_fields(
         rate_hz=track.rate_hz,
         available=tuple(
             AvailableTrack(
-                one.name, one.origin.kind, one.origin.passage, len(one.samples), one.rate_hz
+                track.name,
+                track.origin.kind,
+                track.origin.passage,
+                len(track.samples),
+                track.rate_hz,
             )
-            for one in comparison.flight.positions
+            for track in comparison.flight.positions
         ),
         not_in_log=tuple(part for part in comparison.missing if part.source),
     )

@@ -1,7 +1,7 @@
-"""The results contract: one JSON object per command, its schema, and how it is written.
+"""Contract of the results: one JSON object per command, its schema, and how it is written.
 
-Everything that px4fuse writes with a major version is read by the same major version; a new field
-raises the minor one.
+px4fuse reads all results with its own major version of the schema; a new field increases the minor
+version.
 """
 
 import json
@@ -39,19 +39,19 @@ LOOP = "px4fuse-loop"
 WHATIF = "px4fuse-whatif"
 AIDS = "px4fuse-aids"
 CHANGES = "px4fuse-changes"
-# Of the numbers that are written
+# Significant digits of written numbers
 SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, frozen=True, kw_only=True):
-    """The recording, the files that were read beside it, and the clocks that were mapped."""
+    """Log, the files that were joined with it, and the clocks that were mapped."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]
 
 
 class AvailableTrack(Record, frozen=True):
-    """A position track of the flight."""
+    """Position track of the flight."""
 
     name: str
     kind: PositionKind
@@ -61,11 +61,11 @@ class AvailableTrack(Record, frozen=True):
 
 
 class PositionSource(Record, frozen=True, kw_only=True):
-    """The position that both filters are judged by.
+    """Position source with which KF and EKF2 are compared.
 
-    ``kind`` and ``passage`` say where it comes from and how it got into the flight,
-    ``ekf2_parameters`` what the log has of EKF2's parameters for it, by PX4 name and in PX4's
-    units; ``log`` is the file that it was read from.
+    ``kind`` is the type of sensor, ``passage`` the path of the data into the log.
+    ``ekf2_parameters`` are the logged EKF2 parameters of the source, by PX4 name and in PX4's
+    units. ``log`` is the file with the data.
     """
 
     name: str
@@ -86,7 +86,7 @@ class PositionSource(Record, frozen=True, kw_only=True):
 
 
 class ChosenSettings(Record, frozen=True, kw_only=True):
-    """Settings of the filter; ``clock_offset_s`` was added to the source's time stamps."""
+    """Settings of KF; ``clock_offset_s`` was added to the timestamps of the source."""
 
     sigma_a_m_s2: Positive
     sigma_z_m: Positive
@@ -98,7 +98,7 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
     clock_offset_s: float
 
 
-# Field of Tuned that says what each setting of the filter should be
+# Field of NoiseEstimate with the maximum-likelihood estimate of each KF setting
 TUNED_FIELDS = {"sigma_a_m_s2": "filter_sigma_a_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
@@ -108,7 +108,7 @@ Interval = tuple[float, float | None]
 
 
 class Compared(Record, frozen=True, kw_only=True):
-    """One of the two: what was given, and the flight that it is of."""
+    """One of the two inputs of diff: the given file and its log."""
 
     given: str
     kind: Literal["log", "report", "results"]
@@ -118,16 +118,16 @@ class Compared(Record, frozen=True, kw_only=True):
 
 
 class NumberChange(Record, frozen=True, kw_only=True):
-    """One number that differs.
+    """Number that differs.
 
     Attributes
     ----------
     path : str
         Path in the results of both: ``axes.aisle.filters.ekf2.nis_mean``.
     label, unit : str
-        The unit "share" is for 0 to 1.
+        The unit "share" means 0 to 1.
     a, b : float
-        Absent if only the other one has it.
+        Absent if only the other side has the number.
     a_interval, b_interval : (float, float or None)
         95 %; absent if none is recorded.
     """
@@ -142,7 +142,7 @@ class NumberChange(Record, frozen=True, kw_only=True):
 
 
 class SettingChange(Record, frozen=True):
-    """A setting, a parameter of PX4 or a fact about the flight that differs; absent if unknown."""
+    """Setting, PX4 parameter or flight data that differ; a value is absent if unknown."""
 
     name: str
     a: float | str | None = None
@@ -150,7 +150,7 @@ class SettingChange(Record, frozen=True):
 
 
 class FindingChange(Record, frozen=True):
-    """A finding that only one of the two has."""
+    """Finding that only one of the two inputs has."""
 
     id: str
     severity: Literal["error", "warning", "info"]
@@ -159,6 +159,8 @@ class FindingChange(Record, frozen=True):
 
 
 class _FlightResults(Record, frozen=True):
+    """Base class of the results of a comparison."""
+
     schema: Schema
     request: ComparisonRequest
     log: Log
@@ -173,33 +175,33 @@ class ComparisonResults(_FlightResults, frozen=True):
     ----------
     schema : Schema
     request : ComparisonRequest
-        What was analysed and how.
+        Files and settings of the analysis.
     log : Log
     source : PositionSource
     settings : ChosenSettings
     axes : mapping of axis name to AxisResult
     horizontal : mapping of "kf" and "ekf2" to HorizontalNis
-    tuning : mapping of axis name, or "horizontal" for north and east together, to Tuned
+    tuning : mapping of axis name, or "horizontal" for north and east together, to NoiseEstimate
     clock : Clock
     heading : HeadingError
-        How the source's frame is turned against the vehicle's heading.
+        Yaw misalignment between the position frame and the heading of the vehicle.
     ekf2_replay : Replayed
-        EKF2 replayed from the log, and how well that agrees with what was logged.
+        Replay of EKF2 from the log, and its agreement with the logged EKF2.
     why : mapping of axis name to WhySteps
-        Why EKF2 differs.
+        Differences between EKF2 and KF, by filter step.
     causes : tuple of Intervention
-        What was changed, each by a replay, and what that explains of what is not consistent.
+        Re-runs with one change each, and how much of an inconsistency each change explains.
     aids : mapping of PX4's name to AidResult
-        What EKF2 fused in flight, each judged by its own innovations; empty where none can be.
-    loop : LoopPart
+        Sensors that EKF2 fused, each with statistics of its innovations; empty without innovations.
+    loop : LoopResult
     story : tuple of str
-        What happened, in up to three sentences.
+        Summary of the flight in up to three sentences.
     findings : tuple of Finding
-        One per cause, most severe first, what the recording lacks before noises.
+        Most severe first; of the same severity, missing data before noises.
     notes : tuple of str
-        Choices made on the way.
+        Choices of the analysis.
     missing : tuple of Unavailable
-        What was looked for and not found.
+        Missing data, with reasons and actions.
     student : Student
     provenance : Provenance
     """
@@ -223,7 +225,7 @@ class ComparisonResults(_FlightResults, frozen=True):
 
 
 class AidsResults(Record, frozen=True):
-    """Results of ``px4fuse compare`` on a flight without a position source: EKF2's aids alone."""
+    """Results of ``px4fuse compare`` on a flight without position source: EKF2's aids only."""
 
     schema: Schema
     request: ComparisonRequest
@@ -236,14 +238,14 @@ class AidsResults(Record, frozen=True):
 
 
 class TuningResults(_FlightResults, frozen=True):
-    """Results of ``px4fuse tune``: the noises that the data ask for, by axis."""
+    """Results of ``px4fuse tune``: maximum-likelihood noises by axis."""
 
     tuning: dict[str, OrUnavailable[NoiseEstimate]]
     provenance: Provenance
 
 
 class SyncResults(_FlightResults, frozen=True):
-    """Results of ``px4fuse sync``: the clock offset of the position source."""
+    """Results of ``px4fuse sync``: time offset of the position source."""
 
     clock: OrUnavailable[Clock]
     provenance: Provenance
@@ -271,7 +273,7 @@ class GraphResults(Record, frozen=True):
 
 
 class EvaluationResults(Score, frozen=True, kw_only=True):
-    """Results of ``px4fuse evaluate``: the score, and what was scored against what."""
+    """Results of ``px4fuse evaluate``: errors of the estimate against the reference."""
 
     schema: Schema
     estimate: Track
@@ -282,8 +284,8 @@ class EvaluationResults(Score, frozen=True, kw_only=True):
 class WhatIfResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
-    All are judged over the times ``judged_s``. ``asked`` says that the changes of ``whatif`` are
-    what the data ask for; ``sweep`` has an outcome per value.
+    All statistics are over the spans ``judged_s``. ``asked`` is True if the changes of ``whatif``
+    are the maximum-likelihood estimates; ``sweep`` contains one summary per value.
     """
 
     schema: Schema
@@ -311,7 +313,7 @@ class ChangeResults(Record, frozen=True, kw_only=True):
     numbers : tuple of NumberChange
     findings : tuple of FindingChange
     worse : tuple of str
-        Verdicts that are worse in B, a sentence each; the exit code is 1 if there are any.
+        Verdicts that are worse in B, one sentence each; with any, the exit code is 1.
     provenance : Provenance
     """
 
@@ -336,7 +338,7 @@ Results = (
     | WhatIfResults
     | ChangeResults
 )
-# By the name in their schema
+# Types of results by the name in their schema
 KINDS: dict[str, type[Results]] = {
     COMPARISON: ComparisonResults,
     LOOP: LoopResults,
@@ -351,17 +353,17 @@ KINDS: dict[str, type[Results]] = {
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of everything that is written as results."""
+    """Return the JSON Schema (draft 2020-12) of all results."""
     kinds: dict[type, None] = dict.fromkeys(KINDS.values())
     components: dict[str, Any] = {}
 
     def either(kind: Any) -> dict[str, Any]:
         kinds.update(dict.fromkeys(kind.kinds))
-        return {"anyOf": [{"$ref": f"#/$defs/{one.__name__}"} for one in kind.kinds]}
+        return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.kinds]}
 
-    known = 0
-    while known < len(kinds):  # msgspec does not look into an Either by itself
-        known = len(kinds)
+    count = 0
+    while count < len(kinds):  # msgspec does not resolve the types inside a RecordOrUnavailable
+        count = len(kinds)
         _, components = msgspec.json.schema_components(
             list(kinds), schema_hook=either, ref_template="#/$defs/{name}"
         )
@@ -369,8 +371,8 @@ def schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": f"px4fuse-results-{VERSION}",
         "title": "Results of px4fuse",
-        "description": f"Numbers have {SIGNIFICANT_DIGITS} significant digits at most, or six "
-        "decimals where that is finer.",
+        "description": f"Numbers have at most {SIGNIFICANT_DIGITS} significant digits, or six "
+        "decimals if that is more precise.",
         "oneOf": [
             {
                 "$ref": f"#/$defs/{kind.__name__}",
@@ -383,15 +385,16 @@ def schema() -> dict[str, Any]:
 
 
 def to_plain(results: msgspec.Struct) -> dict[str, Any]:
-    """Results as dicts, lists and numbers, by the names that they have in JSON."""
+    """Convert results to dicts, lists and numbers, by their JSON names."""
     plain_results: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain)
     return plain_results
 
 
 def round_number(value: float) -> float:
-    """Round to ten significant digits, or to 1e-6 where that is finer (times of the UNIX clock).
+    """Round to ten significant digits, or to six decimals if that is more precise.
 
-    Digits beyond those depend on the processor: linear algebra libraries add in another order.
+    UNIX times need the six decimals. Further digits depend on the processor, as linear algebra
+    libraries add in different orders.
 
     >>> round_number(0.1 + 0.2), round_number(1795251250.2020123)
     (0.3, 1795251250.202012)
@@ -400,7 +403,7 @@ def round_number(value: float) -> float:
 
 
 def _round_numbers(value: Any) -> Any:
-    """Return plain results with every float rounded by :func:`round_number`."""
+    """Round all floats by :func:`round_number`."""
     if isinstance(value, dict):
         return {name: _round_numbers(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -409,27 +412,27 @@ def _round_numbers(value: Any) -> Any:
 
 
 def _plain(value: Any) -> float | dict[str, Any]:
-    """A number of numpy's as Python's own, any mapping as a dict.
+    """Convert a numpy number to a float, and a mapping to a dict.
 
     Raises
     ------
     NotImplementedError
-        It is neither.
+        The value is neither.
     """
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, float):
         return float(value)
-    raise NotImplementedError(f"results cannot hold a {type(value).__name__}")
+    raise NotImplementedError(f"results cannot contain a {type(value).__name__}")
 
 
 def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
-    """Text of results: stable order, numbers as :func:`round_number`, one trailing newline.
+    """Write results as JSON: stable order, rounded numbers, one trailing newline.
 
     Raises
     ------
     ValueError
-        A number in them is not finite.
+        A number is not finite.
     """
     plain_results = to_plain(results) if isinstance(results, msgspec.Struct) else results
     plain = _round_numbers(plain_results)
@@ -437,5 +440,5 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
 
 
 def file_hashes_in(text: str) -> list[str]:
-    """SHA-256 of every file that results as JSON rest on, as they stand there."""
+    """Return the SHA-256 of all input files in results (JSON text), in their order."""
     return re.findall(r'"([0-9a-f]{64})"', text)

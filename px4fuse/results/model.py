@@ -1,4 +1,4 @@
-"""What all results share: their schema's name, whose report it is, and what made it."""
+"""Common parts of all results: schema name, student and provenance."""
 
 import platform
 from importlib import metadata
@@ -11,7 +11,7 @@ from px4fuse.answers import Answers
 from px4fuse.record import Record
 
 VERSION: Literal["3.0"] = "3.0"
-# The libraries on whose arithmetic the numbers rest
+# Libraries that affect the numbers
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 MAX_NOTES_BYTES = 200_000
 MAX_PERSON_LENGTH = 10_000
@@ -20,22 +20,22 @@ Version = Annotated[str, Meta(pattern="^[0-9A-Za-z.+!_-]{1,60}$")]
 
 
 class Schema(Record, frozen=True):
-    """Which results these are, and the version of their contract."""
+    """Name of the results, and version of their schema."""
 
     name: str
     version: Literal["3.0"]
 
 
 class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Whose report it is; every part may be empty.
+    """Student of a report; every field may be empty.
 
     Attributes
     ----------
     name, id : str
     notes : str
-        The student's own words, Markdown.
+        Text of the student, Markdown.
     answers : Answers or UNSET
-        The form about the flight, as filled in.
+        Completed answer form.
     """
 
     name: Annotated[str, Meta(max_length=MAX_PERSON_LENGTH)] = ""
@@ -48,15 +48,15 @@ NO_STUDENT = Student()
 
 
 class Provenance(Record, frozen=True):
-    """Versions and the command line; nothing else of the machine is recorded.
+    """Versions and command line; no other data of the computer are recorded.
 
     Attributes
     ----------
     px4fuse, python : str
     libraries : mapping of str to str
-        On whose arithmetic the numbers rest.
+        Versions of the libraries that affect the numbers.
     command : str
-        For people; the request says what was analysed and how.
+        Command line for the reader; the request contains files and settings.
     """
 
     px4fuse: Version
@@ -66,12 +66,12 @@ class Provenance(Record, frozen=True):
 
 
 def schema_of(name: str) -> Schema:
-    """Name and version of what is written."""
+    """Return name and version of a schema."""
     return Schema(name, VERSION)
 
 
 def provenance(command: str) -> Provenance:
-    """Versions of this installation, and the command line."""
+    """Return the versions of this installation, with the command line."""
     return Provenance(
         px4fuse=metadata.version("px4fuse"),
         python=platform.python_version(),

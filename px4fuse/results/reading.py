@@ -1,4 +1,4 @@
-"""Results read back, strictly and within bounds: they may come from a stranger."""
+"""Strict reading of results, which may come from an untrusted source."""
 
 import json
 import unicodedata
@@ -17,24 +17,24 @@ INTEGER_BITS = 64
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
-    """Read results that px4fuse wrote, whoever hands them in.
+    """Read results of px4fuse from untrusted bytes.
 
     Parameters
     ----------
     data : bytes
-        Anything.
+        Content of the file.
     name : str
-        What to call it in errors.
+        File name for error messages.
 
     Returns
     -------
     Results
-        By the name in its schema. Texts are :func:`clean_text`, numbers are finite.
+        Of the type that its schema names. Texts are cleaned by :func:`clean_text`.
 
     Raises
     ------
     ResultsError
-        It is too large, not JSON, nested too deeply, or not results of this version.
+        The data are too large, not JSON, nested too deeply, or not results of this version.
     """
     if len(data) > MAX_BYTES:
         raise ResultsError(f"{name} is larger than {MAX_BYTES // 1_000_000} MB.")
@@ -48,13 +48,11 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     schema = value.get("schema") if isinstance(value, dict) else None
     kind = KINDS.get(str(schema.get("name"))) if isinstance(schema, dict) else None
     if schema is None or kind is None:
-        raise ResultsError(f"{name} holds no results of px4fuse.")
+        raise ResultsError(f"{name} contains no results of px4fuse.")
     if (version := str(schema.get("version"))) != VERSION:
         raise ResultsError(
-            (
-                f"{name} uses schema version {one_line(version, 20)}; this px4fuse reads "
-                f"version {VERSION}."
-            ),
+            f"{name} uses schema version {one_line(version, 20)}; this px4fuse reads version "
+            f"{VERSION}.",
             "Create the report again, or use the px4fuse version that wrote it.",
         )
     try:
@@ -67,13 +65,13 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
 
 
 def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:
-    """Refuse what one program reads from its first place and another one from its last."""
+    """Raise an error for repeated keys: programs differ in the value that they read."""
     if len(dict(pairs)) < len(pairs):
-        raise ValueError("a key stands there twice")
+        raise ValueError("a key is repeated")
 
 
 def _clean_values(value: Any) -> Any:
-    """The same with every text :func:`clean_text`."""
+    """Clean all texts in plain data by :func:`clean_text`; reject integers above 64 bits."""
     if isinstance(value, str):
         return clean_text(value)
     if isinstance(value, dict):
@@ -84,11 +82,11 @@ def _clean_values(value: Any) -> Any:
 
 
 def clean_text(text: str) -> str:
-    r"""Text without characters that act on a terminal, a page or the order of its neighbours.
+    r"""Remove characters that change a terminal, a page or the direction of text.
 
     Control characters other than newline and tab, bidirectional embeddings, overrides and
-    isolates, line and paragraph separators, invisible tags, noncharacters and lone surrogates are
-    dropped. Letters and signs of all languages stay.
+    isolates, line and paragraph separators, tag characters, noncharacters and lone surrogates are
+    removed. Letters and symbols of all languages remain.
 
     >>> clean_text("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
     'Zoë[2J gnp.exe'
@@ -97,12 +95,12 @@ def clean_text(text: str) -> str:
 
 
 def one_line(text: str, length: int) -> str:
-    r"""A cleaned text on one line, at most ``length`` characters long.
+    r"""Clean a text and shorten it to one line of at most ``length`` characters.
 
     >>> one_line("a\nb\t c", 4)
     'a b…'
     """
-    # of a million characters only as many are looked at as may count
+    # cut first, so that a text of millions of characters is processed fast
     line = " ".join(clean_text(text[: 10 * length]).split())
     return line if len(line) <= length else line[: length - 1].rstrip() + "…"
 
