@@ -575,7 +575,7 @@ class _Ekf2Changes(_FilterChanges):
         return float(np.sqrt(np.median(np.maximum(stated, flown[aid.noise] ** 2))))
 
     def time_offset_candidates(self) -> list[Change]:
-        """Return EKF2's delay parameter, or a shift of the timestamps that no parameter sets."""
+        """Return a change of EKF2's delay, or a shift of the timestamps if it has no effect."""
         delay = ml_delay_change(self.comparison, self.inputs, self.clock)
         return [delay] if delay else super().time_offset_candidates()
 
