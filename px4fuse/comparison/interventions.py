@@ -296,7 +296,7 @@ def _difference_reduction(
 
 
 def is_inconsistent(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[FilterSummary]:
-    """Return True if the mean NIS is outside its band and σ is wrong by a factor of 1.25 or more."""
+    """Return True if the mean NIS is outside its band and σ is wrong by at least 25 %."""
     if isinstance(statement, Unavailable):
         return False
     return (
@@ -430,7 +430,7 @@ class _FilterChanges:
         is_underconfident = of == "nis" and statement.nis_mean < 1.0
         tuned = tuning_of_axis(self.tuning, result.axis.name)
         changes = list[Change]()
-        # the innovations of such a source do not show its slow errors
+        # innovations against GNSS or a drifting source do not show its slow errors
         hides_noise = origin.may_drift or origin.is_gnss
         if tuned is not None and not (is_underconfident and hides_noise):
             changes += self.noise_candidates(statement, tuned, is_underconfident)
@@ -575,7 +575,7 @@ class _Ekf2Changes(_FilterChanges):
         return float(np.sqrt(np.median(np.maximum(stated, flown[aid.noise] ** 2))))
 
     def time_offset_candidates(self) -> list[Change]:
-        """Return a change of EKF2's delay, or a shift of the timestamps if it has no effect."""
+        """Return a change of EKF2's delay, or else a shift of the timestamps."""
         delay = ml_delay_change(self.comparison, self.inputs, self.clock)
         return [delay] if delay else super().time_offset_candidates()
 

@@ -87,8 +87,8 @@ class Likelihood:
 
     With acceleration and measurement noise only, all but a scale depends smoothly on their ratio.
     So -ln p is computed on demand at nodes of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z, and interpolated
-    with polynomials. Singularities of the likelihood are π/2 from the real axis, so the interpolation
-    error is at the level of rounding.
+    with polynomials. Singularities of the likelihood are π/2 from the real axis, so the
+    interpolation error is at the level of rounding.
 
     Parameters
     ----------

@@ -111,7 +111,7 @@ class Axis:
 
     @property
     def called(self) -> str:
-        """Name in messages: "the aisle" if elongated or with --heading, else "the main direction"."""
+        """Name in messages; "the aisle" only for an elongated track or with --heading."""
         if self.name != AISLE:
             return self.name
         flown = self.elongation is None or self.elongation >= MIN_AISLE_ELONGATION
