@@ -49,7 +49,7 @@ def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Intervention:
     return cause_of(analysis.causes, owner, "aisle", of)
 
 
-def test_nothing_is_tried_where_nothing_is_wrong() -> None:
+def test_interventions_without_discrepancy_are_empty() -> None:
     assert flown().causes == ()
 
 
@@ -76,7 +76,7 @@ def test_nothing_is_tried_where_nothing_is_wrong() -> None:
         ("ekf2-delay=0.175", {}, "ekf2", "nees", {"EKF2_EV_DELAY": (0, 0)}),
     ],
 )  # fmt: skip
-def test_the_cause_is_what_was_made_wrong(mistake, settings, owner, of, change) -> None:
+def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of, change) -> None:
     analysis = flown(*filter(None, (mistake,)), **settings)
     found = cause(analysis, owner, of)
     assert found.change.keys() == change.keys()
@@ -89,7 +89,7 @@ def test_the_cause_is_what_was_made_wrong(mistake, settings, owner, of, change) 
     assert "replayed: " in (ours if owner == "kf" else ekf2)
 
 
-def test_a_bias_that_is_taken_out_is_an_imu_without_it() -> None:
+def test_kf_changes_remove_bias_from_acceleration() -> None:
     analysis = flown("accel-bias=0.5")
     found, imu = cause(analysis, "kf"), analysis.flight.imu
     without = imu[Columns.SPECIFIC_FORCE] - [found.change[FORWARD], found.change[TO_RIGHT], 0.0]
@@ -98,7 +98,7 @@ def test_a_bias_that_is_taken_out_is_an_imu_without_it() -> None:
     assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
 
 
-def test_vibration_asks_ekf2_for_more_process_noise_as_far_as_px4_lets_it() -> None:
+def test_ekf2_changes_vibration_raises_noise_to_px4_limit() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's largest
@@ -107,7 +107,7 @@ def test_vibration_asks_ekf2_for_more_process_noise_as_far_as_px4_lets_it() -> N
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
 
 
-def test_an_offset_that_was_applied_to_ours_is_still_missing_to_ekf2() -> None:
+def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK]
     analysis = explain(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
@@ -122,7 +122,7 @@ def test_an_offset_that_was_applied_to_ours_is_still_missing_to_ekf2() -> None:
 @pytest.mark.parametrize(
     ("analysis", "of"), [(lambda: flown(sigma_z=0.03), "nis"), (lambda: flown(LATE), "nees")]
 )
-def test_a_number_of_our_filter_is_that_of_a_comparison_with_the_change(analysis, of) -> None:
+def test_kf_rerun_equals_comparison_with_the_change(analysis, of) -> None:
     analysis = analysis()
     found = cause_of(analysis.causes, "kf", "north", of)
     again = compare(analysis.flight, replace(analysis.settings, **found.change))
@@ -137,7 +137,7 @@ def test_a_number_of_our_filter_is_that_of_a_comparison_with_the_change(analysis
     assert found.explains == pytest.approx(1.0 - np.log(found.after) / np.log(found.before))
 
 
-def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
+def test_ekf2_rerun_equals_what_if() -> None:
     analysis = flown("ekf2-noise=0.03")
     found = [cause_of(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
@@ -157,7 +157,7 @@ def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
 rms_apart = attrgetter("main.difference.position_rmse_m")
 
 
-def test_a_cause_says_how_far_it_keeps_both_filters_apart() -> None:
+def test_cause_has_difference_before_and_after() -> None:
     ours = flown(sigma_a=0.02)
     right = compare(ours.flight, replace(ours.settings, **cause(ours, "kf").change))
     (row,) = [one for one in ours.causes if (one.of, one.axis) == ("apart", "aisle")]
@@ -174,7 +174,7 @@ def test_a_cause_says_how_far_it_keeps_both_filters_apart() -> None:
     assert "Put right in EKF2, that brings both from" in story(theirs, find(theirs))[1]
 
 
-def test_outliers_are_left_out_of_stamps_that_are_moved() -> None:
+def test_outliers_are_excluded_at_shifted_timestamps() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS]
     rows = [one for one in analysis.causes if one.filter == "ekf2" and one.axis == "aisle"]
@@ -193,7 +193,7 @@ def test_outliers_are_left_out_of_stamps_that_are_moved() -> None:
         assert nis.mean() < 1.3
 
 
-def test_a_parameter_that_is_not_px4s_is_tried() -> None:
+def test_ekf2_changes_include_non_default_parameter() -> None:
     analysis = flown("ekf2-noise=0.03")
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
@@ -204,7 +204,7 @@ def test_a_parameter_that_is_not_px4s_is_tried() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_what_explains_too_little_or_too_much_is_no_cause() -> None:
+def test_is_cause_requires_half_to_one_and_a_half() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
         return Intervention(
             of="nis", filter="kf", axis="aisle", change=change, before=9.0,
@@ -225,7 +225,7 @@ def test_what_explains_too_little_or_too_much_is_no_cause() -> None:
     assert cause_of([whole], "ekf2", "aisle") is cause_of([whole], "kf", "north") is None
 
 
-def test_without_what_it_needs_a_candidate_is_not_tried() -> None:
+def test_candidate_without_required_data_is_skipped() -> None:
     analysis = flown("nlos=7%", sigma_z=0.05)
     missing = Unavailable("it", "not known", "None.")
 

@@ -60,7 +60,7 @@ def matrices(elements: Array) -> Array:
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_the_system_is_that_of_the_dense_normal_equations(seed: int) -> None:
+def test_system_equals_dense_normal_equations(seed: int) -> None:
     """Two stretches, and a state that nothing measures, by lstsq, slogdet and inv."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(6, 14))
@@ -105,7 +105,7 @@ def test_the_system_is_that_of_the_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
-def test_legs_of_one_step_are_factorised_far_beyond_the_search() -> None:
+def test_factorise_single_steps_outside_search_range() -> None:
     """Their Q is of rank one: of what makes it invertible, rounding leaves nothing."""
     step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
@@ -206,7 +206,7 @@ def joint_normal(
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
-def test_marginal_constants_are_a_covariance() -> None:
+def test_fit_positions_constants_act_as_covariance() -> None:
     """At all offsets and noises, but for one number that is always the same."""
     part = with_constants()
 
@@ -230,7 +230,7 @@ def test_marginal_constants_are_a_covariance() -> None:
 
 
 @pytest.mark.parametrize("start_known", [True, False])
-def test_an_axis_that_is_hardly_measured_says_nothing(start_known: bool) -> None:
+def test_fit_positions_single_measurement_has_no_effect(start_known: bool) -> None:
     """One position in a stretch, wherever it is, and none at all are the same."""
     part = with_constants()
     if not start_known:
@@ -244,7 +244,7 @@ def test_an_axis_that_is_hardly_measured_says_nothing(start_known: bool) -> None
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
 
-def test_constants_and_squares_are_those_of_the_conditional_distribution() -> None:
+def test_constants_and_squares_equal_conditional_normal() -> None:
     part = with_constants(offsets=1)
     # of a third axis that is hardly measured the square would say nothing
     part = replace(part, measurement_m=part.measurement_m * [1.0, 1.0, np.nan])
@@ -271,7 +271,7 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
+def test_products_by_stretch_equal_dense_covariance() -> None:
     part, noises = with_constants(offsets=1), Noises(0.5, 0.1)
     signal = np.random.default_rng(8).normal(0.0, 1.0, (COUNT, 3, 2))
     still = np.zeros((3, 2, COUNT - 1))
@@ -293,7 +293,7 @@ def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
         np.testing.assert_allclose(ours[stretch], expected[1], rtol=1e-4, atol=1e-4)
 
 
-def test_a_smooth_path_taken_out_changes_nothing() -> None:
+def test_centre_on_path_keeps_likelihood() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
     plain, ours = (fit_positions(*each).totals()[0] for each in given)
@@ -311,7 +311,7 @@ def test_a_smooth_path_taken_out_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("which", ["filter", "constants"])
-def test_the_likelihood_between_its_nodes_is_the_likelihood(which: str) -> None:
+def test_likelihood_interpolation_equals_direct_value(which: str) -> None:
     """Over four powers of ten of the ratio and of SIGMA_Z, but for one number always the same."""
     parts = [filter_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
@@ -341,7 +341,7 @@ def with_gap() -> Axis:
 
 
 @pytest.mark.parametrize("interval", [0.1, 0.2, 0.5, None])
-def test_the_filters_likelihood_is_that_of_its_innovations(interval: float | None) -> None:
+def test_filter_positions_likelihood_equals_innovations(interval: float | None) -> None:
     """With legs of one step, whose Q has no inverse, of more, and through an IMU gap."""
     axis, chosen = with_gap(), Settings()
     if interval is not None:
@@ -367,7 +367,7 @@ def test_the_filters_likelihood_is_that_of_its_innovations(interval: float | Non
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, 0.8, -3.0])
-def test_the_ends_of_a_parabola_are_196_sigma_away(slope: float) -> None:
+def test_profile_ends_of_parabola_are_1_96_sigma(slope: float) -> None:
     """With the other parameter free, which follows: its sigma is that of the margin."""
     sigma, other_sigma = 0.2, 0.05
 
@@ -423,7 +423,7 @@ def clean() -> list[NoiseFit]:
     ("share", "size_m", "length", "least_found"),
     [(0.05, 2.0, 4, 0.99), (0.12, 2.0, 4, 0.99), (0.06, 0.5, 2, 0.9)],
 )
-def test_outliers_are_found_and_do_not_move_the_noise(clean, share, size_m, length, least_found):
+def test_maximise_likelihood_finds_outliers(clean, share, size_m, length, least_found):
     hits = wrong = missed = 0
     ratio = []
     for seed in SEEDS:
@@ -448,7 +448,7 @@ def test_outliers_are_found_and_do_not_move_the_noise(clean, share, size_m, leng
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(axes, share, width):
+def test_outlier_variance_factor_equals_mixture_curvature(axes, share, width):
     """Of measurements without any motion, whose likelihood can be written down."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share
@@ -479,7 +479,7 @@ def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(axes, 
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
-def test_without_a_search_the_weights_stay() -> None:
+def test_maximise_likelihood_without_outliers_keeps_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
     parts = [filter_positions(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, outliers=False)
@@ -491,7 +491,7 @@ def test_without_a_search_the_weights_stay() -> None:
         assert negative_log_likelihood(parts, other, weight) > best
 
 
-def test_outlier_probability_goes_from_the_prior_to_certainty() -> None:
+def test_outlier_probability_rises_from_prior_to_one() -> None:
     """Bayes: ε N(e; 0, w²σ²) against (1 - ε) N(e; 0, σ²), over all axes."""
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):
