@@ -1,6 +1,7 @@
-"""What explains innovations better than noise: the tool against replays, the causes against truth.
+"""Biases, scale factor error, jumps and low pass, and the findings that report them.
 
-Each detector on a clean flight, a faulty one, one without what it needs, and a short one.
+Each detector runs on a flight without a fault, with the fault, without required data, and on a
+short flight.
 """
 
 from functools import cache
@@ -35,7 +36,7 @@ DETECTORS = (*OF_CAUSES, source_clock.detect, source_frame.detect, noises.deviat
 
 
 def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analysis:
-    """A flight with its noises, its clock and its frame, all that the detectors here need."""
+    """Analyse a flight for the detectors: noises, time offset and frame misalignment."""
     comparison = compare(flight, settings, axes=("north", "east"), **span)
     tuning, clock = noises_and_clock(comparison)
     heading = estimate_frame_rotation(comparison, tuning, clock)
@@ -57,11 +58,11 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
     return {finding.id: finding for detector in detectors for finding in detector(analysis)}
 
 
-# ------------------------------------------------------------------ the tool
+# ------------------------------------------------------------------ the regression
 
 
 def test_design_columns_equal_filter_responses() -> None:
-    """Of the measurements, and of these with a step in them, against replays with filterpy."""
+    """Compare innovations with and without a step with filterpy replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
     intervals = preintegrate(north, RIGHT)
@@ -80,7 +81,7 @@ def test_design_columns_equal_filter_responses() -> None:
         updates = replay(moved, RIGHT).updates
         np.testing.assert_allclose(column, updates["innovation_m"], atol=1e-9)
         np.testing.assert_allclose(s, updates["innovation_variance_m2"], rtol=1e-9)
-    # what is not fused, as the filter of the likelihood leaves it out
+    # skipped measurements
     skip = np.arange(len(none)) % 7 == 3
     nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
     expected = innovations(intervals, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
@@ -125,7 +126,7 @@ def test_design_fit_equals_least_squares_with_prior() -> None:
     np.testing.assert_allclose(made.residual, data - columns @ expected)
     np.testing.assert_allclose(made.covariance, np.linalg.inv(rows.T @ rows), rtol=1e-9)
     assert made.square_sum == pytest.approx(np.sum((np.append(data, 0.0) - rows @ expected) ** 2))
-    # a sigma is widened where more remains than the noises say
+    # σ is widened if the residual exceeds the assumed noise
     sigma = np.sqrt(made.covariance[0, 0])
     for spread, widened in ((3.0, 3.0), (0.5, 1.0)):
         assert replace(made, residual_rms=spread).estimate(0).sigma == pytest.approx(
@@ -149,7 +150,7 @@ def test_fit_clean_flight_has_no_bias_scale_or_jump() -> None:
     [
         ("accel-bias=0.4", "accelerometer_bias", "error", {"bias_m_s2": (0.4, 0.1)}),
         ("scale=25%", "source_scale_wrong", "error", {"scale": (1.25, 0.1)}),
-        # less than the time constant, by half an interval
+        # the lag is the time constant minus half an interval
         ("smoothed=0.5", "source_smoothed", "error", {"lag_s": (0.41, 0.1)}),
         ("jump=1,40s", "source_jumps", "error", {"size_m": (1.0, 0.3), "count": (1.0, 0.0)}),
         ("decimate=2Hz", "source_thinned", "error", {"source_rate_hz": (5.0, 0.1)}),
@@ -180,14 +181,14 @@ def test_find_simulated_mistake_is_first_with_size(mistake, name, severity, evid
 def test_find_simulated_mistake_has_command(name, mistake, settings, severity, remedy) -> None:
     named = found(analysed(flight(), replace(RIGHT, **settings)) if settings else flown(mistake))
     assert named[name].severity == severity
-    # both noises make S too large; only the likelihood knows which
+    # either noise makes S too large; the likelihood separates them
     if name.endswith("_large"):
         assert [other for other in named if other.startswith("sigma")] == [name]
     assert any(part in named[name].remedy for part in remedy.split("|"))
 
 
 def test_scale_estimate_noise_does_not_bias_it() -> None:
-    """Regression on a noisy acceleration would give 8 % too little, on every flight."""
+    """Plain regression on a noisy acceleration would be 8 % too small."""
     scales = []
     for seed in range(5):
         flown = simulate_flight(Scenario(ekf2=False, truth=False, seed=seed))
@@ -216,7 +217,7 @@ def test_time_offset_is_not_reported_as_low_pass() -> None:
     assert replace(late, clock=unavailable("clock offset")).smoothing.gain_nats > 3.0
 
 
-# ------------------------------------------------------------------ stamps of arrival
+# ------------------------------------------------------------------ arrival times
 
 
 @cache
@@ -233,7 +234,7 @@ def test_clock_change_from_publication_age_has_severity(jump, severity):
     assert "--start 50" in finding.remedy
 
 
-# ------------------------------------------------------------------ what is missing
+# ------------------------------------------------------------------ missing data
 
 
 def without_variances(flight: Flight) -> Flight:

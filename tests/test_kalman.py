@@ -1,4 +1,4 @@
-"""The filter and its formulas against a recursion in plain Python, as the lesson writes it."""
+"""KF and its formulas against a recursion in plain Python, as in the lesson."""
 
 import math
 from bisect import bisect_right
@@ -24,7 +24,7 @@ STATE = STATES + COVARIANCES
 
 
 def steps_of(measured: Sequence[float], dt: float) -> list[float]:
-    """The DT grid from the first measurement on, and each measurement's own time."""
+    """Return the DT grid from the first measurement, with all measurement times."""
     kept = list(measured)
     for k in range(math.floor((measured[-1] - measured[0]) / dt + 1e-6) + 1):
         time = measured[0] + k * dt
@@ -38,7 +38,7 @@ def steps_of(measured: Sequence[float], dt: float) -> list[float]:
 def mean_acceleration(
     times: Sequence[float], values: Sequence[float], start: float, end: float
 ) -> float:
-    """Mean over a step of a signal that has in each interval the mean of its two samples."""
+    """Return the mean over a step of a signal with piecewise constant means of two samples."""
     total = 0.0
     at = max(bisect_right(times, start) - 1, 0)
     while at + 1 < len(times) and times[at] < end:
@@ -126,7 +126,7 @@ def test_replay_starts_at_first_measurement_or_state(axis: Axis) -> None:
 
 
 def test_state_at_predicts_from_previous_step(axis: Axis) -> None:
-    """At a step it is the step's, between two by the input; outside the replay not a number."""
+    """At a step the state is that of the step, between two predicted, outside NaN."""
     run = replay(axis, Settings())
     edges = run.steps.index.to_numpy()
     np.testing.assert_array_equal(np.transpose(state_at(run, edges)), run.steps[STATE[:2]])
@@ -143,7 +143,7 @@ def test_state_at_predicts_from_previous_step(axis: Axis) -> None:
 @pytest.mark.parametrize("dt", [0.02, 0.1, 0.4])
 @pytest.mark.parametrize("gap", [False, True])
 def test_variance_at_predicts_from_previous_step(dt: float, gap: bool) -> None:
-    """P = FPFᵀ + Q written as matrices, at every point of every step, with an IMU gap or not."""
+    """P = FPFᵀ + Q in matrix form, at several points of every step, with and without a gap."""
     time = 0.37 * np.arange(12)
     imu = np.arange(0.0, 5.0, 0.02)
     imu = imu[(imu < 1.0) | (imu > 2.5)] if gap else imu
@@ -195,14 +195,14 @@ def test_replay_imu_gap_adds_input_mean_square_to_q() -> None:
     mean_square = np.mean(value[outside_gap] ** 2)
     at = broken.steps.index.searchsorted([4.09, 4.19])
     before, after = broken.steps["velocity_variance_m2_s2"].iloc[at]
-    # between two measurements the gap lasts 0.5 s, five times DT, and the motion persists in it
+    # the gap between two measurements lasts 0.5 s, five times DT, with persistent acceleration
     assert after - before == pytest.approx((0.5**2 + 5.0 * mean_square) * 0.1 * 0.1, rel=1e-6)
     at = whole.steps.index[(whole.steps.index > 4.05) & (whole.steps.index < 4.95)]
     raised = broken.steps.loc[at, "position_variance_m2"]
     assert np.all(raised > whole.steps.loc[at, "position_variance_m2"])
 
 
-# ---- the formulas, element by element, against the matrices that they stand for ----
+# ---- formulas by elements against their matrices ----
 
 P = (0.5, -0.2, 0.7)
 

@@ -48,15 +48,15 @@ def test_innovations_sample_grid_equals_replay(sample_flight: Flight) -> None:
         for i, sigma_a in enumerate(SIGMA_A):
             for j in range(3) if axis.name == "north" else [i]:
                 chosen = Settings(sigma_a_m_s2=sigma_a, sigma_z_m=SIGMA_Z[j])
-                ours = np.array([nu[:, i, j], s[:, i, j]])
-                np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
+                found = np.array([nu[:, i, j], s[:, i, j]])
+                np.testing.assert_allclose(found, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
 
 
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
 def test_innovations_any_axis_equal_replay(axis: Axis, chosen: Settings) -> None:
-    ours = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
-    np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
+    found = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
+    np.testing.assert_allclose(found, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
     quick, exact = quick_replay(axis, chosen), replay(axis, chosen)
     for table in ("steps", "updates"):
         frames = getattr(quick, table), getattr(exact, table)
@@ -69,8 +69,8 @@ def test_innovations_with_imu_gap_equal_replay() -> None:
     time = 0.37 * np.arange(30)
     axis = line(time, np.sin(time), (imu, -np.sin(imu)))
     assert replay(axis, Settings()).input_gap_s > 1.0
-    ours = innovations(preintegrate(axis, Settings()), 0.5, 0.1)
-    np.testing.assert_allclose(ours, replayed(axis, Settings()), rtol=1e-9, atol=1e-9)
+    found = innovations(preintegrate(axis, Settings()), 0.5, 0.1)
+    np.testing.assert_allclose(found, replayed(axis, Settings()), rtol=1e-9, atol=1e-9)
 
 
 @settings(max_examples=30)
@@ -81,19 +81,19 @@ def test_filter_states_equal_replay_at_measurements(axis: Axis, chosen: Settings
     )
     run = replay(axis, chosen)
     after, updates = run.steps.loc[run.updates.index], run.updates
-    for ours, theirs in (
+    for values, expected in (
         (grid.gain, updates["gain_position"]),
         (grid.velocity_m_s, after["velocity_m_s"]),
         (grid.sigma_p_m**2, after["position_variance_m2"]),
         (grid.sigma_v_m_s**2, after["velocity_variance_m2_s2"]),
         (grid.nis, updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]),
     ):
-        assert ours.shape == (len(updates), 2, 1)
-        np.testing.assert_allclose(ours[:, 1, 0], theirs, rtol=1e-9, atol=1e-9)
+        assert values.shape == (len(updates), 2, 1)
+        np.testing.assert_allclose(values[:, 1, 0], expected, rtol=1e-9, atol=1e-9)
 
 
 def test_innovations_skipped_measurement_is_not_fused() -> None:
-    """As if it were not there, for all that come after it."""
+    """Later innovations are as without the skipped measurement."""
     axis = walk(count=60)
     skip = np.zeros(59, dtype=bool)
     skip[[20, 21, 40]] = True
@@ -107,7 +107,7 @@ def test_innovations_skipped_measurement_is_not_fused() -> None:
 
 
 def test_run_filter_weight_divides_variance() -> None:
-    """A weight of 1/w² is SIGMA_Z times w; hardly any weight is a measurement left out."""
+    """A weight of 1/w² multiplies SIGMA_Z by w; a weight near zero excludes the measurement."""
     legs = preintegrate(walk(count=40), ZERO)
     rows = list(run_filter(legs, 0.5, 0.2, None, np.full(39, 4.0)))
     heavier = innovations(legs, 0.5, 0.1)
@@ -120,7 +120,7 @@ def test_run_filter_weight_divides_variance() -> None:
 
 
 def test_score_grid_equals_normal_density() -> None:
-    """Of both axes, against scipy's density of the replay's innovations."""
+    """Compare both axes with scipy's density of the replay's innovations."""
     axes = walk(4, count=60), walk(5, count=60)
     a, z = np.array([0.2, 0.5, 2.0]), np.array([0.05, 0.1])
     legs = [preintegrate(axis, ZERO) for axis in axes]
@@ -139,6 +139,6 @@ def test_parabola_vertex_from_three_points_is_exact() -> None:
     for vertex, bend in ((-0.5, 0.3), (-0.2, 4.0), (0.0, 0.3), (0.35, 4.0)):
         found = parabola_vertex(1.0 + 0.5 * bend * (steps - vertex) ** 2, 3)
         assert found == pytest.approx((vertex, bend), abs=1e-12)
-    # one that does not bend upwards has none
+    # without upward curvature there is no vertex
     assert parabola_vertex(np.array([3.0, 2.0, 1.0]), 1) == (0.0, 0.0)
     assert parabola_vertex(np.array([1.0, 2.0, 1.0]), 1) == (0.0, -2.0)

@@ -53,7 +53,7 @@ def flight_of(*, imu=ABSENT, attitude=ABSENT, track=None, duration_s=10.0, airbo
 # ---- acceleration in NED ----------------------------------------------------------------------
 
 
-def acceleration_of(time, force, attitude):
+def ned_acceleration_of(time, force, attitude):
     """Acceleration in NED that a specific force in the body gives."""
     return ned_acceleration(flight_of(imu=still_imu(time, force), attitude=attitude))
 
@@ -65,7 +65,7 @@ def test_ned_acceleration_at_rest_is_zero_at_any_attitude(angles_deg):
     time = np.arange(0.0, 5.0, 0.01)
     tilt = Rotation.from_euler("ZYX", angles_deg, degrees=True)
     attitude = attitude_table(time[::5], Rotation.concatenate([tilt] * len(time[::5])))
-    acceleration = acceleration_of(time, tilt.inv().apply([0.0, 0.0, -GRAVITY]), attitude)
+    acceleration = ned_acceleration_of(time, tilt.inv().apply([0.0, 0.0, -GRAVITY]), attitude)
     assert list(acceleration.columns) == list(AXIS_NAMES)
     np.testing.assert_allclose(acceleration, 0, atol=1e-12)
     np.testing.assert_array_equal(acceleration.index, time[time <= time[::5][-1]])
@@ -74,7 +74,7 @@ def test_ned_acceleration_at_rest_is_zero_at_any_attitude(angles_deg):
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 1, 0), (0.6, 0.0, 0.8)])
 @pytest.mark.parametrize("rate_rad_s", [0.5, -3.0])
 def test_ned_acceleration_rotating_body_is_constant(axis, rate_rad_s):
-    """Turning at a constant rate, acceleration_of force is R(t)ᵀ(a − g); a must come back.
+    """Turning at a constant rate, the specific force is R(t)ᵀ(a − g); a must come back.
 
     The attitude is logged ten times slower than the IMU; interpolation on the sphere is exact for
     a constant rate.
@@ -87,7 +87,9 @@ def test_ned_acceleration_rotating_body_is_constant(axis, rate_rad_s):
 
     time = np.arange(0.0, 5.0, 0.005)
     force = body_to_ned(time).inv().apply(truth - [0.0, 0.0, GRAVITY])
-    acceleration = acceleration_of(time, force, attitude_table(time[::10], body_to_ned(time[::10])))
+    acceleration = ned_acceleration_of(
+        time, force, attitude_table(time[::10], body_to_ned(time[::10]))
+    )
     assert len(acceleration) > 980
     np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=1e-9)
 
@@ -97,7 +99,9 @@ def test_ned_acceleration_without_overlap_is_unavailable():
     level = attitude_table(time, Rotation.identity(len(time)))
     assert ned_acceleration(flight_of(attitude=level)) is ABSENT
     assert ned_acceleration(flight_of(imu=still_imu(time))) is ABSENT
-    assert "overlap" in acceleration_of(time, (0.0, 0.0, 0.0), level.set_axis(time + 100.0)).reason
+    assert (
+        "overlap" in ned_acceleration_of(time, (0.0, 0.0, 0.0), level.set_axis(time + 100.0)).reason
+    )
 
 
 # ---- averages over steps ----------------------------------------------------------------------
