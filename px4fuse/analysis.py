@@ -1,6 +1,6 @@
-"""Request → Analysis: the one way to run a comparison or a loop.
+"""Run a comparison, a loop analysis or a what-if from its request.
 
-Readers, alignment, filter, comparison and what explains it are called from here, in that order.
+The order: readers, alignment, KF, comparison with EKF2, explanations.
 """
 
 from __future__ import annotations
@@ -59,31 +59,31 @@ from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# Noises that the report states: those of a source once. Each axis by itself is for `px4fuse tune`
+# The report contains one noise estimate for both horizontal axes; `px4fuse tune` has each axis
 REPORTED_AXES = (HORIZONTAL, "down")
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Analysis(Comparison):
-    """A comparison and what explains it.
+    """Comparison of KF and EKF2 with the estimates and re-runs that explain it.
 
     Attributes
     ----------
     flight, source, source_reason, segment, settings, lines, notes, missing, axes, horizontal
-        As :class:`~px4fuse.comparison.model.Comparison` has them.
+        See :class:`~px4fuse.comparison.model.Comparison`.
     tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
-        The noises that the data ask for.
+        Maximum-likelihood estimates of the noises.
     clock : ClockOffset or Unavailable
     ekf2_model : Model or Unavailable
-        EKF2 made ready for replays; whether they can be believed is in its agreement.
+        EKF2 prepared for replays; ``agreement`` states how well a replay matches the log.
     why : mapping from axis name to Why or Unavailable
-        Why EKF2 differs.
+        Steps that explain the difference KF - EKF2.
     loop : Loop or Unavailable
         Loop closure of the flight's odometry.
     heading : HeadingError or Unavailable
-        How the source's frame is turned against the vehicle's heading.
+        Misalignment of the source's frame in yaw.
     request : ComparisonRequest or None
-        What was asked for; None where :func:`explain` was given a comparison.
+        None if :func:`explain` was called without :func:`run`.
     """
 
     tuning: Tuning
@@ -96,46 +96,46 @@ class Analysis(Comparison):
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
-        """EKF2 replayed as flown, with its agreement with the log."""
+        """EKF2 replay with the flown parameters, and its agreement with the log."""
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.flown
 
     @cached_property
     def events(self) -> Events:
-        """What is marked on every time axis."""
+        """Events for the time axes: gaps, rejections, resets, flight modes."""
         return collect_events(self)
 
     @property
     def others(self) -> list[AxisComparison]:
-        """The axes beside the main one."""
+        """All axes except the main one."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
     @cached_property
     def causes(self) -> tuple[Intervention, ...]:
-        """What was changed, each by itself, and what that explains of each discrepancy."""
+        """Re-runs with one change each, and the share of a discrepancy that each explains."""
         model = self.ekf2_model
         tried = interventions(
             self, self.tuning, self.clock, self.heading, self.bias_scale_jump_fit, model
         )
-        if isinstance(model, Model):  # most of its memory; what is asked for later is made again
+        if isinstance(model, Model):  # frees most of the memory; later requests replay again
             model.runs.clear()
             model.intervals.clear()
         return tried
 
     @cached_property
     def bias_scale_jump_fit(self) -> BiasScaleJumpFit | Unavailable:
-        """Biases, scale and jumps that explain the innovations better than noise."""
-        found = self._horizontal_estimate()
-        if isinstance(found, Unavailable):
-            return found
-        axes, tuned, offset_s = found
+        """Accelerometer biases, scale factor error and jumps, fitted to the innovations."""
+        horizontal = self._horizontal_estimate()
+        if isinstance(horizontal, Unavailable):
+            return horizontal
+        axes, axis_tuning, offset_s = horizontal
         return bias_scale_jump_fit(
             self.flight,
             axes,
             self.settings,
-            sigma_a_m_s2=value_or_bound(tuned.filter_sigma_a, self.settings.sigma_a_m_s2),
-            sigma_z_m=value_or_bound(tuned.sigma_z, self.settings.sigma_z_m),
-            outlier_time_s=tuned.outlier_time_s,
+            sigma_a_m_s2=value_or_bound(axis_tuning.filter_sigma_a, self.settings.sigma_a_m_s2),
+            sigma_z_m=value_or_bound(axis_tuning.sigma_z, self.settings.sigma_z_m),
+            outlier_time_s=axis_tuning.outlier_time_s,
             clock_offset_s=offset_s,
         )
 
@@ -143,7 +143,7 @@ class Analysis(Comparison):
     def time_correlation_fit(
         self,
     ) -> tuple[SourceLowPass | Unavailable, TimeCorrelatedNoise | Unavailable]:
-        """A low pass and a slow error of the source, jumps taken out."""
+        """Low pass and time-correlated noise of the position source, without position jumps."""
         horizontal = self._horizontal_estimate()
         if isinstance(horizontal, Unavailable):
             return horizontal, horizontal
@@ -153,7 +153,7 @@ class Analysis(Comparison):
             if isinstance(self.bias_scale_jump_fit, BiasScaleJumpFit)
             else ()
         )
-        # when exactly a jump was is not known
+        # the exact time of a jump is unknown: exclude the measurements after it
         time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
         for jump in jumps:
             near = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
@@ -178,28 +178,28 @@ class Analysis(Comparison):
 
     @property
     def smoothing(self) -> SourceLowPass | Unavailable:
-        """A low pass in the source."""
+        """Low pass of the position source, or Unavailable."""
         return self.time_correlation_fit[0]
 
     @property
     def coloured(self) -> TimeCorrelatedNoise | Unavailable:
-        """A slow error of the source, where something makes successive errors hang together."""
+        """Time-correlated noise of the position source, or Unavailable."""
         return self.time_correlation_fit[1]
 
     @cached_property
     def aids(self) -> Mapping[str, AidResult] | Unavailable:
-        """Every aid that EKF2 can fuse, judged by its own innovations."""
+        """Innovation check of every aid that EKF2 can fuse, by PX4's name."""
         return evaluate_aids(self.flight)
 
     def _horizontal_estimate(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
-        """The horizontal axes, their noises and outliers, and a clock offset beyond doubt."""
+        """Return the horizontal axes, their tuning and the significant time offset (s)."""
         clock, offset_s = self.clock, 0.0
         if isinstance(clock, ClockOffset) and clock.determinable:
             offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
         for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
-            tuned = self.tuning.get(name)
-            if isinstance(tuned, AxisTuning) and self.axes.keys() >= set(group):
-                return tuple(self.axes[each].axis for each in group), tuned, offset_s
+            axis_tuning = self.tuning.get(name)
+            if isinstance(axis_tuning, AxisTuning) and self.axes.keys() >= set(group):
+                return tuple(self.axes[each].axis for each in group), axis_tuning, offset_s
         return Unavailable(
             "causes other than noise",
             "the noises of the horizontal axes could not be estimated",
@@ -209,14 +209,14 @@ class Analysis(Comparison):
 
 @dataclass(frozen=True)
 class AidsOnlyAnalysis:
-    """A flight without a position for our filter: what EKF2 fused is judged all the same.
+    """EKF2's aids in a flight without positions for KF.
 
     Attributes
     ----------
     flight : Flight
     aids : mapping from PX4's name to AidResult
     missing_data : Unavailable
-        Why there is no comparison, and what would make one.
+        Reason for the missing comparison, and its remedy.
     """
 
     flight: Flight
@@ -226,30 +226,31 @@ class AidsOnlyAnalysis:
     __repr__ = one_line_repr
 
 
-def failed_checks(found: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
-    """What a test rig stops at: EKF2's axes and aids whose verdict is bad, with it.
+def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
+    """Return the failed EKF2 checks for ``--checks``: axis or aid, and its verdict.
 
-    What is overstated, idle or has too few samples is not; nor is our own filter.
+    Overconfident axes and aids fail, also biased aids and aids that were not fused for too long.
+    KF, underconfident aids and aids with too few samples do not.
     """
-    bad = {}
-    if isinstance(found, Analysis):
-        for name, axis in found.axes.items():
+    failed = {}
+    if isinstance(analysis, Analysis):
+        for name, axis in analysis.axes.items():
             ekf2 = axis.filters["ekf2"]
             if not isinstance(ekf2, Unavailable) and ekf2.verdict == "variance understated":
-                bad[f"EKF2, {name}"] = ekf2.verdict
-    aids = {} if isinstance(found.aids, Unavailable) else found.aids
-    return bad | {aid.label: aid.verdict for aid in aids.values() if aid.is_bad}
+                failed[f"EKF2, {name}"] = ekf2.verdict
+    aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
+    return failed | {aid.label: aid.verdict for aid in aids.values() if aid.is_bad}
 
 
 def run_or_evaluate_aids(
     request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Analysis | AidsOnlyAnalysis:
-    """As :func:`run`; without a position source the aids of EKF2 alone.
+    """Run a comparison as :func:`run`; without positions, check EKF2's aids only.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        As of :func:`run`; the flight has neither a position nor aids that can be judged.
+        See :func:`run`; also if the flight has neither positions nor aids that can be checked.
     """
     flight = flight or read_flight(request, progress)
     has_named_source = request.position_source is not None
@@ -259,10 +260,10 @@ def run_or_evaluate_aids(
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
             raise MissingDataError(
-                f"{flight.log.name}: the vehicle did not fly, so there is nothing to analyse "
+                f"{flight.log.name}: the vehicle did not fly, so nothing can be analysed "
                 f"({aids.reason}). px4fuse info {flight.log.name} lists what is logged."
             )
-        neither = f"{no_position.reason}, and the aids of EKF2 cannot be judged: {aids.reason}"
+        neither = f"{no_position.reason}, and EKF2's aids cannot be checked: {aids.reason}"
         raise MissingDataError(f"{flight.log.name}: {neither}", no_position.remedy)
     return AidsOnlyAnalysis(flight, aids, no_position)
 
@@ -270,26 +271,26 @@ def run_or_evaluate_aids(
 def run(
     request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Analysis:
-    """Read a flight, compare it with EKF2 and explain the comparison.
+    """Read a flight, compare KF with EKF2 and explain the difference.
 
     Parameters
     ----------
     request : ComparisonRequest
     progress : callable
-        Told what is being done.
+        Called with the name of each step.
     flight : Flight, optional
-        What the request's recordings hold, where they have been read.
+        Flight that was already read from the request's recordings.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        A file cannot be read, the flight lacks what was asked for, or a setting is out of range.
+        A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     return replace(explain(run_comparison(request, progress, flight), progress), request=request)
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flight:
-    """Read the recordings that a request names, and make them one flight.
+    """Read the recordings of a request and join them into one flight.
 
     Raises
     ------
@@ -299,14 +300,14 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     log = Path(request.log)
     progress(f"reading {display_name(log)}")
     flight = read_log(log, system=request.system if request.mavlink is None else None)
-    # scipy.signal and scipy.ndimage cost a fifth of a second: only where something is placed
+    # late imports: scipy.signal and scipy.ndimage take 0.2 s and are needed for alignment only
     if request.mavlink is not None:
         from px4fuse.alignment.joining import join  # noqa: PLC0415
 
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):
             raise LogError(
-                (f"--mavlink {other.log.name} is a {other.log.format}, not a MAVLink recording."),
+                f"--mavlink {other.log.name} is a {other.log.format}, not a MAVLink recording.",
                 "Give the ULog as LOG and the recording (.tlog) with --mavlink.",
             )
         flight = join(flight, other)
@@ -327,7 +328,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
 def run_comparison(
     request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Comparison:
-    """Read a flight and compare it with EKF2, without what explains the comparison.
+    """Read a flight and compare KF with EKF2, without the explanations.
 
     Arguments and errors are those of :func:`run`.
     """
@@ -338,7 +339,7 @@ def run_comparison(
 def prepare_comparison(
     request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> Comparison:
-    """Read a flight and choose what is compared, which is all that tuning and clock need.
+    """Read a flight; choose source, segment and axes. Tuning and time offset need no more.
 
     Arguments and errors are those of :func:`run`.
     """
@@ -350,7 +351,7 @@ def prepare_comparison(
         sigma_z_m=Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m,
         dt_s=request.dt_s,
         input=request.input or "imu",
-        # that of a position file is spent on placing it
+        # the alignment of a position file applies its own offset
         clock_offset_s=clock_offset
         if isinstance(clock_offset, float) and request.position is None
         else 0.0,
@@ -368,17 +369,15 @@ def prepare_comparison(
     _, clock = noises_and_clock(prepared, progress)
     if isinstance(clock, Unavailable) or not clock.determinable:
         raise MissingDataError(
-            (
-                f"{flight.log.name}: the clock offset cannot be determined from this flight "
-                f"({clock.reason})."
-            ),
+            f"{flight.log.name}: the time offset cannot be estimated from this flight "
+            f"({clock.reason}).",
             "Give --clock-offset SECONDS, or omit it.",
         )
     low, high = clock.interval_s
     if low <= 0.0 <= high:
         note = (
-            f"--clock-offset auto: {clock.offset_s:+.3f} s, 95 % {low:+.3f} s to {high:+.3f} s, "
-            "holds zero: nothing was added to the stamps"
+            f"--clock-offset auto: {clock.offset_s:+.3f} s (95 % {low:+.3f} to {high:+.3f} s) "
+            "is not significant; no offset was applied"
         )
         return replace(prepared, notes=(*prepared.notes, note))
     settings = replace(settings, clock_offset_s=clock.offset_s)
@@ -392,12 +391,12 @@ def _check_finite(**values: float | str | None) -> None:
 
 
 def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
-    """Read a flight or a trajectory, and measure and correct its loop.
+    """Read a flight or a trajectory, measure its loop closure error and correct the path.
 
     Raises
     ------
     TrajectoryError, LogError, MissingDataError, SettingsError
-        A file cannot be read or lacks what was asked for, or a setting is out of range.
+        A file cannot be read or lacks required data, or a setting is out of range.
     """
     from px4fuse.loop.analysis import analyse  # noqa: PLC0415 (tune and sync have none)
     from px4fuse.loop.tracks import read_source  # noqa: PLC0415
@@ -413,22 +412,21 @@ def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
 
 @dataclass(frozen=True)
 class WhatIfAnalysis:
-    """EKF2 with other parameters.
+    """EKF2 replayed with other parameters.
 
     Attributes
     ----------
     flight : Flight
     whatif : WhatIf
-        Its ``whatif`` has the changes first, where there are any, then the values of the sweep.
+        Replays in ``whatif``: first the changes (if any), then the values of the sweep.
     changes : mapping from PX4 name to value
-        Empty where only a sweep was asked for.
+        Empty if only a sweep is requested.
     asked : bool
-        Whether the changes are what the data ask for.
+        True if the changes are the maximum-likelihood estimates.
     without : mapping from PX4's name of an aid to float
-        From when on (s) it is not fused.
+        Time (s) from which EKF2 does not fuse the aid.
     why : mapping from axis name to Why or Unavailable
-        Why EKF2 as flown differs from our filter at its defaults; empty where they cannot be
-        compared.
+        Difference between KF with default settings and EKF2 as flown; empty if not comparable.
     """
 
     flight: Flight
@@ -442,14 +440,14 @@ class WhatIfAnalysis:
 
     @property
     def first(self) -> int:
-        """Where the values of the sweep begin: after the changes, where there are any."""
+        """Index of the sweep's first value in the list of replays."""
         return int(bool(self.changes or self.without))
 
 
 def run_what_if(
     request: WhatIfRequest, progress: Progress = silent, flight: Flight | None = None
 ) -> WhatIfAnalysis:
-    """Read a flight and replay its EKF2 with other parameters; arguments as of :func:`run`.
+    """Read a flight and replay its EKF2 with other parameters; arguments as in :func:`run`.
 
     Raises
     ------
@@ -462,7 +460,7 @@ def run_what_if(
     if swept is not None:
         values = sweep_values(swept.parameter, swept.low, swept.high, swept.count)
         if swept.parameter in changes:
-            raise SettingsError(f"{swept.parameter}: set and swept", "Give one of the two.")
+            raise SettingsError(f"{swept.parameter} is both set and swept.", "Set it or sweep it.")
     recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
     flight = flight or read_flight(recordings, progress)
     progress("replaying EKF2")
@@ -475,7 +473,7 @@ def run_what_if(
     try:
         if model.agreement.good:
             compared = compare(flight, axes=("north", "east", AISLE), sigma_z_given=False)
-    except MissingDataError:  # EKF2 can be replayed all the same
+    except MissingDataError:  # EKF2 can be replayed without a comparison
         if is_default_change:
             raise
     if compared is not None:
@@ -488,31 +486,35 @@ def run_what_if(
     settings = [changes] if changes or request.without else []
     settings += [{**changes, swept.parameter: value} for value in values] if swept else []
     progress("replaying with other parameters")
-    found = what_if(model, settings, request.without)
-    if isinstance(found, Unavailable):
-        raise MissingDataError(f"{flight.log.name}: {found.what}: {found.reason}", found.remedy)
-    return WhatIfAnalysis(flight, found, changes, is_default_change, why, request.without)
+    replays = what_if(model, settings, request.without)
+    if isinstance(replays, Unavailable):
+        raise MissingDataError(
+            f"{flight.log.name}: {replays.what}: {replays.reason}", replays.remedy
+        )
+    return WhatIfAnalysis(flight, replays, changes, is_default_change, why, request.without)
 
 
 def _explain_missing_change(compared: Comparison, model: Model) -> str:
-    source, why = compared.source, "the data do not tell the noise and the delay of what EKF2 fused"
+    """Format the error for a log that gives no maximum-likelihood change of EKF2's parameters."""
+    source = compared.source
+    reason = f"noise and delay of {source.name} cannot be estimated from this log"
     if source.origin.is_gnss or source.origin.may_drift:
-        why = (
-            f"innovations do not tell the slow errors of {source.name}, and its delay is as the "
-            "data ask for or not determinable"
+        reason = (
+            f"innovations do not show the slow errors of {source.name}, and its delay is correct "
+            "or cannot be estimated"
         )
     name, noise = compared.flight.log.name, model.inputs.aid.noise
-    return f"{name}: {why}. Say what to change: `changes` {noise}=0.1."
+    return f"{name}: {reason}. Give a change, for example `changes` {noise}=0.1."
 
 
 def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
-    """Add tuning, clock offset, why EKF2 differs and loop closure to a comparison.
+    """Add tuning, time offset, explanations and loop closure to a comparison.
 
     Parameters
     ----------
     comparison : Comparison
     progress : callable
-        Told what is being done.
+        Called with the name of each step.
     """
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = noises_and_clock(comparison, progress, names)
@@ -525,7 +527,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
 
     model = open_model(comparison.flight, requested_variants)
     why = explain_ekf2_difference(comparison, model, clock)
-    progress("looking for a loop")
+    progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 (tune and sync have none)
 
     loop = analyse_flight_loop(comparison.flight, progress)

@@ -1,4 +1,4 @@
-"""The commands as functions: paths and options as arguments, the analysis as the result."""
+"""The px4fuse commands as Python functions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ from px4fuse.writing import write_all
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table() and their types: fields of FilterSummary and AgainstTruth, and nis_band in two
+# Columns of table() and their types: fields of FilterSummary and AgainstTruth; nis_band is split
 COLUMNS = {
     "count": "Int64",
     "nis_mean": "float64",
@@ -106,30 +106,29 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
-    given = locals()  # arguments are called as the fields of the request
-    known, named = get_args(request.AxisName), (axes,) if isinstance(axes, str) else tuple(axes)
-    if unknown := set(named).difference(known):
+    arguments = locals()  # named like the fields of the request
+    known = get_args(request.AxisName)
+    axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
+    if unknown := set(axis_names).difference(known):
         raise SettingsError(f"`axes` {unknown.pop()!r}: choose from {', '.join(known)}.")
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
         raise SettingsError(
-            (
-                "position, mavlink and system are only used when a log is read, and this "
-                "flight is already read."
-            ),
+            "position, mavlink and system are only used when a log is read, and this flight is "
+            "already read.",
             "Give the path of its log instead.",
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != request.AUTO:
         raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
-    asked = {name: given[name] for name in request.ComparisonRequest.__struct_fields__}
-    asked |= {"log": log.log.name if isinstance(log, Flight) else str(log), "axes": named}
+    fields = {name: arguments[name] for name in request.ComparisonRequest.__struct_fields__}
+    fields |= {"log": log.log.name if isinstance(log, Flight) else str(log), "axes": axis_names}
     if mavlink is not None:
-        asked["mavlink"] = str(mavlink)
+        fields["mavlink"] = str(mavlink)
     if isinstance(position, str | Path):
-        asked["position"] = request.PositionFile(path=str(position))
+        fields["position"] = request.PositionFile(path=str(position))
     if isinstance(clock_offset_s, int):
-        asked["clock_offset_s"] = float(clock_offset_s)
+        fields["clock_offset_s"] = float(clock_offset_s)
     flight = log if isinstance(log, Flight) else None
-    return run(request.ComparisonRequest(**asked), progress, flight)
+    return run(request.ComparisonRequest(**fields), progress, flight)
 
 
 def table(analysis: Analysis) -> pd.DataFrame:
@@ -143,7 +142,7 @@ def table(analysis: Analysis) -> pd.DataFrame:
         and NEES are against ground truth. A number that is not available is NaN.
     """
     rows = {
-        (axis_name, filter_name): _row(summary)
+        (axis_name, filter_name): _summary_row(summary)
         for axis_name, axis in analysis.axes.items()
         for filter_name, summary in axis.filters.items()
     }
@@ -151,7 +150,7 @@ def table(analysis: Analysis) -> pd.DataFrame:
     return pd.DataFrame(list(rows.values()), index, list(COLUMNS)).astype(COLUMNS)
 
 
-def _row(summary: FilterSummary | UnjudgedFilter) -> dict[str, Any]:
+def _summary_row(summary: FilterSummary | UnjudgedFilter) -> dict[str, Any]:
     truth = {} if isinstance(summary.truth, Unavailable) else structs.asdict(summary.truth)
     numbers = {"verdict": "", **truth, "count": None, **structs.asdict(summary)}
     numbers["nis_low"], numbers["nis_high"] = numbers.get("nis_band", (None, None))
@@ -159,7 +158,7 @@ def _row(summary: FilterSummary | UnjudgedFilter) -> dict[str, Any]:
 
 
 def evaluate(
-    estimate: Pathlike | Trajectory, reference: Pathlike | Trajectory, **how: Any
+    estimate: Pathlike | Trajectory, reference: Pathlike | Trajectory, **options: Any
 ) -> Evaluation:
     """Compute ATE and RPE of a trajectory against a reference, with 95 % intervals.
 
@@ -167,7 +166,7 @@ def evaluate(
     ----------
     estimate, reference : str, Path or Trajectory
         Trajectory file, or part of a flight log: "LOG:vio", "LOG:ekf2", "LOG:kf" or "LOG:truth".
-    **how
+    **options
         Arguments of :func:`px4fuse.trajectory.evaluation.evaluate`: ``alignment``,
         ``association``, ``max_gap_s``, ``time_offset_s``, ``rpe_deltas``, ``all_pairs``.
 
@@ -179,13 +178,13 @@ def evaluate(
     """
     if not isinstance(estimate, Trajectory):
         estimate = read_source(str(estimate)).trajectory
-    return evaluation.evaluate(estimate, _reference(reference), **how)
+    return evaluation.evaluate(estimate, _read_reference(reference), **options)
 
 
-def _reference(given: Pathlike | Trajectory) -> Trajectory:
-    if isinstance(given, Trajectory):
-        return given
-    return read_source(str(given), default="truth").trajectory
+def _read_reference(reference: Pathlike | Trajectory) -> Trajectory:
+    if isinstance(reference, Trajectory):
+        return reference
+    return read_source(str(reference), default="truth").trajectory
 
 
 def close_loop(
@@ -234,15 +233,15 @@ def close_loop(
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks required data, or a number is out of range.
     """
-    asked = {name: value for name, value in locals().items() if name != "progress"}
-    asked |= {"source": str(source), "reference": None, "closures": tuple(closures)}
-    asked["landed_at"] = None if landed_at is None else request.Landing(*landed_at)
+    fields = {name: value for name, value in locals().items() if name != "progress"}
+    fields |= {"source": str(source), "reference": None, "closures": tuple(closures)}
+    fields["landed_at"] = None if landed_at is None else request.Landing(*landed_at)
     if isinstance(source, Trajectory):
-        flown = LoopSource(source, None)
+        loop_source = LoopSource(source, None)
     else:
-        flown = read_source(str(source), frame=frame)
-    against = None if reference is None else _reference(reference)
-    return analyse(flown, request.LoopRequest(**asked), against, progress)
+        loop_source = read_source(str(source), frame=frame)
+    track = None if reference is None else _read_reference(reference)
+    return analyse(loop_source, request.LoopRequest(**fields), track, progress)
 
 
 def write_report(analysis: Analysis, path: Pathlike) -> Path:
@@ -269,10 +268,10 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
-    target = _ending(path, ".pdf")
-    found = results(_request(analysis), analysis)
-    text = to_json(found)
-    write_all({target: render(analysis, found, text), target.with_suffix(".json"): text.encode()})
+    target = _require_suffix(path, ".pdf")
+    record = results(_require_request(analysis), analysis)
+    text = to_json(record)
+    write_all({target: render(analysis, record, text), target.with_suffix(".json"): text.encode()})
     return target
 
 
@@ -298,20 +297,20 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
     """
     from px4fuse.explore.page import html_text  # noqa: PLC0415 - slow import
 
-    target = _ending(path, ".html")
-    _request(analysis)
+    target = _require_suffix(path, ".html")
+    _require_request(analysis)
     write_all({target: html_text(analysis).encode()})
     return target
 
 
-def _ending(path: Pathlike, ending: str) -> Path:
+def _require_suffix(path: Pathlike, suffix: str) -> Path:
     target = Path(path)
-    if target.suffix.lower() != ending:
-        raise OutputError(f"{target}: give a name that ends in {ending}.")
+    if target.suffix.lower() != suffix:
+        raise OutputError(f"{target}: give a name that ends in {suffix}.")
     return target
 
 
-def _request(analysis: Analysis) -> request.ComparisonRequest:
+def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
             "This analysis contains no request, so its command is unknown.",
@@ -351,7 +350,7 @@ def what_if(
         raise MissingDataError(f"{model.what}: {model.reason}", model.remedy)
     changes = {} if changes is None else changes
     settings = [changes] if isinstance(changes, Mapping) else changes
-    found = whatif.what_if(model, settings, without)
-    if isinstance(found, Unavailable):
-        raise MissingDataError(f"{found.what}: {found.reason}", found.remedy)
-    return found
+    replays = whatif.what_if(model, settings, without)
+    if isinstance(replays, Unavailable):
+        raise MissingDataError(f"{replays.what}: {replays.reason}", replays.remedy)
+    return replays

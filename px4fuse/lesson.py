@@ -1,4 +1,4 @@
-"""The lesson's worked examples through px4fuse's own engine.
+"""Worked examples of the lesson, computed with px4fuse's KF.
 
 Source: UAT 366, module 2, "SLAM and sensor fusion", Examples 1 and 2.
 """
@@ -17,14 +17,14 @@ from px4fuse.trajectory.model import cumulative_distance
 TRUE_VELOCITY_M_S = 1.0
 STEPS = 30
 STEPS_PER_UPDATE = 5
-# Fixed values standing in for noise, as in the lesson (m).
+# m; the lesson's fixed values instead of random noise
 UWB_NOISE_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
-# Corners of Example 2's path by odometry, m; it truly returns to the start.
+# m; corners of Example 2's odometry; the true path returns to its start
 ODOMETRY_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
 
 
 def example_1() -> Replay:
-    """Run Example 1: UWB every 0.5 s on an aisle at 1 m/s, velocity unknown at first."""
+    """Run Example 1: UWB every 0.5 s along an aisle at 1 m/s, initial velocity unknown."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
     step = np.arange(STEPS_PER_UPDATE, STEPS + 1, STEPS_PER_UPDATE, dtype=np.float64)
     time = settings.dt_s * step
@@ -54,7 +54,7 @@ def kalman_lines() -> Iterator[str]:
 
 
 def loop_lines() -> Iterator[str]:
-    """Yield the six lines of Example 2: the loop-closure error, distributed by distance."""
+    """Yield the six lines of Example 2: the loop closure error, distributed over the distance."""
     odometry = np.array(ODOMETRY_M)
     misclosure = odometry[-1] - odometry[0]
     total = cumulative_distance(odometry)[-1]

@@ -1,4 +1,4 @@
-"""Axes and flights for the filter, with noises, biases and clocks that are known."""
+"""Axes and flights for tests of the filter, with known noises, biases and time offsets."""
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, make_axes
 from px4fuse.flight import Columns, Flight
 
-# --- axes as the two-state filter assumes them ---
+# --- axes that follow the model of KF ---
 
 TRUE = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
 INTERVAL_S = 0.2
@@ -22,7 +22,7 @@ COUNT = 300
 
 
 def modelled(seed: int, count: int = COUNT, *, sigma_a: float = 0.5, sigma_z: float = 0.1) -> Axis:
-    """Make an axis exactly as the filter assumes it: even the start is of its initial P."""
+    """Simulate an axis exactly as KF assumes it, with an initial state drawn from P₀."""
     rng = np.random.default_rng(seed)
     per_leg = round(INTERVAL_S / TRUE.dt_s)
     pushed = rng.normal(0.0, sigma_a, count * per_leg)
@@ -30,7 +30,7 @@ def modelled(seed: int, count: int = COUNT, *, sigma_a: float = 0.5, sigma_z: fl
     way = velocity[:-1] * TRUE.dt_s + pushed * TRUE.dt_s**2 / 2.0
     position = rng.normal(0.0, 0.5) + np.concatenate([[0.0], np.cumsum(way)])
     measured = position[::per_leg] + rng.normal(0.0, sigma_z, count + 1)
-    measured[0] = 0.0  # the filter starts there, wrong by 0.5 m
+    measured[0] = 0.0  # KF starts at 0 m; the true position has σ 0.5 m
     return line(INTERVAL_S * np.arange(count + 1), measured)
 
 
@@ -51,7 +51,7 @@ any_settings = st.builds(
 
 @st.composite
 def any_axis(draw: st.DrawFn) -> Axis:
-    """Measurements at irregular times, under an acceleration sampled at 50 Hz."""
+    """Draw measurements at irregular times and an acceleration sampled at 50 Hz."""
     intervals = draw(st.lists(st.floats(0.005, 0.7), min_size=3, max_size=20))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     measured = draw(st.floats(0.0, 500.0)) + np.cumsum(intervals)
@@ -59,7 +59,7 @@ def any_axis(draw: st.DrawFn) -> Axis:
     return line(measured, rng.normal(0.0, 5.0, len(measured)), (imu, rng.normal(0, 3, len(imu))))
 
 
-# --- flights whose IMU has biases, and whose stamps are wrong by a known amount ---
+# --- flights with IMU biases and wrong timestamps ---
 
 GRAVITY = np.array([0.0, 0.0, 9.80665])
 AMPLITUDE = np.array([4.0, 1.0, 0.3])
@@ -70,7 +70,7 @@ SETTINGS = Settings(sigma_a_m_s2=SIGMA_A, sigma_z_m=SIGMA_Z, dt_s=DT)
 
 
 def position(time_s: Array) -> Array:
-    """Truth: from rest, swinging in all three directions."""
+    """Return the true position (m, NED): from rest, oscillating along all three axes."""
     return AMPLITUDE * (1.0 - np.cos(np.outer(time_s, PULSATION)))
 
 
@@ -79,7 +79,7 @@ def acceleration(time_s: Array) -> Array:
 
 
 def attitude(time_s: Array) -> Rotation:
-    """Truth, body to NED: yaw swings by 20°, pitch and roll by 10°."""
+    """Return the true attitude, body to NED: yaw oscillates by 20°, pitch and roll by 10°."""
     phase = np.outer(time_s, 2.0 * np.pi / np.array([25.0, 6.0, 8.0]))
     angles = np.radians([30.0, 0.0, 5.0]) + np.radians([20.0, 10.0, 10.0]) * np.sin(phase)
     return Rotation.from_euler("ZYX", angles)
@@ -98,10 +98,10 @@ def made_flight(
     sigma_a: float = SIGMA_A,
     hole_s: float = 0.0,
 ) -> tuple[Flight, NDArray[np.bool_]]:
-    """A flight to whose stamps ``offset_s`` must be added, and which positions are outliers.
+    """Simulate a flight whose timestamps lack ``offset_s``; return it with the outlier mask.
 
-    All sensor noise is white. The jump comes in mid-flight; the drift is zero there. The IMU's hole
-    begins there.
+    All sensor noise is white. In the middle of the flight the clock jumps by ``jump_s``, the clock
+    drift is zero, and a gap of ``hole_s`` begins in the IMU.
     """
     rng = np.random.default_rng(seed)
     scale = 1.0 if biased else 0.0
@@ -113,7 +113,7 @@ def made_flight(
     rate = (attitude(time - h).inv() * attitude(time + h)).as_rotvec() / (2.0 * h)
     force = attitude(time).inv().apply(moving * acceleration(time) - GRAVITY)
     rate += gyro_bias + rng.normal(0.0, 0.002, rate.shape)
-    # averaged over DT it must be sigma_a
+    # σ of the average over DT is sigma_a
     force += force_bias + rng.normal(0.0, sigma_a * np.sqrt(DT * IMU_HZ), force.shape)
     logged = np.arange(round(duration_s * 50.0) + 1) / 50.0
     quaternion = (Rotation.from_rotvec(tilt) * attitude(logged)).as_quat(scalar_first=True)
@@ -123,12 +123,12 @@ def made_flight(
     outlier[rng.choice(np.arange(10, len(true) - 10), outliers, replace=False)] = True
     measured[outlier, :2] += 1.5
     middle = duration_s / 2.0
-    stamps = true - offset_s - jump_s * (true > middle) - drift_ppm * 1e-6 * (true - middle)
+    timestamps_s = true - offset_s - jump_s * (true > middle) - drift_ppm * 1e-6 * (true - middle)
     base = aisle_flight(seed=seed, duration_s=duration_s, ekf2=None, truth=False)
     track = replace(
         base.positions[0],
         samples=table(
-            stamps,
+            timestamps_s,
             np.hstack([measured, np.full(measured.shape, np.nan)]),
             Columns.POSITION + Columns.POSITION_VARIANCE,
         ),

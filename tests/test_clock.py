@@ -1,4 +1,4 @@
-"""The clock offset against flights whose stamps are wrong by a known amount."""
+"""Time offset against simulated flights whose timestamps are wrong by a known amount."""
 
 from types import SimpleNamespace
 
@@ -67,29 +67,29 @@ def covers(found: ClockOffset, true_s: float) -> bool:
     return found.interval_s[0] <= true_s <= found.interval_s[1]
 
 
-# --- what the IMU says ---
+# --- signals of the IMU ---
 
 
 def heading(angle: Array) -> Rotation:
     return Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0]))
 
 
-def felt(
+def level_signals(
     force: tuple[float, float, float] = (0.0, 0.0, 0.0), *, turn: float = 0.0,
     interval: float = 0.01,
 ) -> Signals:  # fmt: skip
-    """Signals of a level vehicle that turns steadily, with a constant acceleration of its body."""
+    """Return signals of a level vehicle at constant yaw rate and body acceleration."""
     time = np.arange(0.0, 20.0, interval)
     still = np.zeros((len(time), 3))
     logged = heading(turn * time)
-    # of the attitude, only the beginning is used: what EKF2 made of it later must not matter
+    # only the start of the logged attitude is used; a wrong later attitude must not matter
     spoiled = Rotation.concatenate([logged[:300], heading(np.full(len(time) - 300, -0.3))])
     imu = imu_table(time, still + np.array(force) - GRAVITY, still + np.array([0.0, 0.0, turn]))
     return make_signals(imu, attitude_table(time, spoiled), (0.5, 19.0))
 
 
-def test_a_level_vehicle_at_rest_accelerates_in_no_direction() -> None:
-    signals = felt()
+def test_signals_level_vehicle_at_rest_have_no_acceleration() -> None:
+    signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
     _, speed, value = np.moveaxis(signals.table, 1, 0)
     assert signals.table.shape == (len(t), 3, 3, len(CONSTANT_SIGMA))
@@ -105,10 +105,10 @@ def test_a_level_vehicle_at_rest_accelerates_in_no_direction() -> None:
     np.testing.assert_allclose(value[:, :, 7:10], np.tile(-np.eye(3), (len(t), 1, 1)), atol=1e-12)
 
 
-def test_a_constant_turn_goes_round_in_a_circle() -> None:
+def test_signals_constant_yaw_rate_give_a_circle() -> None:
     """Yaw rate ω with a body acceleration s to the right: a = s (-sin ωt, cos ωt)."""
     omega, sideways = 0.5, 2.0
-    signals = felt((0.0, sideways, 0.0), turn=omega, interval=0.004)
+    signals = level_signals((0.0, sideways, 0.0), turn=omega, interval=0.004)
     t, middle = signals.time_s, omega * (signals.time_s + np.diff(signals.time_s)[0] / 2.0)
     circle = sideways * np.stack([-np.sin(middle), np.cos(middle), 0.0 * t], 1)
     np.testing.assert_allclose(signals.table[:, 2, :, 0], circle, atol=2e-5)
@@ -117,8 +117,8 @@ def test_a_constant_turn_goes_round_in_a_circle() -> None:
     np.testing.assert_allclose(signals.table[:, 1, :2, 0], speed, atol=1e-4)
 
 
-def test_legs_are_the_way_beyond_what_the_velocity_makes() -> None:
-    """Of sideways acceleration s over dt: s dt²/2 and s dt, at every offset, in each stretch."""
+def test_motion_increments_equal_constant_acceleration() -> None:
+    """Sideways acceleration s over dt gives s dt²/2 and s dt at every offset in each stretch."""
     time, stamps = np.arange(0.0, 80.0, 0.01), np.arange(0.0, 80.0, 0.25)
     still = np.zeros((len(time), 3))
     flight = replace(
@@ -139,13 +139,13 @@ def test_legs_are_the_way_beyond_what_the_velocity_makes() -> None:
     np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
     np.testing.assert_allclose(speed[1, :, 0, inside], 1.5 * 0.25, atol=1e-9)
     np.testing.assert_array_equal(np.flatnonzero(~positions.joined) + 1, moved.edges[1:-1])
-    # from the first that is measured in each stretch
+    # positions are relative to the first measured one of each stretch
     for begin, end in positions.stretches:
         known = positions.measurement_m[begin:end, 0]
         known = known[np.isfinite(known)]
         np.testing.assert_allclose(known, 0.25 * np.arange(len(known)), atol=1e-12)
     assert np.all(np.isnan(positions.measurement_m[:, 1]))
-    # a third of them, in every stretch
+    # a third of the measurements, in every stretch
     some = moved.downsample(len(moved.time_s) // 3)
     np.testing.assert_array_equal(some.time_s, moved.time_s[::3])
     assert len(some.edges) == 4
@@ -155,11 +155,11 @@ def test_legs_are_the_way_beyond_what_the_velocity_makes() -> None:
 
 
 class JointNormal:
-    """A stretch's positions, all at once: the estimator's own model without a filter.
+    """Joint normal distribution of a stretch's positions: the estimator's model without a filter.
 
-    They are normal with the mean that the true acceleration gives them. Their covariance has the
-    unknown start, white noise of acceleration, the measurements' own noise, and constants of known
-    variance: tilt, biases of gyros and accelerometers, and scale.
+    The mean follows from the true acceleration. The covariance contains the unknown initial state,
+    white acceleration noise, measurement noise, and constants with known variance: tilt, gyro and
+    accelerometer biases, and scale.
     """
 
     def __init__(self, stamps: Array, measured: Array, offset: float) -> None:
@@ -175,7 +175,7 @@ class JointNormal:
         for column in (acceleration(fine), *columns, acceleration(fine)):
             speed = cumulative_trapezoid(column, fine, axis=0, initial=0.0)
             way = cumulative_trapezoid(speed, fine, axis=0, initial=0.0)
-            # from rest at the first measurement: how it really starts is not known
+            # from rest at the first measurement: the initial state is unknown
             first, before = (
                 np.array([np.interp(time[0], fine, each) for each in part.T])
                 for part in (speed, way)
@@ -189,7 +189,7 @@ class JointNormal:
         self.prior = np.diag(sigma**2)
 
     def solved(self, sigma_a: float, sigma_z: float) -> tuple[float, Array, Array]:
-        """-ln p but for a constant, and the constants with their covariance."""
+        """Return -ln p (without a constant), and the constants with their covariance."""
         since = self.since
         short, long = np.minimum.outer(since, since), np.maximum.outer(since, since)
         one_axis = (
@@ -215,7 +215,7 @@ class JointNormal:
 
 @pytest.fixture(scope="module")
 def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
-    """50 s with an IMU without error, in wind that it does not feel; the stretches taken of it."""
+    """Return 50 s with an ideal IMU and wind that it does not measure, and its stretches."""
     flight, _ = made_flight(duration_s=50.0, offset_s=0.07)
     time = np.arange(0.0, 50.005, 1.0 / IMU_HZ)
     h = 0.0005
@@ -235,7 +235,7 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
         positions=(replace(track, samples=samples),),
     )
     found = estimate(flight)
-    # what the search can shift is used, in stretches of equal length of at most 30 s
+    # positions that the search can shift, in equal stretches of at most 30 s
     used = samples[(samples.index >= 0.6) & (samples.index <= 49.4)]
     first = used.index < (used.index[0] + used.index[-1]) / 2.0
     parts = used[first], used[~first]
@@ -244,8 +244,8 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
     return flight, found, stretches
 
 
-def test_the_profile_of_an_offset_is_that_of_the_joint_normal_distribution(exact_imu) -> None:
-    """Both noises are those that fit each offset best."""
+def test_clock_profile_equals_joint_normal_density(exact_imu) -> None:
+    """Both noises are maximised at each offset."""
     _, found, stretches = exact_imu
     profile, best = [], []
     within = [24, 60, 90]  # further out the Newton step is too coarse
@@ -260,28 +260,28 @@ def test_the_profile_of_an_offset_is_that_of_the_joint_normal_distribution(exact
         profile.append(least.fun)
         best.append(np.exp(least.x))
     expected = np.array(profile) - min(profile)
-    ours = found.curve_drop[within] - found.curve_drop[within].min()
+    profile_drop = found.curve_drop[within] - found.curve_drop[within].min()
     assert 1.0 < expected.max() < 4.0
-    np.testing.assert_allclose(ours, expected, rtol=0.02, atol=0.03)
+    np.testing.assert_allclose(profile_drop, expected, rtol=0.02, atol=0.03)
     at = int(np.argmin(profile))
     assert [found.sigma_a_m_s2, found.sigma_z_m] == pytest.approx(best[at], rel=0.03)
 
 
-# --- the arithmetic of profiles and parts ---
+# --- profiles and parts ---
 
 
-def test_a_parabola_gives_its_vertex_sigma_and_interval() -> None:
+def test_clock_parabola_gives_vertex_sigma_interval() -> None:
     grid = np.linspace(-0.1, 0.3, 41)
     drop = (grid - 0.123) ** 2 / (2.0 * 0.03**2)
     assert clock._minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
     ends = 0.123 - 1.96 * 0.03, 0.123 + 1.96 * 0.03
     assert profile_interval(grid, drop) == pytest.approx(ends, abs=1e-3)
-    # what lies beyond was not looked at
+    # an end outside the grid is None
     assert profile_interval(grid[18:], drop[18:]) == (None, pytest.approx(ends[1], abs=1e-3))
     assert profile_interval(grid[:25], drop[:25])[1] is None
     wider = 0.123 - 2 * 1.96 * 0.03, 0.123 + 2 * 1.96 * 0.03
     assert profile_interval(grid, drop, 4.0 * PROFILE_DROP) == pytest.approx(wider, abs=1e-3)
-    # without a minimum the standard deviation is all that was looked at
+    # without a minimum, σ is the width of the grid
     found, sigma = clock._minimum_and_sigma(grid, -((grid - 0.1) ** 2))
     assert found in (grid[0], grid[-1])
     assert sigma == pytest.approx(0.4)
@@ -289,8 +289,8 @@ def test_a_parabola_gives_its_vertex_sigma_and_interval() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
 @pytest.mark.parametrize("factor", [1.0, 2.5])
-def test_parts_and_change_are_those_of_their_profiles(monkeypatch, offset_s, factor) -> None:
-    """Profiles that are parabolas, about multiples of the grid's step from the whole's offset."""
+def test_clock_parts_and_change_follow_profiles(monkeypatch, offset_s, factor) -> None:
+    """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
     def fit_noises(grid: Array, *_: object) -> SimpleNamespace:
@@ -302,7 +302,7 @@ def test_parts_and_change_are_those_of_their_profiles(monkeypatch, offset_s, fac
         edges=np.arange(5) * 2, time_s=np.arange(8.0), blocks=lambda grid: grid, weight=None
     )
     parts, p = clock._offset_per_part(moved, offset_s, Noises(0.1, 0.1), factor)
-    # the last one says too little
+    # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [part.offset_s for part in parts] == pytest.approx(offset_s + shift[:3])
     assert [part.sigma_s for part in parts] == pytest.approx(np.sqrt(factor) * sigma[:3])
@@ -312,8 +312,8 @@ def test_parts_and_change_are_those_of_their_profiles(monkeypatch, offset_s, fac
     assert p == pytest.approx(chi2.sf(ratio, 2), abs=0.03)
 
 
-def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(monkeypatch) -> None:
-    """Of legs and measurements as large as the noises say, with the velocity that goes with it."""
+def test_clock_variance_inflation_simulates_imu_noise(monkeypatch) -> None:
+    """Increments and measurements have the variance of the noises; velocities match."""
     given: list[Array] = []
 
     def products(
@@ -350,30 +350,30 @@ def test_what_is_simulated_for_the_scatter_is_the_noise_of_the_imu(monkeypatch) 
 SEEDS = 12
 
 
-def test_the_interval_covers_the_truth_as_often_as_it_says() -> None:
-    """200 seeds by hand: see the figure in the module's test report; here what time allows."""
+def test_clock_interval_contains_true_offset_95_percent() -> None:
+    """12 seeds with random offsets; the estimates are also unbiased."""
     inside, normalised = [], []
     for seed in range(SEEDS):
         true_s = float(np.random.default_rng(1000 + seed).uniform(-0.3, 0.3))
         found = estimate(made_flight(seed, offset_s=true_s, duration_s=40.0)[0])
         inside.append(covers(found, true_s))
         normalised.append((found.offset_s - true_s) / found.sigma_s)
-        # in spite of tilt and biases, and the noises were found, too
+        # tilt and biases do not disturb the offset, and the noise is recovered
         assert found.determinable
         assert found.offset_s == pytest.approx(true_s, abs=0.03)
         assert found.sigma_z_m == pytest.approx(SIGMA_Z, rel=0.12)
-    # 1 % in the tail of a binomial distribution
+    # 1 % in the tail of the binomial distribution
     assert sum(inside) >= binom.ppf(0.01, SEEDS, 0.95)
     assert abs(np.mean(normalised)) < 2.6 / np.sqrt(SEEDS)
     assert 0.6 < np.std(normalised) < 1.4
 
 
-def test_what_is_not_determined_says_why() -> None:
+def test_clock_insufficient_data_gives_reason() -> None:
     hovering = estimate(made_flight(3, moving=0.0)[0])
     assert not hovering.determinable
     assert "too little acceleration" in hovering.reason
     assert (hovering.parts, hovering.change_p) == ((), None)
-    assert not estimate(made_flight(11, offset_s=0.9)[0]).determinable  # beyond the search
+    assert not estimate(made_flight(11, offset_s=0.9)[0]).determinable  # outside the search range
     flight, _ = made_flight(1)
     for part in ("imu", "attitude"):
         assert estimate(replace(flight, **{part: unavailable(part)})).what == part
@@ -382,7 +382,7 @@ def test_what_is_not_determined_says_why() -> None:
     assert "at least 30" in short.reason
 
 
-def test_a_jump_in_mid_flight_and_a_drift_show_in_the_parts() -> None:
+def test_clock_jump_and_drift_are_found_in_parts() -> None:
     found = estimate(made_flight(4, duration_s=120.0, jump_s=-0.25)[0])
     assert found.change_p < MAX_CHANGE_P
     for part in found.parts:
@@ -397,7 +397,7 @@ def test_a_jump_in_mid_flight_and_a_drift_show_in_the_parts() -> None:
 
 
 @pytest.mark.parametrize("hole_s", [0.0, 1.0])
-def test_a_steady_clock_shows_no_change_with_an_imu_gap_or_without(hole_s: float) -> None:
+def test_clock_constant_offset_shows_no_change(hole_s: float) -> None:
     found = estimate(made_flight(5, duration_s=100.0, offset_s=-0.2, hole_s=hole_s)[0])
     assert len(found.parts) == 4
     assert found.change_p > 0.01
@@ -406,7 +406,7 @@ def test_a_steady_clock_shows_no_change_with_an_imu_gap_or_without(hole_s: float
     assert not hole_s or not any(part.start_s < 50.5 < part.end_s for part in found.parts)
 
 
-def test_outliers_are_those_that_tuning_found_and_what_was_set_is_not_found_again() -> None:
+def test_clock_excludes_outliers_and_keeps_applied_offset() -> None:
     flight, outlier = made_flight(8, offset_s=-0.2, outliers=12)
     inside = flight.positions[0].samples.index.to_numpy()[outlier]
     tuning, found = noises_and_clock(compare(flight, SETTINGS))
@@ -421,16 +421,16 @@ def test_outliers_are_those_that_tuning_found_and_what_was_set_is_not_found_agai
     assert clock_advice(compared, found)["Offset"].startswith("-0.")
 
 
-def test_a_step_between_parts_is_students_t_times_the_places() -> None:
-    """Against scipy's two-sample t, where all parts weigh the same and scatter more than stated."""
+def test_largest_step_p_value_is_bonferroni_t_test() -> None:
+    """Compare with scipy's two-sample t for equal weights and a scatter above the stated σ."""
     offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
     weight = np.full(len(offset), 1e6)
     places = range(MIN_PARTS, len(offset) - MIN_PARTS + 1)
-    told = min(ttest_ind(offset[:at], offset[at:]).pvalue for at in places)
+    smallest_p = min(ttest_ind(offset[:at], offset[at:]).pvalue for at in places)
     assert estimates._largest_step_p_value(offset, weight) == pytest.approx(
-        told * len(places), rel=1e-9
+        smallest_p * len(places), rel=1e-9
     )
-    # parts that scatter less than stated count by what is stated: z, with the same freedom
+    # for a scatter below the stated σ, the stated σ is used
     sure = np.full(len(offset), 100.0)
     t = min(
         -abs(offset[:at].mean() - offset[at:].mean())
@@ -442,7 +442,7 @@ def test_a_step_between_parts_is_students_t_times_the_places() -> None:
     )
 
 
-# --- sources that may drift: which they are, and what is left of their estimate ---
+# --- sources that may drift ---
 
 
 def stated(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7) -> ClockOffset:
@@ -469,13 +469,13 @@ def stated(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7
         (LOGGED_BY_EKF2, True),
     ],
 )
-def test_external_vision_with_an_orientation_that_turns_may_drift(origin, drifts) -> None:
+def test_origin_vision_with_orientation_may_drift(origin, drifts) -> None:
     assert with_orientation(origin, turns=True).may_drift is drifts
     assert not with_orientation(origin, turns=False).may_drift
 
 
-def test_parts_that_scatter_widen_the_interval_and_are_no_change() -> None:
-    """As measured on a VIO whose stamps were right throughout."""
+def test_widen_for_drift_scatter_widens_interval() -> None:
+    """Offsets of parts as measured on a VIO with correct timestamps."""
     scattered = stated(-0.013, 0.019, 0.076, 0.031, 0.082, 0.107, -0.077, 0.012, -0.007, -0.024)
     found = widen_for_drift(scattered)
     scatter = found.sigma_s / scattered.sigma_s
@@ -486,15 +486,15 @@ def test_parts_that_scatter_widen_the_interval_and_are_no_change() -> None:
     assert found.determinable
 
 
-def test_parts_as_far_apart_as_their_noise_change_nothing() -> None:
+def test_widen_for_drift_small_scatter_changes_nothing() -> None:
     found = widen_for_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 
 
-def test_what_drift_cannot_imitate_and_what_it_hides() -> None:
+def test_widen_for_drift_keeps_step_and_flags_wide_interval() -> None:
     step = widen_for_drift(stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
     assert step.change_p < 1e-3
     wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
     assert not wide.determinable
-    assert "drifts" in wide.reason
-    assert widen_for_drift(stated(0.0, 0.3)).change_p is None  # two parts show no scatter
+    assert "as for a drifting source" in wide.reason
+    assert widen_for_drift(stated(0.0, 0.3)).change_p is None  # two parts give no scatter

@@ -1,4 +1,4 @@
-"""Every number of a comparison against direct computation and against what was injected."""
+"""Numbers of a comparison against direct computation and simulated values."""
 
 import numpy as np
 import pandas as pd
@@ -29,9 +29,9 @@ def rms(values: Array) -> float:
 
 
 def predicted(result: AxisComparison, times: Array) -> Array:
-    """Our position, velocity and their variances at other times.
+    """Predict KF's position, velocity and variances at other times from the step before.
 
-    Each is predicted from the last step before it: x = Fx + Ba, P = FPFᵀ + Q.
+    x = Fx + Ba, P = FPFᵀ + Q.
     """
     run, chosen = result.replay, result.replay.settings
     edges, q = run.steps.index.to_numpy(), chosen.sigma_a_m_s2**2 * chosen.dt_s
@@ -43,22 +43,22 @@ def predicted(result: AxisComparison, times: Array) -> Array:
 
 
 def ekf2_times_within(result: AxisComparison) -> Array:
-    """EKF2's sample times that our replay covers."""
+    """Return EKF2's sample times within the KF replay."""
     first, last = result.replay.steps.index[[0, -1]]
     times = result.ekf2_state.index.to_numpy()
     return times[(times >= first) & (times <= last)]
 
 
 def true_errors(flight: Flight, frame: pd.DataFrame, column: str) -> Array:
-    """Difference of a series and the truth interpolated to its times, where there is truth."""
+    """Return a series minus ground truth interpolated to its times, without NaN."""
     truth = flight.truth.samples[column]
     error = frame[column] - np.interp(frame.index, truth.index, truth, left=np.nan, right=np.nan)
     return error.dropna()
 
 
 class TestSample:
-    def test_nis_is_the_mean_of_squared_normalised_innovations(self, sample, sample_flight) -> None:
-        """PX4 publishes innov² / (gate² S): the sign is flipped, the size must not change."""
+    def test_nis_mean_equals_logged_test_ratio(self, sample, sample_flight) -> None:
+        """PX4 logs the test ratio ν² / (gate² S) with the opposite sign of ν."""
         segment = sample.segment
         for name in ("north", "east"):
             kf, ekf2 = (sample[name].filters[who] for who in ("kf", "ekf2"))
@@ -70,7 +70,7 @@ class TestSample:
             nis = ours["innovation_m"] ** 2 / ours["innovation_variance_m2"]
             assert kf.nis_mean == pytest.approx(nis.mean(), rel=1e-12)
 
-    def test_ekf2_errors_are_those_of_its_own_topics(self, sample, sample_flight) -> None:
+    def test_ekf2_errors_equal_those_of_its_topics(self, sample, sample_flight) -> None:
         start, end = sample.segment.start_s, sample.segment.end_s
         state = sample_flight.ekf2.state.loc[start:end]
         for name in ("north", "east"):
@@ -86,10 +86,8 @@ class TestSample:
             nees = np.nanmean(error**2 / variance[f"{name}_m2_s2"])
             assert truth.nees_velocity_mean == pytest.approx(nees)
 
-    def test_ekf2_claims_its_position_where_it_met_the_measurement(
-        self, sample, sample_flight, sample_log
-    ):
-        """Published positions lag by the output predictor, whose lag no variance states."""
+    def test_ekf2_nees_uses_position_at_fusion_horizon(self, sample, sample_flight, sample_log):
+        """Published positions include the output predictor's lag, which no variance contains."""
         (met,) = ULog(str(sample_log), ["estimator_aid_src_ev_pos"]).data_list
         at = met.data["timestamp_sample"] * 1e-6 - sample_flight.log.boot_time_s
         inside = (at >= sample.segment.start_s) & (at <= sample.segment.end_s)
@@ -107,7 +105,7 @@ class TestSample:
             assert 0.6 < nees < 1.1
             assert truth.position_rmse_m > rms(error)
 
-    def test_our_errors_are_those_of_the_prediction_at_ekf2s_times(self, sample, sample_flight):
+    def test_kf_errors_use_predictions_at_ekf2_times(self, sample, sample_flight):
         for name in ("north", "east"):
             result = sample[name]
             times = ekf2_times_within(result)
@@ -122,7 +120,7 @@ class TestSample:
             assert found.nees_velocity_mean == pytest.approx(np.mean(ev**2 / vv), rel=1e-9)
 
 
-def test_what_no_log_tells_of_a_source_can_be_said(sample_flight: Flight) -> None:
+def test_compare_source_kind_sets_drift_and_gnss_flags(sample_flight: Flight) -> None:
     plain = compare(sample_flight)
     for kind, drifts, slow in (
         ("uwb", False, False), ("vio", True, False), ("mocap", False, False), ("gnss", False, True),
@@ -130,7 +128,7 @@ def test_what_no_log_tells_of_a_source_can_be_said(sample_flight: Flight) -> Non
         said = compare(sample_flight, source_kind=kind)
         origin = said.source.origin
         assert (origin.kind, origin.may_drift, origin.is_gnss) == (kind, drifts, slow)
-        # it is still what EKF2 took as external vision, with the same numbers
+        # EKF2 still fused it as external vision, with the same numbers
         assert origin.is_vision
         assert not origin.fused_as_gnss
         assert said.horizontal == plain.horizontal
@@ -138,11 +136,11 @@ def test_what_no_log_tells_of_a_source_can_be_said(sample_flight: Flight) -> Non
 
 class TestMadeFlight:
     @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
-    def test_ekf2s_sigma_factor_is_the_one_injected(self, nis: float) -> None:
+    def test_ekf2_sigma_factor_equals_simulated_one(self, nis: float) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(nis=nis)))
         assert comparison.horizontal.get("ekf2").sigma_factor == pytest.approx(nis**-0.5, rel=0.05)
 
-    def test_ekf2s_errors_and_sigmas_are_those_injected(self, made: Comparison) -> None:
+    def test_ekf2_errors_and_sigmas_equal_simulated_ones(self, made: Comparison) -> None:
         """P⁻ = S - R and P⁺ = P⁻R/S, with P⁻ = (0.06 m)² and R = (0.10 m)²."""
         for result in made.axes.values():
             ekf2 = result.filters["ekf2"]
@@ -155,19 +153,19 @@ class TestMadeFlight:
             around = ekf2.sigma_p_before_update_m, ekf2.sigma_p_after_update_m
             assert around == pytest.approx((0.06, 0.06 * 0.10 / np.hypot(0.06, 0.10)))
 
-    def test_difference_is_ours_minus_ekf2_at_ekf2s_times(self, made: Comparison) -> None:
+    def test_difference_is_kf_minus_ekf2_at_ekf2_times(self, made: Comparison) -> None:
         for result in made.axes.values():
             times = ekf2_times_within(result)
             p, v, *_ = predicted(result, times)
-            theirs = result.ekf2_state.loc[times]
-            dp, dv = p - theirs["position_m"], v - theirs["velocity_m_s"]
+            ekf2 = result.ekf2_state.loc[times]
+            dp, dv = p - ekf2["position_m"], v - ekf2["velocity_m_s"]
             assert result.difference.count == len(times)
-            of = (rms, np.mean, lambda apart: np.max(np.abs(apart)))
-            expected = [each(apart) for apart in (dp, dv) for each in of]
+            statistics = (rms, np.mean, lambda values: np.max(np.abs(values)))
+            expected = [each(values) for values in (dp, dv) for each in statistics]
             assert list(asdict(result.difference).values())[1:] == pytest.approx(expected)
 
-    def test_nees_does_not_depend_on_the_prediction_grid(self) -> None:
-        """The variance belongs to the same moment as the error, also between two steps."""
+    def test_nees_is_independent_of_dt(self) -> None:
+        """Variance and error have the same time, also between two steps."""
         flight = aisle_flight(uwb=Uwb(rate_hz=1.0))
         fine, coarse = (
             compare(flight, Settings(dt_s=dt, sigma_a_m_s2=0.5 * (0.1 / dt) ** 0.5), axes=("east",))
@@ -177,17 +175,17 @@ class TestMadeFlight:
         assert other == pytest.approx(one, rel=0.1)
 
     @pytest.mark.parametrize(("heading", "name"), [(0.0, "north"), (90.0, "east")])
-    def test_aisle_along_a_cardinal_direction_is_that_axis(self, made, heading, name) -> None:
+    def test_aisle_with_cardinal_heading_equals_that_axis(self, made, heading, name) -> None:
         aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).main
         same = made[name]
         assert asdict(aisle.difference) == pytest.approx(asdict(same.difference))
         for who in ("kf", "ekf2"):
-            ours, theirs = aisle.filters[who], same.filters[who]
-            assert asdict(ours.truth) == pytest.approx(asdict(theirs.truth))
-            assert ours.nis_mean == pytest.approx(theirs.nis_mean)
-            assert ours.sigma_p_after_update_m == pytest.approx(theirs.sigma_p_after_update_m)
+            one, other = aisle.filters[who], same.filters[who]
+            assert asdict(one.truth) == pytest.approx(asdict(other.truth))
+            assert one.nis_mean == pytest.approx(other.nis_mean)
+            assert one.sigma_p_after_update_m == pytest.approx(other.sigma_p_after_update_m)
 
-    def test_settings_and_segment_reach_the_replay(self, made: Comparison) -> None:
+    def test_compare_uses_settings_and_segment(self, made: Comparison) -> None:
         chosen = Settings(sigma_z_m=0.3, clock_offset_s=0.05)
         run = compare(made.flight, chosen, start_s=20.0, end_s=50.0).main.replay
         assert run.settings == chosen
@@ -198,7 +196,7 @@ class TestMadeFlight:
 
 
 class TestMissingParts:
-    def test_without_ekf2_our_part_stands_and_the_rest_says_why(self) -> None:
+    def test_compare_without_ekf2_has_kf_and_reasons(self) -> None:
         comparison = compare(aisle_flight(ekf2=None))
         assert comparison.horizontal.get("kf").verdict == "consistent"
         assert comparison.horizontal.get("ekf2") is None
@@ -215,25 +213,25 @@ class TestMissingParts:
                 assert part == comparison.flight.ekf2
 
     @pytest.mark.parametrize("left_out", ["imu", "attitude_hz"])
-    def test_without_acceleration_constant_velocity_stands_in_and_is_noted(self, left_out) -> None:
+    def test_compare_without_acceleration_notes_constant_velocity(self, left_out) -> None:
         flight = aisle_flight(**{left_out: None})
         comparison = compare(flight, Settings(sigma_z_m=0.2))
         assert comparison.settings == Settings(sigma_z_m=0.2, input="zero")
-        assert any("constant velocity was used" in note for note in comparison.notes)
+        assert any("KF assumes constant velocity" in note for note in comparison.notes)
         assert isinstance(comparison.lines[0].acceleration, Unavailable)
         assert comparison.lines[0].acceleration in comparison.missing
         assert comparison.main.filters["kf"].count == 600
         with pytest.raises(SettingsError, match="`input` imu"):
             prepare(flight, input_required=True)
 
-    def test_without_variances_there_is_no_nees_but_an_rmse(self) -> None:
+    def test_compare_without_variances_has_rmse_but_no_nees(self) -> None:
         for result in compare(aisle_flight(ekf2=Estimator(variance_logged=False))).axes.values():
             assert isinstance(result.ekf2_variance, Unavailable)
             assert result.filters["ekf2"].sigma_p_median_m is None
             assert result.filters["ekf2"].truth.nees_position_mean is None
             assert result.filters["ekf2"].truth.position_rmse_m == pytest.approx(0.05, rel=0.06)
 
-    def test_without_innovations_there_is_no_verdict_on_ekf2(self) -> None:
+    def test_compare_without_innovations_has_no_ekf2_verdict(self) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(innovations_logged=False)))
         assert comparison.horizontal.get("ekf2") is None
         for result in comparison.axes.values():
@@ -241,8 +239,8 @@ class TestMissingParts:
             assert result.filters["ekf2"].sigma_p_before_update_m is None
             assert isinstance(result.difference, Difference)
 
-    def test_truth_between_two_variances_has_an_rmse_but_no_nees(self, made: Comparison) -> None:
-        """EKF2's variances come once a second: none may fall where the truth is."""
+    def test_compare_short_truth_has_rmse_but_no_nees(self, made: Comparison) -> None:
+        """EKF2's variances are logged at 1 Hz: none may be within 0.8 s of ground truth."""
         samples = made.flight.truth.samples.loc[40.1:40.9]
         flight = replace(made.flight, truth=Truth("0.8 s", samples))
         truth = compare(flight, axes=("north",)).main.filters["ekf2"].truth
@@ -250,7 +248,7 @@ class TestMissingParts:
         assert truth.nees_position_mean is None
         assert truth.nees_velocity_mean is None
 
-    def test_horizontal_nis_uses_only_the_updates_that_both_axes_have(self) -> None:
+    def test_horizontal_nis_uses_common_updates_only(self) -> None:
         flight = aisle_flight(ekf2=Estimator(nis=0.5))
         innovations = flight.ekf2.innovations
         north, east = innovations["north"], innovations["east"].iloc[100:]
@@ -263,14 +261,14 @@ class TestMissingParts:
 
 
 class TestRobustness:
-    def test_a_reset_of_frame_is_undone_and_noted(self, made: Comparison) -> None:
+    def test_compare_frame_reset_is_removed_and_noted(self, made: Comparison) -> None:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
-        assert any("resets undone: 1 of horizontal position" in note for note in comparison.notes)
+        assert any("resets removed: 1 of horizontal position" in note for note in comparison.notes)
         for result, same in zip(comparison.axes.values(), made.axes.values(), strict=True):
             assert asdict(result.difference) == pytest.approx(asdict(same.difference))
 
-    def test_compare_does_not_change_the_flight(self) -> None:
+    def test_compare_leaves_flight_unchanged(self) -> None:
         flight = aisle_flight(ekf2=Estimator(resets=(Reset(60.0, "position", (5.0, 0.0, 0.0)),)))
 
         def frames() -> list[pd.DataFrame]:
@@ -286,6 +284,6 @@ class TestRobustness:
             pd.testing.assert_frame_equal(frame, copy)
 
 
-def test_seconds_without_imu_are_counted() -> None:
+def test_compare_imu_gap_is_counted_in_seconds() -> None:
     result = compare(aisle_flight(imu=Imu(gap_s=(40.0, 42.0))), axes=("north",)).main
     assert result.updates.input_gap_s == pytest.approx(2.0, abs=1e-6)

@@ -1,4 +1,4 @@
-"""What happened when: flight modes as read, and the list that every time axis marks."""
+"""Events for the time axes: flight modes as read, gaps, dropouts, resets, rejections."""
 
 from __future__ import annotations
 
@@ -21,42 +21,42 @@ from px4fuse.recording import Dropout
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
 
 
-def test_modes_of_the_sample(sample_flight: Flight) -> None:
+def test_modes_sample_log_has_expected_spans(sample_flight: Flight) -> None:
     assert [mode.name for mode in sample_flight.modes] == ["Offboard", "Land", "Offboard"]
     _, land, last = sample_flight.modes
     assert (land.start_s, land.end_s) == pytest.approx((120.48, 128.74), abs=0.01)
     assert last.end_s == sample_flight.log.duration_s
-    # the land detector agrees: landing ends in it
+    # the landing of the land detector is within the Land mode
     assert land.start_s < sample_flight.airborne[-1][1] < land.end_s
 
 
-def test_a_recording_tells_the_same_modes(sample_flight: Flight, sample_log: Path) -> None:
+def test_modes_mavlink_recording_equals_ulog(sample_flight: Flight, sample_log: Path) -> None:
     recording = read_log(sample_log.with_suffix(".tlog"))
     assert [mode.name for mode in recording.modes] == ["Hold", "Offboard", "Land", "Offboard"]
     shift = recording.log.boot_time_s - sample_flight.log.boot_time_s
-    # a heartbeat comes once in a second
-    for mine, theirs in zip(sample_flight.modes[1:], recording.modes[2:], strict=True):
-        assert 0.0 <= theirs.start_s + shift - mine.start_s <= 1.1
+    # heartbeats are sent at 1 Hz
+    for logged, received in zip(sample_flight.modes[1:], recording.modes[2:], strict=True):
+        assert 0.0 <= received.start_s + shift - logged.start_s <= 1.1
     joined = join(replace(sample_flight, modes=Unavailable("modes", "", "")), recording)
     assert joined.modes[2].start_s == pytest.approx(recording.modes[2].start_s + shift)
     assert join(sample_flight, recording).modes == sample_flight.modes
 
 
-def test_stretches_join_what_is_the_same_and_never_overlap() -> None:
+def test_mode_spans_equal_modes_are_joined() -> None:
     names = pd.Series(["a", "a", "b", "c", "a"], index=[-3.0, 1.0, 2.0, 1.5, 6.0])
     assert mode_spans(names, 8.0) == (
         FlightMode(0.0, 2.0, "a"), FlightMode(2.0, 6.0, "c"), FlightMode(6.0, 8.0, "a"),
     )  # fmt: skip
 
 
-def test_a_gap_is_longer_than_a_second_and_five_intervals() -> None:
+def test_source_gaps_exceed_1_s_and_five_intervals() -> None:
     time_s = np.array([0.0, 0.2, 0.4, 1.4, 1.6, 3.0, 3.2])
     assert source_gaps(time_s, 5.0) == ((1.6, 3.0),)
     assert source_gaps(time_s, 1.0) == ()
     assert source_gaps(time_s[:1], 5.0) == ()
 
 
-def test_all_that_happened_is_listed_and_cut_to_the_segment() -> None:
+def test_collect_events_lists_all_within_the_segment() -> None:
     resets = tuple(Reset(time, "position", (1.0, 0.0, 0.0)) for time in (5.0, 30.0, 30.0, 95.0))
     flight = aisle_flight(
         duration_s=100.0, uwb=Uwb(gap_s=(60.0, 65.0)), ekf2=Estimator(resets=resets),
@@ -74,7 +74,7 @@ def test_all_that_happened_is_listed_and_cut_to_the_segment() -> None:
     assert found.resets_s == (30.0,)
 
 
-def test_rejections_are_of_each_axis() -> None:
+def test_collect_events_rejections_are_per_axis() -> None:
     comparison = compare(aisle_flight(ekf2=Estimator(rejected_share=0.2)))
     found = collect_events(comparison)
     for result in comparison.axes.values():
@@ -83,7 +83,7 @@ def test_rejections_are_of_each_axis() -> None:
     assert len(found.rejected_s["aisle"]) > 50
 
 
-def test_what_is_not_logged_is_not_marked() -> None:
+def test_collect_events_missing_data_gives_no_events() -> None:
     flight = aisle_flight(ekf2=None)
     absent = Unavailable("land detector", "no topic", "Record it.")
     found = collect_events(compare(replace(flight, airborne=absent)))

@@ -1,6 +1,7 @@
-"""What explains innovations better than noise: the tool against replays, the causes against truth.
+"""Biases, scale factor error, jumps and low pass, and the findings that report them.
 
-Each detector on a clean flight, a faulty one, one without what it needs, and a short one.
+Each detector runs on a flight without a fault, with the fault, without required data, and on a
+short flight.
 """
 
 from functools import cache
@@ -35,7 +36,7 @@ DETECTORS = (*OF_CAUSES, source_clock.detect, source_frame.detect, noises.deviat
 
 
 def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analysis:
-    """A flight with its noises, its clock and its frame, all that the detectors here need."""
+    """Analyse a flight for the detectors: noises, time offset and frame misalignment."""
     comparison = compare(flight, settings, axes=("north", "east"), **span)
     tuning, clock = noises_and_clock(comparison)
     heading = estimate_frame_rotation(comparison, tuning, clock)
@@ -57,11 +58,11 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
     return {finding.id: finding for detector in detectors for finding in detector(analysis)}
 
 
-# ------------------------------------------------------------------ the tool
+# ------------------------------------------------------------------ the regression
 
 
-def test_responses_are_what_the_filter_itself_makes_of_signals() -> None:
-    """Of the measurements, and of these with a step in them, against replays with filterpy."""
+def test_design_columns_equal_filter_responses() -> None:
+    """Compare innovations with and without a step with filterpy replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
     intervals = preintegrate(north, RIGHT)
@@ -80,14 +81,14 @@ def test_responses_are_what_the_filter_itself_makes_of_signals() -> None:
         updates = replay(moved, RIGHT).updates
         np.testing.assert_allclose(column, updates["innovation_m"], atol=1e-9)
         np.testing.assert_allclose(s, updates["innovation_variance_m2"], rtol=1e-9)
-    # what is not fused, as the filter of the likelihood leaves it out
+    # skipped measurements
     skip = np.arange(len(none)) % 7 == 3
     nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
     expected = innovations(intervals, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, skip)
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
-def test_an_axis_of_which_a_gap_tells_less_has_a_filter_of_its_own() -> None:
+def test_design_matrix_imu_gap_separates_axis_groups() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
@@ -111,7 +112,7 @@ def test_an_axis_of_which_a_gap_tells_less_has_a_filter_of_its_own() -> None:
             np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)
 
 
-def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None:
+def test_design_fit_equals_least_squares_with_prior() -> None:
     rng = np.random.default_rng(1)
     columns, data = rng.normal(size=(2, 25, 2)), rng.normal(size=(2, 25))
     skip = np.arange(25) % 5 == 0
@@ -125,7 +126,7 @@ def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None
     np.testing.assert_allclose(made.residual, data - columns @ expected)
     np.testing.assert_allclose(made.covariance, np.linalg.inv(rows.T @ rows), rtol=1e-9)
     assert made.square_sum == pytest.approx(np.sum((np.append(data, 0.0) - rows @ expected) ** 2))
-    # a sigma is widened where more remains than the noises say
+    # σ is widened if the residual exceeds the assumed noise
     sigma = np.sqrt(made.covariance[0, 0])
     for spread, widened in ((3.0, 3.0), (0.5, 1.0)):
         assert replace(made, residual_rms=spread).estimate(0).sigma == pytest.approx(
@@ -136,7 +137,7 @@ def test_a_fit_is_least_squares_with_the_prior_as_one_more_measurement() -> None
 # ------------------------------------------------------------------ the causes
 
 
-def test_a_clean_flight_has_no_causes_beyond_noise() -> None:
+def test_fit_clean_flight_has_no_bias_scale_or_jump() -> None:
     causes, low_pass = flown().bias_scale_jump_fit, flown().smoothing
     assert causes.jumps == ()
     assert low_pass.correlation == 0.0
@@ -149,7 +150,7 @@ def test_a_clean_flight_has_no_causes_beyond_noise() -> None:
     [
         ("accel-bias=0.4", "accelerometer_bias", "error", {"bias_m_s2": (0.4, 0.1)}),
         ("scale=25%", "source_scale_wrong", "error", {"scale": (1.25, 0.1)}),
-        # less than the time constant, by half an interval
+        # the lag is the time constant minus half an interval
         ("smoothed=0.5", "source_smoothed", "error", {"lag_s": (0.41, 0.1)}),
         ("jump=1,40s", "source_jumps", "error", {"size_m": (1.0, 0.3), "count": (1.0, 0.0)}),
         ("decimate=2Hz", "source_thinned", "error", {"source_rate_hz": (5.0, 0.1)}),
@@ -157,7 +158,7 @@ def test_a_clean_flight_has_no_causes_beyond_noise() -> None:
         ("r-scale=4", "source_variance_wrong", "error", {"variance_factor": (4.0, 0.8)}),
     ],
 )
-def test_a_mistake_is_named_first_with_its_size(mistake, name, severity, evidence) -> None:
+def test_find_simulated_mistake_is_first_with_size(mistake, name, severity, evidence) -> None:
     named = found(flown(mistake))
     assert next(iter(named)) == name
     assert ("source_smoothed" in named) == (name == "source_smoothed")
@@ -177,17 +178,17 @@ def test_a_mistake_is_named_first_with_its_size(mistake, name, severity, evidenc
         ("sigma_a_large", "", {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
     ],
 )
-def test_a_mistake_is_named_with_what_to_type(name, mistake, settings, severity, remedy) -> None:
+def test_find_simulated_mistake_has_command(name, mistake, settings, severity, remedy) -> None:
     named = found(analysed(flight(), replace(RIGHT, **settings)) if settings else flown(mistake))
     assert named[name].severity == severity
-    # both noises make S too large; only the likelihood knows which
+    # either noise makes S too large; the likelihood separates them
     if name.endswith("_large"):
         assert [other for other in named if other.startswith("sigma")] == [name]
     assert any(part in named[name].remedy for part in remedy.split("|"))
 
 
-def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None:
-    """Regression on a noisy acceleration would give 8 % too little, on every flight."""
+def test_scale_estimate_noise_does_not_bias_it() -> None:
+    """Plain regression on a noisy acceleration would be 8 % too small."""
     scales = []
     for seed in range(5):
         flown = simulate_flight(Scenario(ekf2=False, truth=False, seed=seed))
@@ -200,7 +201,7 @@ def test_a_scale_is_not_drawn_to_zero_by_the_noise_of_the_acceleration() -> None
     assert np.mean(scales) == pytest.approx(0.0, abs=0.04)
 
 
-def test_a_jump_is_where_it_was_made_and_outliers_that_end_are_none() -> None:
+def test_jump_is_located_and_outlier_burst_is_not_one() -> None:
     assert set(found(flown("nlos=5%"))) == {"source_outliers"}
     assert "source_outliers" not in found(flown("jump=1,40s"))
     causes = flown("jump=1,40s").bias_scale_jump_fit
@@ -210,13 +211,13 @@ def test_a_jump_is_where_it_was_made_and_outliers_that_end_are_none() -> None:
     assert heading == pytest.approx(30.0, abs=15.0)
 
 
-def test_a_shift_of_the_stamps_that_explains_as_much_is_no_smoothing() -> None:
+def test_time_offset_is_not_reported_as_low_pass() -> None:
     late = flown("clock-offset=250ms", passes=6)
     assert late.smoothing.gain_nats == 0.0
     assert replace(late, clock=unavailable("clock offset")).smoothing.gain_nats > 3.0
 
 
-# ------------------------------------------------------------------ stamps of arrival
+# ------------------------------------------------------------------ arrival times
 
 
 @cache
@@ -225,7 +226,7 @@ def with_ekf2(*mistakes: str) -> Analysis:
 
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
-def test_the_age_of_what_is_published_shows_when_the_clocks_were_synchronised(jump, severity):
+def test_clock_change_from_publication_age_has_severity(jump, severity):
     (finding,) = stamps.arrivals(with_ekf2(f"clock-jump={jump}"))
     assert finding.severity == severity
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)
@@ -233,7 +234,7 @@ def test_the_age_of_what_is_published_shows_when_the_clocks_were_synchronised(ju
     assert "--start 50" in finding.remedy
 
 
-# ------------------------------------------------------------------ what is missing
+# ------------------------------------------------------------------ missing data
 
 
 def without_variances(flight: Flight) -> Flight:
@@ -252,12 +253,12 @@ def without_variances(flight: Flight) -> Flight:
         ("r-scale=0.25", without_variances),
     ],
 )
-def test_what_a_log_cannot_show_is_not_guessed(mistake, change) -> None:
+def test_find_missing_data_gives_no_finding(mistake, change) -> None:
     named = set(found(analysed(change(flight(mistake))), OF_CAUSES))
     assert named <= {"source_outliers"}
 
 
-def test_what_was_not_tuned_is_unavailable_with_a_remedy() -> None:
+def test_fit_without_tuning_is_unavailable_with_remedy() -> None:
     untuned = replace(flown("jump=1,40s"), tuning={})
     assert isinstance(untuned.bias_scale_jump_fit, Unavailable)
     assert isinstance(untuned.smoothing, Unavailable)
@@ -265,7 +266,7 @@ def test_what_was_not_tuned_is_unavailable_with_a_remedy() -> None:
 
 
 @pytest.mark.parametrize("mistake", ["accel-bias=0.4", "jump=1,21s", "decimate=2Hz"])
-def test_a_flight_of_a_moment_says_nothing(mistake) -> None:
+def test_find_very_short_flight_gives_no_finding(mistake) -> None:
     short = analysed(flight(mistake), start_s=20.0, end_s=25.0)
     assert found(short) == {}
     assert isinstance(short.bias_scale_jump_fit, Unavailable)

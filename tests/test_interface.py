@@ -31,7 +31,7 @@ def analysis(sample_log) -> px4fuse.Analysis:
 # -- names -----------------------------------------------------------------------------------------
 
 
-def test_dir_lists_the_public_names_alone() -> None:
+def test_dir_lists_public_names_only() -> None:
     assert dir(px4fuse) == sorted(px4fuse.__all__)
     assert {"compare", "find", "read_log", "Settings"} <= set(dir(px4fuse))
     for name in dir(px4fuse):
@@ -45,7 +45,7 @@ def test_dir_lists_the_public_names_alone() -> None:
         px4fuse.comapre  # noqa: B018
 
 
-def test_type_checkers_read_the_same_names_and_modules() -> None:
+def test_type_checking_imports_equal_lazy_imports() -> None:
     tree = ast.parse(Path(px4fuse.__file__).read_text(encoding="utf-8"))
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     read = {one.asname: node.module for node in imports for one in node.names}
@@ -61,7 +61,7 @@ def test_import_loads_no_library() -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_findings_are_those_of_the_command_line(sample_log, analysis, tmp_path):
+def test_find_equals_findings_of_command_line(sample_log, analysis, tmp_path):
     command = "compare", sample_log, "--sigma-z", "0.2", "--json", "-", "-o", tmp_path / "r.pdf"
     told = json.loads(done(*command).stdout)["findings"]
     typed = [(f["id"], f["message"], f["remedy"]) for f in told]
@@ -71,13 +71,13 @@ def test_findings_are_those_of_the_command_line(sample_log, analysis, tmp_path):
     assert px4fuse.find(analysis) == found
 
 
-def test_a_flight_that_was_read_gives_the_same(sample_log, analysis):
+def test_compare_flight_equals_compare_path(sample_log, analysis):
     again = px4fuse.compare(px4fuse.read_log(str(sample_log)), sigma_z_m=0.2)
     pd.testing.assert_frame_equal(px4fuse.table(again), px4fuse.table(analysis))
     assert px4fuse.find(again) == px4fuse.find(analysis)
 
 
-def test_arguments_do_what_the_options_do(sample_log, analysis):
+def test_compare_arguments_act_like_options(sample_log, analysis):
     chosen = {"sigma_a_m_s2": 0.3, "sigma_z_m": 0.3, "dt_s": 0.05, "clock_offset_s": 1}
     found = px4fuse.compare(
         analysis.flight, axes="aisle", heading_deg=30, end_s=60, input="zero", **chosen
@@ -95,24 +95,24 @@ def test_arguments_do_what_the_options_do(sample_log, analysis):
     [
         ({"axes": "ailse"}, "`axes` 'ailse': choose from north, east, down, aisle."),
         ({"clock_offset_s": "find"}, "`clock_offset_s` 'find': give seconds, or 'auto'."),
-        ({"mavlink": "a.tlog"}, "`position`, `mavlink` and `system` say what is read"),
+        ({"mavlink": "a.tlog"}, "position, mavlink and system are only used when a log is read"),
         ({"sigma_a_m_s2": -1}, "`sigma_a_m_s2` -1 is out of range"),
         ({"start_s": float("nan")}, "`start_s` nan is not a finite number."),
         ({"position_source": "gps"}, "position source gps: no such source."),
     ],
 )
-def test_arguments_that_make_no_sense_are_refused(analysis, arguments, said):
+def test_compare_invalid_arguments_are_rejected(analysis, arguments, said):
     with pytest.raises(px4fuse.Px4FuseError) as raised:
         px4fuse.compare(analysis.flight, **arguments)
     assert said in str(raised.value)
-    with pytest.raises(px4fuse.Px4FuseError, match="no axis 'up' here"):
+    with pytest.raises(px4fuse.Px4FuseError, match="Axis 'up' was not analysed"):
         analysis["up"]
 
 
 # -- errors ----------------------------------------------------------------------------------------
 
 
-def test_errors_name_arguments_in_python_and_options_on_the_command_line(sample_log):
+def test_errors_name_arguments_or_options(sample_log):
     with pytest.raises(px4fuse.Px4FuseError, match=r"^`clock_offset_s` 99 is out of range"):
         px4fuse.Settings(clock_offset_s=99.0)
     said = refused("tune", sample_log, "--clock-offset", 99.0)
@@ -200,11 +200,13 @@ def test_report_and_page_are_written_as_by_the_commands(
     done("verify", report, LOG)
 
 
-def test_what_cannot_be_written_is_said(analysis: px4fuse.Analysis, tmp_path: Path) -> None:
+def test_write_wrong_suffix_or_no_request_is_rejected(
+    analysis: px4fuse.Analysis, tmp_path: Path
+) -> None:
     for function, name in ((px4fuse.write_report, "x.html"), (px4fuse.write_page, "x.pdf")):
         with pytest.raises(px4fuse.Px4FuseError, match="give a name that ends in"):
             function(analysis, tmp_path / name)
     bare = dataclasses.replace(analysis, request=None)
-    with pytest.raises(px4fuse.Px4FuseError, match="does not say what was asked for"):
+    with pytest.raises(px4fuse.Px4FuseError, match="contains no request"):
         px4fuse.write_report(bare, tmp_path / "x.pdf")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Causes by intervention: each number is that of a replay, and the right cause is found."""
+"""Causes of inconsistency: each re-run equals a replay, and the simulated cause is found."""
 
 import re
 from functools import cache
@@ -49,7 +49,7 @@ def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Intervention:
     return cause_of(analysis.causes, owner, "aisle", of)
 
 
-def test_nothing_is_tried_where_nothing_is_wrong() -> None:
+def test_interventions_without_discrepancy_are_empty() -> None:
     assert flown().causes == ()
 
 
@@ -65,7 +65,7 @@ def test_nothing_is_tried_where_nothing_is_wrong() -> None:
         (LATE, {}, "kf", "nees", {CLOCK: (-0.25, 0.06)}),
         (LATE, {}, "ekf2", "nees",
          {"EKF2_EV_DELAY": (250, 60), "EKF2_DELAY_MAX": (300, 0)}),
-        # no parameter of EKF2 has positions count earlier than they are stamped
+        # no parameter of EKF2 shifts positions to an earlier time than their timestamp
         ("clock-offset=-0.19", {}, "ekf2", "nees", {CLOCK: (0.19, 0.06)}),
         ("accel-bias=0.5", {}, "kf", "nis", {FORWARD: (0.5, 0.03), TO_RIGHT: (-0.04, 0.03)}),
         ("yaw=20", {}, "kf", "nees", {TURN: (-20, 4)}),
@@ -76,20 +76,20 @@ def test_nothing_is_tried_where_nothing_is_wrong() -> None:
         ("ekf2-delay=0.175", {}, "ekf2", "nees", {"EKF2_EV_DELAY": (0, 0)}),
     ],
 )  # fmt: skip
-def test_the_cause_is_what_was_made_wrong(mistake, settings, owner, of, change) -> None:
+def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of, change) -> None:
     analysis = flown(*filter(None, (mistake,)), **settings)
     found = cause(analysis, owner, of)
     assert found.change.keys() == change.keys()
     for name, (value, within) in change.items():
         assert found.change[name] == pytest.approx(value, abs=within)
     assert found.is_enough
-    # and the story says so, of this filter
+    # the summary names the re-run of this filter
     told = story(analysis, find(analysis))[0]
-    ekf2, ours = told.split("; our filter")
-    assert "replayed: " in (ours if owner == "kf" else ekf2)
+    ekf2, kf_case = told.split("; our filter")
+    assert "replayed: " in (kf_case if owner == "kf" else ekf2)
 
 
-def test_a_bias_that_is_taken_out_is_an_imu_without_it() -> None:
+def test_kf_changes_remove_bias_from_acceleration() -> None:
     analysis = flown("accel-bias=0.5")
     found, imu = cause(analysis, "kf"), analysis.flight.imu
     without = imu[Columns.SPECIFIC_FORCE] - [found.change[FORWARD], found.change[TO_RIGHT], 0.0]
@@ -98,16 +98,16 @@ def test_a_bias_that_is_taken_out_is_an_imu_without_it() -> None:
     assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
 
 
-def test_vibration_asks_ekf2_for_more_process_noise_as_far_as_px4_lets_it() -> None:
+def test_ekf2_changes_vibration_raises_noise_to_px4_limit() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
-    assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's largest
+    assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
     assert found.explains > 0.5
     assert "since EKF2_ACC_NOISE is 0.35 instead of 1 m/s²" in story(analysis, find(analysis))[0]
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
 
 
-def test_an_offset_that_was_applied_to_ours_is_still_missing_to_ekf2() -> None:
+def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK]
     analysis = explain(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
@@ -122,30 +122,30 @@ def test_an_offset_that_was_applied_to_ours_is_still_missing_to_ekf2() -> None:
 @pytest.mark.parametrize(
     ("analysis", "of"), [(lambda: flown(sigma_z=0.03), "nis"), (lambda: flown(LATE), "nees")]
 )
-def test_a_number_of_our_filter_is_that_of_a_comparison_with_the_change(analysis, of) -> None:
+def test_kf_rerun_equals_comparison_with_the_change(analysis, of) -> None:
     analysis = analysis()
     found = cause_of(analysis.causes, "kf", "north", of)
     again = compare(analysis.flight, replace(analysis.settings, **found.change))
 
-    def number(of_comparison: Any) -> float:
+    def statistic(of_comparison: Any) -> float:
         kf = of_comparison.axes["north"].filters["kf"]
         return float(kf.nis_mean if of == "nis" else kf.truth.nees_position_mean)
 
-    assert found.before == number(analysis)
-    # NEES is at the filter's own steps, where the comparison takes EKF2's times
-    assert found.after == pytest.approx(number(again), rel=1e-6 if of == "nis" else 0.1)
+    assert found.before == statistic(analysis)
+    # the re-run's NEES is at KF's steps, that of the comparison at EKF2's sample times
+    assert found.after == pytest.approx(statistic(again), rel=1e-6 if of == "nis" else 0.1)
     assert found.explains == pytest.approx(1.0 - np.log(found.after) / np.log(found.before))
 
 
-def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
+def test_ekf2_rerun_equals_what_if() -> None:
     analysis = flown("ekf2-noise=0.03")
     found = [cause_of(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
-    asked = what_if(replace(model), [change])  # which has not run before
+    replays = what_if(replace(model), [change])  # a copy without cached replays
     for one, axis in zip(found, ("north", "east"), strict=True):
         assert one.before == analysis.axes[axis].filters["ekf2"].nis_mean
-        assert one.after == pytest.approx(asked.whatif[0].axes[axis].nis_mean, rel=1e-9)
-    # it was run along with EKF2 as flown; of other positions it is another
+        assert one.after == pytest.approx(replays.whatif[0].axes[axis].nis_mean, rel=1e-9)
+    # the variant was planned with EKF2 as flown; other positions give another replay
     known = analysis, analysis.tuning, analysis.clock, analysis.heading
     assert Variant({**model.inputs.settings, **change}) in planned_variants(*known, model.inputs)
     once, other = (
@@ -154,27 +154,34 @@ def test_a_number_of_ekf2_is_that_of_a_what_if() -> None:
     assert not once.updates.equals(other.updates)
 
 
-rms_apart = attrgetter("main.difference.position_rmse_m")
+rms_difference = attrgetter("main.difference.position_rmse_m")
 
 
-def test_a_cause_says_how_far_it_keeps_both_filters_apart() -> None:
-    ours = flown(sigma_a=0.02)
-    right = compare(ours.flight, replace(ours.settings, **cause(ours, "kf").change))
-    (row,) = [one for one in ours.causes if (one.of, one.axis) == ("apart", "aisle")]
-    assert (row.before, row.after) == pytest.approx((rms_apart(ours), rms_apart(right)))
-    assert row.change == cause(ours, "kf").change
+def test_cause_has_difference_before_and_after() -> None:
+    kf_case = flown(sigma_a=0.02)
+    right = compare(kf_case.flight, replace(kf_case.settings, **cause(kf_case, "kf").change))
+    (row,) = [one for one in kf_case.causes if (one.of, one.axis) == ("apart", "aisle")]
+    assert (row.before, row.after) == pytest.approx(
+        (rms_difference(kf_case), rms_difference(right))
+    )
+    assert row.change == cause(kf_case, "kf").change
     assert row.explains == pytest.approx(1.0 - (row.after / row.before) ** 2)
     assert row.explains > 0.8
-    assert "Put right in our filter, that brings both from 24 cm to" in story(ours, find(ours))[1]
-    # what is right in EKF2 is as near to ours as EKF2 in the same flight without the mistake
-    theirs = flown("ekf2-gate=1", passes=6)
+    assert (
+        "Put right in our filter, that brings both from 24 cm to"
+        in story(kf_case, find(kf_case))[1]
+    )
+    # corrected EKF2 differs from KF as much as EKF2 in the same flight without the mistake
+    ekf2_case = flown("ekf2-gate=1", passes=6)
     right = compare(simulate_flight(Scenario(seed=5)), RIGHT)
-    (row,) = [one for one in theirs.causes if (one.of, one.axis) == ("apart", "aisle")]
-    assert (row.before, row.after) == pytest.approx((rms_apart(theirs), rms_apart(right)), rel=0.1)
-    assert "Put right in EKF2, that brings both from" in story(theirs, find(theirs))[1]
+    (row,) = [one for one in ekf2_case.causes if (one.of, one.axis) == ("apart", "aisle")]
+    assert (row.before, row.after) == pytest.approx(
+        (rms_difference(ekf2_case), rms_difference(right)), rel=0.1
+    )
+    assert "Put right in EKF2, that brings both from" in story(ekf2_case, find(ekf2_case))[1]
 
 
-def test_outliers_are_left_out_of_stamps_that_are_moved() -> None:
+def test_outliers_are_excluded_at_shifted_timestamps() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS]
     rows = [one for one in analysis.causes if one.filter == "ekf2" and one.axis == "aisle"]
@@ -187,13 +194,13 @@ def test_outliers_are_left_out_of_stamps_that_are_moved() -> None:
         with_misaligned_positions(model, 0.0, 0.19), [{}], out.outlier_time_s + 0.19
     )
     assert len(late.updates) == pytest.approx(len(bare.updates), abs=2)
-    # both are without their outliers
+    # both replays exclude their outliers
     for each in (bare, late):
         nis = each.updates["innovation_north_m"] ** 2 / each.updates["innovation_variance_north_m2"]
         assert nis.mean() < 1.3
 
 
-def test_a_parameter_that_is_not_px4s_is_tried() -> None:
+def test_ekf2_changes_include_non_default_parameter() -> None:
     analysis = flown("ekf2-noise=0.03")
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
@@ -204,7 +211,7 @@ def test_a_parameter_that_is_not_px4s_is_tried() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_what_explains_too_little_or_too_much_is_no_cause() -> None:
+def test_is_cause_requires_half_to_one_and_a_half() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
         return Intervention(
             of="nis", filter="kf", axis="aisle", change=change, before=9.0,
@@ -214,18 +221,20 @@ def test_what_explains_too_little_or_too_much_is_no_cause() -> None:
     for explains in (MIN_EXPLAINED_SHARE - 0.01, 1.51, -1.0):
         assert cause_of([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
     part, whole = one({"sigma_a_m_s2": 0.1}, 0.99), one({"sigma_z_m": 1.0}, 0.9, into=True)
-    assert cause_of([part, whole], "kf", "aisle") is whole  # into the band before near to it
+    assert (
+        cause_of([part, whole], "kf", "aisle") is whole
+    )  # a change into the band precedes a larger share
     both = one({CLOCK: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
-    assert cause_of([both, whole], "kf", "aisle") is whole  # fewer changes
+    assert cause_of([both, whole], "kf", "aisle") is whole  # fewer changes precede
     fault = one({CLOCK: 0.1}, 0.9, into=True)
-    assert cause_of([whole, fault], "kf", "aisle") is fault  # what is wrong with the source
+    assert cause_of([whole, fault], "kf", "aisle") is fault  # sensor faults precede settings
     nearly, far = one({FORWARD: 0.3, TO_RIGHT: 0.1}, 0.8), one({FORWARD: 0.3, TO_RIGHT: 0.1}, 0.7)
-    assert cause_of([whole, nearly], "kf", "aisle") is nearly  # two numbers are one fault
+    assert cause_of([whole, nearly], "kf", "aisle") is nearly  # both bias components are one change
     assert cause_of([whole, far], "kf", "aisle") is whole
     assert cause_of([whole], "ekf2", "aisle") is cause_of([whole], "kf", "north") is None
 
 
-def test_without_what_it_needs_a_candidate_is_not_tried() -> None:
+def test_candidate_without_required_data_is_skipped() -> None:
     analysis = flown("nlos=7%", sigma_z=0.05)
     missing = Unavailable("it", "not known", "None.")
 

@@ -1,4 +1,4 @@
-"""The filter and its formulas against a recursion in plain Python, as the lesson writes it."""
+"""KF and its formulas against a recursion in plain Python, as in the lesson."""
 
 import math
 from bisect import bisect_right
@@ -24,7 +24,7 @@ STATE = STATES + COVARIANCES
 
 
 def steps_of(measured: Sequence[float], dt: float) -> list[float]:
-    """The DT grid from the first measurement on, and each measurement's own time."""
+    """Return the DT grid from the first measurement, with all measurement times."""
     kept = list(measured)
     for k in range(math.floor((measured[-1] - measured[0]) / dt + 1e-6) + 1):
         time = measured[0] + k * dt
@@ -38,7 +38,7 @@ def steps_of(measured: Sequence[float], dt: float) -> list[float]:
 def mean_acceleration(
     times: Sequence[float], values: Sequence[float], start: float, end: float
 ) -> float:
-    """Mean over a step of a signal that has in each interval the mean of its two samples."""
+    """Return the mean over a step of a signal with piecewise constant means of two samples."""
     total = 0.0
     at = max(bisect_right(times, start) - 1, 0)
     while at + 1 < len(times) and times[at] < end:
@@ -95,7 +95,7 @@ def axis() -> Axis:
 
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
-def test_replay_of_any_axis_equals_the_plain_recursion(axis: Axis, chosen: Settings) -> None:
+def test_replay_any_axis_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
     run = replay(axis, chosen)
     states, updates = plain_replay(axis, chosen)
     np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
@@ -103,18 +103,18 @@ def test_replay_of_any_axis_equals_the_plain_recursion(axis: Axis, chosen: Setti
 
 
 @pytest.mark.parametrize("name", ["sigma_a_m_s2", "sigma_z_m", "dt_s", "clock_offset_s"])
-def test_settings_out_of_range_are_refused_in_one_line(name: str) -> None:
+def test_settings_out_of_range_are_rejected(name: str) -> None:
     for value in (-11.0, 1e300, math.nan, math.inf, *([] if name[0] == "c" else [0.0, 1e-300])):
         with pytest.raises(SettingsError, match=rf"^`{name}` \S+ is out of range: give .+\.$"):
             Settings(**{name: value})
 
 
-def test_imu_input_without_an_imu_is_refused() -> None:
+def test_replay_imu_input_without_imu_is_rejected() -> None:
     with pytest.raises(SettingsError, match="`input` imu needs an acceleration"):
         replay(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
 
 
-def test_the_first_measurement_or_a_given_state_is_the_start(axis: Axis) -> None:
+def test_replay_starts_at_first_measurement_or_state(axis: Axis) -> None:
     run = replay(axis, Settings())
     assert run.steps.index[0] == axis.measurement_time_s[0]
     assert run.steps[STATE].iloc[0].tolist() == [axis.measurement_m[0], 0.0, 0.25, 0.0, 1.0]
@@ -125,8 +125,8 @@ def test_the_first_measurement_or_a_given_state_is_the_start(axis: Axis) -> None
     assert run.updates.index.tolist() == axis.measurement_time_s.tolist()
 
 
-def test_the_state_is_predicted_from_the_step_before(axis: Axis) -> None:
-    """At a step it is the step's, between two by the input; outside the replay not a number."""
+def test_state_at_predicts_from_previous_step(axis: Axis) -> None:
+    """At a step the state is that of the step, between two predicted, outside NaN."""
     run = replay(axis, Settings())
     edges = run.steps.index.to_numpy()
     np.testing.assert_array_equal(np.transpose(state_at(run, edges)), run.steps[STATE[:2]])
@@ -142,8 +142,8 @@ def test_the_state_is_predicted_from_the_step_before(axis: Axis) -> None:
 
 @pytest.mark.parametrize("dt", [0.02, 0.1, 0.4])
 @pytest.mark.parametrize("gap", [False, True])
-def test_variance_between_steps_is_predicted_from_the_step_before(dt: float, gap: bool) -> None:
-    """P = FPFᵀ + Q written as matrices, at every point of every step, with an IMU gap or not."""
+def test_variance_at_predicts_from_previous_step(dt: float, gap: bool) -> None:
+    """P = FPFᵀ + Q in matrix form, at several points of every step, with and without a gap."""
     time = 0.37 * np.arange(12)
     imu = np.arange(0.0, 5.0, 0.02)
     imu = imu[(imu < 1.0) | (imu > 2.5)] if gap else imu
@@ -167,7 +167,7 @@ def test_variance_between_steps_is_predicted_from_the_step_before(dt: float, gap
 
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings, data=st.data())
-def test_a_later_measurement_does_not_change_earlier_output(axis, chosen, data) -> None:
+def test_state_at_ignores_later_measurements(axis, chosen, data) -> None:
     changed = data.draw(st.integers(1, len(axis.measurement_m) - 1))
     arrival = axis.measurement_time_s[changed]
     measured = axis.measurement_m.copy()
@@ -181,7 +181,7 @@ def test_a_later_measurement_does_not_change_earlier_output(axis, chosen, data) 
     assert abs(after[0, -1] - before[0, -1]) > 0.0
 
 
-def test_imu_gap_raises_the_process_noise_by_the_inputs_mean_square() -> None:
+def test_replay_imu_gap_adds_input_mean_square_to_q() -> None:
     time = 0.5 * np.arange(21)
     imu = np.arange(0.0, 10.001, 0.02)
     value = 2.0 * np.sin(imu)
@@ -195,20 +195,20 @@ def test_imu_gap_raises_the_process_noise_by_the_inputs_mean_square() -> None:
     mean_square = np.mean(value[outside_gap] ** 2)
     at = broken.steps.index.searchsorted([4.09, 4.19])
     before, after = broken.steps["velocity_variance_m2_s2"].iloc[at]
-    # between two measurements the gap lasts 0.5 s, five times DT, and the motion persists in it
+    # the gap between two measurements lasts 0.5 s, five times DT, with persistent acceleration
     assert after - before == pytest.approx((0.5**2 + 5.0 * mean_square) * 0.1 * 0.1, rel=1e-6)
     at = whole.steps.index[(whole.steps.index > 4.05) & (whole.steps.index < 4.95)]
     raised = broken.steps.loc[at, "position_variance_m2"]
     assert np.all(raised > whole.steps.loc[at, "position_variance_m2"])
 
 
-# ---- the formulas, element by element, against the matrices that they stand for ----
+# ---- formulas by elements against their matrices ----
 
 P = (0.5, -0.2, 0.7)
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.1, 0.7])
-def test_elements_are_those_of_the_matrices(dt: float) -> None:
+def test_model_elements_equal_matrices(dt: float) -> None:
     f, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2.0], [dt]])
     propagate_covariance = f @ model.symmetric_matrix(P) @ f.T
     np.testing.assert_allclose(
@@ -223,7 +223,7 @@ def test_elements_are_those_of_the_matrices(dt: float) -> None:
     )
 
 
-def test_many_short_steps_add_the_limit() -> None:
+def test_continuous_noise_is_limit_of_short_steps() -> None:
     count, total = 10_000, 0.7
     dt = total / count
     covariance = (0.0, 0.0, 0.0)

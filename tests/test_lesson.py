@@ -1,10 +1,10 @@
-"""Examples 1 and 2 of the lesson, digit for digit."""
+"""Examples 1 and 2 of the lesson, with exactly its numbers."""
 
 from __future__ import annotations
 
 from cli_tools import run
 
-# as the lesson prints them
+# output as printed in the lesson
 EXAMPLE_1 = """\
 t 0.5 s: p 0.57 (true 0.50), v 0.57, sigma_p 0.099 m, sigma_v 0.719 m/s
 t 1.0 s: p 0.88 (true 1.00), v 0.61, sigma_p 0.097 m, sigma_v 0.262 m/s
@@ -15,11 +15,11 @@ t 3.0 s: p 2.93 (true 3.00), v 0.92, sigma_p 0.081 m, sigma_v 0.136 m/s
 """
 
 
-def test_example_1_prints_the_lessons_six_lines() -> None:
+def test_lesson_kalman_prints_lines_of_example_1() -> None:
     assert run("lesson", "kalman").output == EXAMPLE_1
 
 
-# as the lesson prints them
+# output as printed in the lesson
 EXAMPLE_2 = """\
 loop closure error (1.2, 0.8) m over 80.4 m = 1.8%
 (  0.0,   0.0) -> ( 0.00,  0.00)
@@ -30,5 +30,5 @@ loop closure error (1.2, 0.8) m over 80.4 m = 1.8%
 """
 
 
-def test_example_2_prints_the_lessons_six_lines() -> None:
+def test_lesson_loop_prints_lines_of_example_2() -> None:
     assert run("lesson", "loop").output == EXAMPLE_2

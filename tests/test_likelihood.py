@@ -40,7 +40,7 @@ def walk(seed: int = 3, *, sigma_z: float = 0.1, count: int = 4000) -> Axis:
     return random_walk(rng, count=count, interval_s=0.2, sigma_a=0.5, sigma_z=sigma_z)
 
 
-def test_grid_on_the_sample_log_equals_the_replay_at_every_setting(sample_flight: Flight) -> None:
+def test_innovations_sample_grid_equals_replay(sample_flight: Flight) -> None:
     for axis in sample_axes(sample_flight):
         nu, s = innovations(
             preintegrate(axis, Settings()), np.array(SIGMA_A)[:, None], np.array(SIGMA_Z)
@@ -48,52 +48,52 @@ def test_grid_on_the_sample_log_equals_the_replay_at_every_setting(sample_flight
         for i, sigma_a in enumerate(SIGMA_A):
             for j in range(3) if axis.name == "north" else [i]:
                 chosen = Settings(sigma_a_m_s2=sigma_a, sigma_z_m=SIGMA_Z[j])
-                ours = np.array([nu[:, i, j], s[:, i, j]])
-                np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
+                found = np.array([nu[:, i, j], s[:, i, j]])
+                np.testing.assert_allclose(found, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
 
 
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
-def test_any_axis_and_setting_equals_the_replay(axis: Axis, chosen: Settings) -> None:
-    ours = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
-    np.testing.assert_allclose(ours, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
+def test_innovations_any_axis_equal_replay(axis: Axis, chosen: Settings) -> None:
+    found = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
+    np.testing.assert_allclose(found, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
     quick, exact = quick_replay(axis, chosen), replay(axis, chosen)
     for table in ("steps", "updates"):
         frames = getattr(quick, table), getattr(exact, table)
         pd.testing.assert_frame_equal(*frames, rtol=1e-9, atol=1e-9)
 
 
-def test_an_imu_gap_costs_the_same_in_both_filters() -> None:
+def test_innovations_with_imu_gap_equal_replay() -> None:
     imu = np.arange(0.0, 12.0, 0.02)
     imu = imu[(imu < 4.0) | (imu > 5.3)]
     time = 0.37 * np.arange(30)
     axis = line(time, np.sin(time), (imu, -np.sin(imu)))
     assert replay(axis, Settings()).input_gap_s > 1.0
-    ours = innovations(preintegrate(axis, Settings()), 0.5, 0.1)
-    np.testing.assert_allclose(ours, replayed(axis, Settings()), rtol=1e-9, atol=1e-9)
+    found = innovations(preintegrate(axis, Settings()), 0.5, 0.1)
+    np.testing.assert_allclose(found, replayed(axis, Settings()), rtol=1e-9, atol=1e-9)
 
 
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings)
-def test_states_equal_the_replay_at_the_measurements(axis: Axis, chosen: Settings) -> None:
+def test_filter_states_equal_replay_at_measurements(axis: Axis, chosen: Settings) -> None:
     grid = filter_states(
         preintegrate(axis, chosen), chosen.sigma_a_m_s2 * np.array([[2.0], [1.0]]), chosen.sigma_z_m
     )
     run = replay(axis, chosen)
     after, updates = run.steps.loc[run.updates.index], run.updates
-    for ours, theirs in (
+    for values, expected in (
         (grid.gain, updates["gain_position"]),
         (grid.velocity_m_s, after["velocity_m_s"]),
         (grid.sigma_p_m**2, after["position_variance_m2"]),
         (grid.sigma_v_m_s**2, after["velocity_variance_m2_s2"]),
         (grid.nis, updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]),
     ):
-        assert ours.shape == (len(updates), 2, 1)
-        np.testing.assert_allclose(ours[:, 1, 0], theirs, rtol=1e-9, atol=1e-9)
+        assert values.shape == (len(updates), 2, 1)
+        np.testing.assert_allclose(values[:, 1, 0], expected, rtol=1e-9, atol=1e-9)
 
 
-def test_a_skipped_measurement_is_compared_but_not_fused() -> None:
-    """As if it were not there, for all that come after it."""
+def test_innovations_skipped_measurement_is_not_fused() -> None:
+    """Later innovations are as without the skipped measurement."""
     axis = walk(count=60)
     skip = np.zeros(59, dtype=bool)
     skip[[20, 21, 40]] = True
@@ -106,8 +106,8 @@ def test_a_skipped_measurement_is_compared_but_not_fused() -> None:
     assert np.all(nu[skip] != 0.0)
 
 
-def test_a_weight_is_a_smaller_variance_of_its_measurement() -> None:
-    """A weight of 1/w² is SIGMA_Z times w; hardly any weight is a measurement left out."""
+def test_run_filter_weight_divides_variance() -> None:
+    """A weight of 1/w² multiplies SIGMA_Z by w; a weight near zero excludes the measurement."""
     legs = preintegrate(walk(count=40), ZERO)
     rows = list(run_filter(legs, 0.5, 0.2, None, np.full(39, 4.0)))
     heavier = innovations(legs, 0.5, 0.1)
@@ -119,8 +119,8 @@ def test_a_weight_is_a_smaller_variance_of_its_measurement() -> None:
     np.testing.assert_allclose(np.array([row[1] for row in left_out])[~skip], s[~skip], rtol=1e-6)
 
 
-def test_the_likelihood_over_a_grid_is_that_of_normal_innovations() -> None:
-    """Of both axes, against scipy's density of the replay's innovations."""
+def test_score_grid_equals_normal_density() -> None:
+    """Compare both axes with scipy's density of the replay's innovations."""
     axes = walk(4, count=60), walk(5, count=60)
     a, z = np.array([0.2, 0.5, 2.0]), np.array([0.05, 0.1])
     legs = [preintegrate(axis, ZERO) for axis in axes]
@@ -134,11 +134,11 @@ def test_the_likelihood_over_a_grid_is_that_of_normal_innovations() -> None:
     np.testing.assert_allclose(total + constant, density, rtol=1e-10)
 
 
-def test_the_vertex_of_a_parabola_is_found_from_three_points() -> None:
+def test_parabola_vertex_from_three_points_is_exact() -> None:
     steps = np.arange(7) - 3.0
     for vertex, bend in ((-0.5, 0.3), (-0.2, 4.0), (0.0, 0.3), (0.35, 4.0)):
         found = parabola_vertex(1.0 + 0.5 * bend * (steps - vertex) ** 2, 3)
         assert found == pytest.approx((vertex, bend), abs=1e-12)
-    # one that does not bend upwards has none
+    # without upward curvature there is no vertex
     assert parabola_vertex(np.array([3.0, 2.0, 1.0]), 1) == (0.0, 0.0)
     assert parabola_vertex(np.array([1.0, 2.0, 1.0]), 1) == (0.0, -2.0)

@@ -1,4 +1,4 @@
-"""The banded likelihood against dense linear algebra, and the noises that it finds."""
+"""The banded likelihood and the noise estimates against dense linear algebra."""
 
 from typing import Any
 
@@ -50,7 +50,7 @@ from px4fuse.filter.signals import Axis
 
 
 def matrices(elements: Array) -> Array:
-    """Q of each leg, of its elements 00, 01, 11."""
+    """Return Q of each interval from its elements 00, 01, 11."""
     q00, q01, q11 = elements
     return np.moveaxis([[q00, q01], [q01, q11]], -1, 0)
 
@@ -60,8 +60,8 @@ def matrices(elements: Array) -> Array:
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_the_system_is_that_of_the_dense_normal_equations(seed: int) -> None:
-    """Two stretches, and a state that nothing measures, by lstsq, slogdet and inv."""
+def test_system_equals_dense_normal_equations(seed: int) -> None:
+    """Two stretches and one unmeasured state, compared with lstsq, slogdet and inv."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(6, 14))
     second = int(rng.integers(3, count - 2))
@@ -74,7 +74,7 @@ def test_the_system_is_that_of_the_dense_normal_equations(seed: int) -> None:
     precision[rng.integers(1, count), 0] = 0.0
     widths = count, count - 1, count - 1
     signals = measured, dp, dv = [rng.normal(size=(3, width)) for width in widths]
-    # rows of what is known, over their standard deviations
+    # rows of the prior and the measurements, divided by their σ
     rows = np.diag(np.sqrt(precision.ravel()))
     known = np.zeros((2 * count, 3))
     known[0::2] = np.sqrt(precision[:, :1]) * measured.T
@@ -105,8 +105,8 @@ def test_the_system_is_that_of_the_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
-def test_legs_of_one_step_are_factorised_far_beyond_the_search() -> None:
-    """Their Q is of rank one: of what makes it invertible, rounding leaves nothing."""
+def test_factorise_single_steps_outside_search_range() -> None:
+    """Q of a single step has rank one, so the term that makes it invertible is below rounding."""
     step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
     precision = np.stack([np.ones(20), np.zeros(20)], 1)
@@ -114,7 +114,7 @@ def test_legs_of_one_step_are_factorised_far_beyond_the_search() -> None:
         factorise(step, sigma_a**2 * unit, joined, precision).log_determinant
         for sigma_a in np.geomspace(1e4, 1e6, 100)
     ]
-    # with more noise the innovations are larger
+    # ln|S| grows with the noise
     assert np.all(np.diff(values) > 0.0)
     precision[4:, 0] = 0.0
     with pytest.raises(np.linalg.LinAlgError):
@@ -124,7 +124,7 @@ def test_legs_of_one_step_are_factorised_far_beyond_the_search() -> None:
 # --- the likelihood with constants ---
 
 START, COUNT = np.array([0, 11]), 24
-WEAK = np.array([1e-6, 1e-4])  # of position and velocity where a stretch starts
+WEAK = np.array([1e-6, 1e-4])  # prior precision of position and velocity
 WEIGHT = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
 SOME_NOISES = [
     Noises(0.5, 0.1), Noises(0.05, 0.1), Noises(2.0, 0.1), Noises(0.5, 0.02), Noises(0.5, 1.0),
@@ -157,7 +157,7 @@ def with_constants(offsets: int = 3) -> Positions:
 
 
 def arguments(positions: Positions, noises: Noises, weight: Array) -> tuple[Any, float, Array]:
-    """What :func:`fit_positions` takes."""
+    """Return the arguments of :func:`fit_positions`."""
     if noises.slow_m:
         positions = replace(positions, slow=(noises.slow_m, noises.tau_s))
     scaled, variance = positions.over(1.0, noises.walk_m, weight / noises.sigma_z_m**2)
@@ -167,12 +167,12 @@ def arguments(positions: Positions, noises: Noises, weight: Array) -> tuple[Any,
 def stretch_normal(
     part: Positions, noises: Noises, variance: Array, stretch: int, axis: int, at: int = 0
 ) -> tuple[IntArray, Array, Array]:
-    """Rows that are measured, their signals (data minus mean, constants), and their covariance."""
+    """Return measured rows, their signals (data minus mean, constants) and their covariance."""
     q = matrices(noises.sigma_a_m_s2**2 * part.noise_unit + part.noise_fixed)
     rows = list(range(*(*START, COUNT)[stretch : stretch + 2]))
-    # of position and velocity, over the data's and the constants' signals
+    # position and velocity for the signals of data and constants
     means = [np.zeros((2, 4))]
-    cross = {(0, 0): np.diag(1.0 / WEAK)}  # covariance of each state with all before it
+    cross = {(0, 0): np.diag(1.0 / WEAK)}  # covariance of each state with all earlier ones
     for k, row in enumerate(rows[1:], start=1):
         length = part.length_s[row - 1]
         f = np.array([[1.0, length], [0.0, 1.0]])
@@ -199,15 +199,15 @@ def stretch_normal(
 def joint_normal(
     part: Positions, noises: Noises, variance: Array, stretch: int, at: int = 0
 ) -> tuple[Array, Array, list[tuple[IntArray, Array, Array]]]:
-    """Data and covariance of all axes, the constants in it; and each axis by itself."""
+    """Return data and covariance (with constants) of all axes, and each axis separately."""
     made = [stretch_normal(part, noises, variance, stretch, axis, at) for axis in range(3)]
     signals = np.concatenate([each[1] for each in made])
     covariance = signals[:, 1:] * part.constant_sigma**2 @ signals[:, 1:].T
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
-def test_marginal_constants_are_a_covariance() -> None:
-    """At all offsets and noises, but for one number that is always the same."""
+def test_fit_positions_constants_act_as_covariance() -> None:
+    """Equal at all offsets and noises, except for a constant."""
     part = with_constants()
 
     def dense(noises: Noises, at: int) -> float:
@@ -220,18 +220,22 @@ def test_marginal_constants_are_a_covariance() -> None:
 
     expected = np.array([[dense(noises, at) for at in range(3)] for noises in SOME_NOISES])
     assert np.ptp(expected) > 1000.0
-    ours = np.array(
+    found_values = np.array(
         [fit_positions(*arguments(part, noises, WEIGHT)).totals()[0] for noises in SOME_NOISES]
     )
-    np.testing.assert_allclose(ours - ours[0, 0], expected - expected[0, 0], rtol=1e-5, atol=1e-3)
-    # over SIGMA_Z, which only changes what is as good as unknown
+    np.testing.assert_allclose(
+        found_values - found_values[0, 0], expected - expected[0, 0], rtol=1e-5, atol=1e-3
+    )
+    # in units of SIGMA_Z, which changes only negligible priors
     scaled = np.array([fit_noises([part], noises, WEIGHT).totals()[0] for noises in SOME_NOISES])
-    np.testing.assert_allclose(scaled - scaled[0, 0], ours - ours[0, 0], rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(
+        scaled - scaled[0, 0], found_values - found_values[0, 0], rtol=1e-5, atol=1e-3
+    )
 
 
 @pytest.mark.parametrize("start_known", [True, False])
-def test_an_axis_that_is_hardly_measured_says_nothing(start_known: bool) -> None:
-    """One position in a stretch, wherever it is, and none at all are the same."""
+def test_fit_positions_single_measurement_has_no_effect(start_known: bool) -> None:
+    """A single position in a stretch has the same likelihood as none."""
     part = with_constants()
     if not start_known:
         part = replace(part, initial=np.zeros((COUNT, 2)))
@@ -244,9 +248,9 @@ def test_an_axis_that_is_hardly_measured_says_nothing(start_known: bool) -> None
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
 
-def test_constants_and_squares_are_those_of_the_conditional_distribution() -> None:
+def test_constants_and_squares_equal_conditional_normal() -> None:
     part = with_constants(offsets=1)
-    # of a third axis that is hardly measured the square would say nothing
+    # without the third axis, which has too few measurements
     part = replace(part, measurement_m=part.measurement_m * [1.0, 1.0, np.nan])
     for noises in SOME_NOISES[:5]:
         variance, square = np.full(COUNT, noises.sigma_z_m**2), np.zeros(COUNT)
@@ -256,7 +260,7 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
             _, _, made = joint_normal(part, noises, variance, stretch)
             information, right = np.diag(part.constant_sigma**-2.0), np.zeros(3)
             for _, signals, covariance in made[:2]:
-                by = -signals[:, 1:]  # what a constant adds to the positions
+                by = -signals[:, 1:]  # effect of a constant on the positions
                 information = information + by.T @ np.linalg.solve(covariance, by)
                 right += by.T @ np.linalg.solve(covariance, signals[:, 0])
             found = np.linalg.solve(information, right)
@@ -266,40 +270,40 @@ def test_constants_and_squares_are_those_of_the_conditional_distribution() -> No
                 r = np.diag(variance[rows])
                 error = r @ np.linalg.solve(covariance, signals @ [1.0, *found])
                 square[rows] += error**2 + np.diag(r - r @ np.linalg.solve(covariance, r))
-        ours, count = expected_squares(*arranged, constants)
-        np.testing.assert_allclose(ours, square, rtol=1e-4, atol=1e-9)
+        found_values, count = expected_squares(*arranged, constants)
+        np.testing.assert_allclose(found_values, square, rtol=1e-4, atol=1e-9)
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_paired_products_are_under_the_covariance_with_the_constants() -> None:
+def test_products_by_stretch_equal_dense_covariance() -> None:
     part, noises = with_constants(offsets=1), Noises(0.5, 0.1)
     signal = np.random.default_rng(8).normal(0.0, 1.0, (COUNT, 3, 2))
     still = np.zeros((3, 2, COUNT - 1))
     first, second = signal.transpose(1, 2, 0), signal[..., [1, 1]].transpose(1, 2, 0)
     given = arguments(part, noises, np.ones(COUNT))
-    ours = products_by_stretch(*given, (first, still, still), second)
-    # a path to which the legs lead is not seen
+    found_values = products_by_stretch(*given, (first, still, still), second)
+    # a path that agrees with the increments has no effect
     legs = np.random.default_rng(9).normal(0.0, 1.0, (2, *still.shape))
     path, speed = np.zeros((2, *first.shape))
     for at in np.flatnonzero(part.joined):
         path[..., at + 1] = path[..., at] + part.length_s[at] * speed[..., at] + legs[0, ..., at]
         speed[..., at + 1] = speed[..., at] + legs[1, ..., at]
     moved = products_by_stretch(*given, (first + path, *legs), second)
-    np.testing.assert_allclose(moved, ours, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(moved, found_values, rtol=1e-3, atol=1e-3)
     for stretch in range(2):
         _, covariance, made = joint_normal(part, noises, given[2], stretch)
         picked = np.concatenate([signal[rows, axis] for axis, (rows, *_) in enumerate(made)])
         expected = picked.T @ np.linalg.solve(covariance, picked)
-        np.testing.assert_allclose(ours[stretch], expected[1], rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(found_values[stretch], expected[1], rtol=1e-4, atol=1e-4)
 
 
-def test_a_smooth_path_taken_out_changes_nothing() -> None:
+def test_centre_on_path_keeps_likelihood() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
-    plain, ours = (fit_positions(*each).totals()[0] for each in given)
+    plain, found_values = (fit_positions(*each).totals()[0] for each in given)
     assert np.ptp(plain) > 1.0
-    np.testing.assert_allclose(ours, plain, rtol=1e-7)
-    # a scale's signal is the path to which each offset leads
+    np.testing.assert_allclose(found_values, plain, rtol=1e-7)
+    # the signal of the scale is the path of each offset
     scaled = fit_positions(
         *arguments(centre_on_path(part, scaled=True), SOME_NOISES[0], WEIGHT)
     ).gram
@@ -311,8 +315,8 @@ def test_a_smooth_path_taken_out_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("which", ["filter", "constants"])
-def test_the_likelihood_between_its_nodes_is_the_likelihood(which: str) -> None:
-    """Over four powers of ten of the ratio and of SIGMA_Z, but for one number always the same."""
+def test_likelihood_interpolation_equals_direct_value(which: str) -> None:
+    """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
     parts = [filter_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
         part = with_constants(offsets=1)
@@ -320,16 +324,16 @@ def test_the_likelihood_between_its_nodes_is_the_likelihood(which: str) -> None:
     some = np.exp(np.random.default_rng(4).uniform(-4.6, 1.0, (30, 2))).tolist()
     direct = [negative_log_likelihood(parts, Noises(*pair), WEIGHT) for pair in some]
     assert np.ptp(direct) > 100.0
-    # far from its maximum the start with constants, which is as good as unknown, tells
+    # far from the maximum the weak prior of the initial state has an effect
     for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
         score = Likelihood(parts, WEIGHT, 0.1, rough)
         assert score.tabulated
-        ours = np.array([score(Noises(*pair)) for pair in some])
+        found_values = np.array([score(Noises(*pair)) for pair in some])
         expected = np.array(direct) - direct[0]
-        np.testing.assert_allclose(ours - ours[0], expected, rtol=error, atol=1e-3)
+        np.testing.assert_allclose(found_values - found_values[0], expected, rtol=error, atol=1e-3)
 
 
-# --- the filter's own likelihood ---
+# --- likelihood of KF ---
 
 
 def with_gap() -> Axis:
@@ -341,8 +345,8 @@ def with_gap() -> Axis:
 
 
 @pytest.mark.parametrize("interval", [0.1, 0.2, 0.5, None])
-def test_the_filters_likelihood_is_that_of_its_innovations(interval: float | None) -> None:
-    """With legs of one step, whose Q has no inverse, of more, and through an IMU gap."""
+def test_filter_positions_likelihood_equals_innovations(interval: float | None) -> None:
+    """Intervals of one step (singular Q), of several steps, and with an IMU gap."""
     axis, chosen = with_gap(), Settings()
     if interval is not None:
         rng = np.random.default_rng(3)
@@ -357,18 +361,24 @@ def test_the_filters_likelihood_is_that_of_its_innovations(interval: float | Non
     assert np.ptp(expected) > 50.0
     np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
     part = [filter_positions(legs)]
-    ours = np.array([negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs])
-    np.testing.assert_allclose(ours - ours[0], expected - expected[0], rtol=1e-6, atol=2e-3)
-    # weights mean the same in both
+    found_values = np.array(
+        [negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs]
+    )
+    np.testing.assert_allclose(
+        found_values - found_values[0], expected - expected[0], rtol=1e-6, atol=2e-3
+    )
+    # weights have the same meaning in both
     weight = np.random.default_rng(1).uniform(0.01, 1.0, len(nu))
     grid = score_grid([legs], a, z, weight)
-    ours = np.array([negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs])
-    np.testing.assert_allclose(ours - ours[0], grid - grid[0], rtol=2e-3, atol=0.02)
+    found_values = np.array(
+        [negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs]
+    )
+    np.testing.assert_allclose(found_values - found_values[0], grid - grid[0], rtol=2e-3, atol=0.02)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, 0.8, -3.0])
-def test_the_ends_of_a_parabola_are_196_sigma_away(slope: float) -> None:
-    """With the other parameter free, which follows: its sigma is that of the margin."""
+def test_profile_ends_of_parabola_are_1_96_sigma(slope: float) -> None:
+    """With the other parameter maximised out, σ is the marginal one."""
     sigma, other_sigma = 0.2, 0.05
 
     def score(at: float, other: float) -> float:
@@ -423,7 +433,7 @@ def clean() -> list[NoiseFit]:
     ("share", "size_m", "length", "least_found"),
     [(0.05, 2.0, 4, 0.99), (0.12, 2.0, 4, 0.99), (0.06, 0.5, 2, 0.9)],
 )
-def test_outliers_are_found_and_do_not_move_the_noise(clean, share, size_m, length, least_found):
+def test_maximise_likelihood_finds_outliers(clean, share, size_m, length, least_found):
     hits = wrong = missed = 0
     ratio = []
     for seed in SEEDS:
@@ -439,7 +449,7 @@ def test_outliers_are_found_and_do_not_move_the_noise(clean, share, size_m, leng
         hits += np.count_nonzero(called & outlier_probability[1:])
         wrong += np.count_nonzero(called & ~outlier_probability[1:])
         missed += np.count_nonzero(~called & outlier_probability[1:])
-        # what is called an outlier counts little, and all else counts
+        # outliers have a low weight, all others weight 1
         assert np.all(found.weight[called & outlier_probability[1:]] < 0.6)
         assert np.median(found.weight) > 0.98
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.025)
@@ -448,8 +458,8 @@ def test_outliers_are_found_and_do_not_move_the_noise(clean, share, size_m, leng
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(axes, share, width):
-    """Of measurements without any motion, whose likelihood can be written down."""
+def test_outlier_variance_factor_equals_mixture_curvature(axes, share, width):
+    """Without motion the likelihood has a closed form."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share
     error = rng.normal(0.0, np.where(wrong, width, 1.0)[:, None], (4000, axes))
@@ -479,7 +489,7 @@ def test_noise_is_as_uncertain_as_the_likelihood_of_the_mixture_is_curved(axes, 
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
-def test_without_a_search_the_weights_stay() -> None:
+def test_maximise_likelihood_without_outliers_keeps_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
     parts = [filter_positions(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, outliers=False)
@@ -491,7 +501,7 @@ def test_without_a_search_the_weights_stay() -> None:
         assert negative_log_likelihood(parts, other, weight) > best
 
 
-def test_outlier_probability_goes_from_the_prior_to_certainty() -> None:
+def test_outlier_probability_rises_from_prior_to_one() -> None:
     """Bayes: ε N(e; 0, w²σ²) against (1 - ε) N(e; 0, σ²), over all axes."""
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):
@@ -499,5 +509,5 @@ def test_outlier_probability_goes_from_the_prior_to_certainty() -> None:
         wide = FIRST_SHARE * norm.pdf(error, scale=FIRST_WIDTH) ** axes
         got = _outlier_probability(axes * error**2, np.full(25, axes), FIRST_SHARE, FIRST_WIDTH)
         np.testing.assert_allclose(got, wide / (wide + narrow), rtol=1e-9)
-    # beyond every floating-point density
+    # where the density underflows
     assert _outlier_probability(np.array([1e200]), np.ones(1), FIRST_SHARE, FIRST_WIDTH) == 1.0

@@ -46,7 +46,7 @@ NORTH = rows(
     (0.10, 0.07, 0.01, 0.30, 0.0, 1.0),
     (0.50, 0.08, 0.03, 0.20, 1.0, 0.0),
 )
-# the first of NORTH is missing, and one follows that NORTH lacks
+# without NORTH's first time, and with one more at the end
 EAST = rows(
     (0.40, 0.09, 0.04, 0.20, 1.0, 0.0),
     (0.25, 0.05, 0.02, 0.70, 0.0, 1.0),
@@ -60,7 +60,7 @@ def innovations(made: Flight, axis: str, segment: Segment = WHOLE) -> pd.DataFra
     return project_innovations(made, made.ekf2, made.positions[0], axes_of(made)[axis], segment)
 
 
-def test_along_the_aisle_innovations_are_projected_and_variances_by_the_squares() -> None:
+def test_project_innovations_aisle_combines_north_and_east() -> None:
     got = innovations(with_innovations(flight(), north=NORTH, east=EAST), "aisle")
     assert got.index.tolist() == pytest.approx([1.2, 1.4, 1.6])
     for k, time in enumerate(got.index):
@@ -75,8 +75,8 @@ def test_along_the_aisle_innovations_are_projected_and_variances_by_the_squares(
 
 
 @pytest.mark.parametrize("axis", ["north", "east", "aisle"])
-def test_variances_before_and_after_an_update_are_those_of_the_scalar_filter(axis: str) -> None:
-    """P⁻ = S - R and 1/P⁺ = 1/P⁻ + 1/R; what was rejected updates nothing."""
+def test_project_innovations_variances_follow_scalar_update(axis: str) -> None:
+    """P⁻ = S - R and 1/P⁺ = 1/P⁻ + 1/R; a rejected sample leaves P⁻ unchanged."""
     got = innovations(with_innovations(flight(), north=NORTH, east=EAST), axis)
     s, r = got["innovation_variance_m2"], got["observation_variance_m2"]
     np.testing.assert_allclose(got["prior_variance_m2"], s - r)
@@ -87,8 +87,8 @@ def test_variances_before_and_after_an_update_are_those_of_the_scalar_filter(axi
     np.testing.assert_allclose(got["posterior_variance_m2"], expected)
 
 
-def test_a_variance_without_room_for_the_prior_leaves_it_unknown() -> None:
-    """S below R, or R itself: not a prior of zero or less."""
+def test_project_innovations_s_below_r_has_no_prior() -> None:
+    """S equal to R or smaller gives NaN instead of P⁻ ≤ 0."""
     north = NORTH.assign(innovation_variance_m2=[0.05, 0.02, 0.005, 0.08])
     got = innovations(with_innovations(flight(), north=north), "north")
     assert got["prior_variance_m2"].isna().tolist() == [False, True, True, False]
@@ -100,7 +100,7 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
 
 @pytest.mark.parametrize(("made", "axis", "segment", "says"), [
     (with_innovations(flight(), north=NORTH), "north", Segment(20.0, 30.0, ""),
-     "no sample in the segment"),
+     "no samples in the segment"),
     # the aisle needs both horizontal axes
     (with_innovations(flight(), north=GONE), "aisle", WHOLE, "none logged"),
     (with_innovations(flight(), east=GONE), "aisle", WHOLE, "none logged"),
@@ -108,14 +108,14 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
     (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
      "never fuses vehicle_mocap_odometry"),
 ], ids=["segment", "north", "east", "mocap"])  # fmt: skip
-def test_where_there_are_none_it_says_why(made, axis, segment, says) -> None:
+def test_project_innovations_missing_gives_reason(made, axis, segment, says) -> None:
     (track,) = made.positions
     got = project_innovations(made, made.ekf2, track, axes_of(made)[axis], segment)
     assert isinstance(got, Unavailable)
     assert says in str(got)
 
 
-def test_where_no_observation_noise_is_logged_the_parameters_stand_in() -> None:
+def test_project_innovations_without_r_uses_parameters() -> None:
     made = flight(ekf2=Estimator(noise_logged=False), parameters={"EKF2_EVP_NOISE": 0.05})
     got = innovations(made, "north")
     np.testing.assert_allclose(got["observation_variance_m2"], 0.05**2)
@@ -126,19 +126,19 @@ def test_where_no_observation_noise_is_logged_the_parameters_stand_in() -> None:
 
 @pytest.mark.parametrize(("parameters", "reported_m", "expected_m2"), [
     ({"EKF2_EVP_NOISE": 0.2}, None, 0.2**2),
-    ({"EKF2_EVP_NOISE": 0.001}, None, 0.01**2),  # EKF2 takes no less than a centimetre
-    # the sender's variance where it is the larger, along the axis by the squares
+    ({"EKF2_EVP_NOISE": 0.001}, None, 0.01**2),  # EKF2's lower limit is 0.01 m
+    # the sender's variance if larger, projected onto the axis
     ({"EKF2_EVP_NOISE": 0.2}, (0.3, 0.5, 1.0), COSINE**2 * 0.3**2 + SINE**2 * 0.5**2),
     ({"EKF2_EVP_NOISE": 0.2}, (0.1, 0.1, 1.0), 0.2**2),
     ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 0.0}, (0.3, 0.3, 1.0), 0.3**2),
     ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 1.0}, (0.3, 0.3, 1.0), 0.2**2),
 ])  # fmt: skip
-def test_the_observation_noise_is_ekf2s_own_rule(parameters, reported_m, expected_m2) -> None:
+def test_observation_variance_follows_ekf2_rule(parameters, reported_m, expected_m2) -> None:
     made = flight(parameters=parameters)
     (track,) = made.positions
     if reported_m is not None:
         variances = dict(zip(Columns.POSITION_VARIANCE, np.square(reported_m), strict=True))
-        # one sample that says otherwise does not change the median
+        # a single different sample does not change the median
         samples = track.samples.assign(**variances)
         samples.iloc[10, samples.columns.get_indexer(Columns.POSITION_VARIANCE)] = 100.0
         track = replace(track, samples=samples)

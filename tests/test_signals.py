@@ -53,7 +53,7 @@ def flight_of(*, imu=ABSENT, attitude=ABSENT, track=None, duration_s=10.0, airbo
 # ---- acceleration in NED ----------------------------------------------------------------------
 
 
-def felt(time, force, attitude):
+def ned_acceleration_of(time, force, attitude):
     """Acceleration in NED that a specific force in the body gives."""
     return ned_acceleration(flight_of(imu=still_imu(time, force), attitude=attitude))
 
@@ -61,11 +61,11 @@ def felt(time, force, attitude):
 @pytest.mark.parametrize(
     "angles_deg", [(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (0.0, 25.0, 0.0), (120.0, -10.0, 170.0)]
 )
-def test_a_still_vehicle_does_not_accelerate_whichever_way_it_is_turned(angles_deg):
+def test_ned_acceleration_at_rest_is_zero_at_any_attitude(angles_deg):
     time = np.arange(0.0, 5.0, 0.01)
     tilt = Rotation.from_euler("ZYX", angles_deg, degrees=True)
     attitude = attitude_table(time[::5], Rotation.concatenate([tilt] * len(time[::5])))
-    acceleration = felt(time, tilt.inv().apply([0.0, 0.0, -GRAVITY]), attitude)
+    acceleration = ned_acceleration_of(time, tilt.inv().apply([0.0, 0.0, -GRAVITY]), attitude)
     assert list(acceleration.columns) == list(AXIS_NAMES)
     np.testing.assert_allclose(acceleration, 0, atol=1e-12)
     np.testing.assert_array_equal(acceleration.index, time[time <= time[::5][-1]])
@@ -73,8 +73,8 @@ def test_a_still_vehicle_does_not_accelerate_whichever_way_it_is_turned(angles_d
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 1, 0), (0.6, 0.0, 0.8)])
 @pytest.mark.parametrize("rate_rad_s", [0.5, -3.0])
-def test_constant_acceleration_of_a_turning_body(axis, rate_rad_s):
-    """Turning at a constant rate, felt force is R(t)ᵀ(a − g); a must come back.
+def test_ned_acceleration_rotating_body_is_constant(axis, rate_rad_s):
+    """Turning at a constant rate, the specific force is R(t)ᵀ(a − g); a must come back.
 
     The attitude is logged ten times slower than the IMU; interpolation on the sphere is exact for
     a constant rate.
@@ -87,17 +87,21 @@ def test_constant_acceleration_of_a_turning_body(axis, rate_rad_s):
 
     time = np.arange(0.0, 5.0, 0.005)
     force = body_to_ned(time).inv().apply(truth - [0.0, 0.0, GRAVITY])
-    acceleration = felt(time, force, attitude_table(time[::10], body_to_ned(time[::10])))
+    acceleration = ned_acceleration_of(
+        time, force, attitude_table(time[::10], body_to_ned(time[::10]))
+    )
     assert len(acceleration) > 980
     np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=1e-9)
 
 
-def test_no_acceleration_without_imu_and_attitude_at_the_same_time():
+def test_ned_acceleration_without_overlap_is_unavailable():
     time = np.arange(0.0, 1.0, 0.01)
     level = attitude_table(time, Rotation.identity(len(time)))
     assert ned_acceleration(flight_of(attitude=level)) is ABSENT
     assert ned_acceleration(flight_of(imu=still_imu(time))) is ABSENT
-    assert "overlap" in felt(time, (0.0, 0.0, 0.0), level.set_axis(time + 100.0)).reason
+    assert (
+        "overlap" in ned_acceleration_of(time, (0.0, 0.0, 0.0), level.set_axis(time + 100.0)).reason
+    )
 
 
 # ---- averages over steps ----------------------------------------------------------------------
@@ -111,7 +115,7 @@ intervals = st.lists(st.integers(1, 50), min_size=3, max_size=40)
 
 
 @given(intervals, st.data())
-def test_step_means_of_piecewise_linear_signals_are_exact(gaps_ms, data):
+def test_step_means_piecewise_linear_are_exact(gaps_ms, data):
     """Between samples the signal is a straight line; steps that end on samples average exactly."""
     time = np.concatenate([[0.0], np.cumsum(gaps_ms) * 1e-3])
     count = len(time)
@@ -135,7 +139,7 @@ def test_step_means_of_piecewise_linear_signals_are_exact(gaps_ms, data):
         (np.r_[0.0 : 20.0 : 1 / 8.6], np.arange(0.0, 19.0, 0.1), np.zeros(189)),
     ],
 )  # fmt: skip
-def test_a_gap_is_the_share_of_the_step_without_imu(time, edges, gaps):
+def test_step_means_gap_is_share_without_imu(time, edges, gaps):
     """A gap between equal values says the same value; outside the mean is zero."""
     mean, gap = step_means(acceleration_of(time, np.ones(len(time))), edges)
     np.testing.assert_allclose(gap, gaps, atol=1e-9)
@@ -143,7 +147,7 @@ def test_a_gap_is_the_share_of_the_step_without_imu(time, edges, gaps):
     np.testing.assert_allclose(mean, inside, atol=1e-9)
 
 
-def test_rms_counts_only_the_segment():
+def test_acceleration_rms_uses_segment_only():
     time = np.arange(0.0, 10.0, 0.01)
     pushed = table(time, np.outer(np.where(time < 5.0, 100.0, 2.0), NORTH), AXIS_NAMES)
     inside = project_acceleration(pushed, NORTH, Segment(5.0, 9.0, ""))
@@ -166,14 +170,14 @@ def line_track(heading_deg, count=200, noise=0.0):
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 30.0, 90.0, 135.0, 179.0, 210.0])
-def test_heading_of_a_straight_line(heading_deg):
+def test_aisle_heading_of_straight_line_is_its_heading(heading_deg):
     heading, elongation = aisle_heading(line_track(heading_deg)[0], ALL)
     assert (heading - heading_deg + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=1e-6)
     assert 0.0 <= heading < 180.0
     assert elongation > 1e6
 
 
-def test_axes_project_the_positions():
+def test_make_axes_projects_positions():
     track, along = line_track(30.0)
     axes = {axis.name: axis for axis in make_axes(flight_of(track=track), track, ALL)}
     assert list(axes) == ["north", "east", "down", "aisle"]
@@ -185,7 +189,7 @@ def test_axes_project_the_positions():
     np.testing.assert_allclose(axes["aisle"].measurement_m, along + offset, atol=1e-9)
 
 
-def test_positions_and_acceleration_are_projected_on_a_given_heading():
+def test_make_axes_given_heading_projects_both():
     time = np.arange(0.0, 10.0, 0.01)
     track, _ = line_track(30.0, count=50)
     flight = flight_of(
@@ -201,7 +205,7 @@ def test_positions_and_acceleration_are_projected_on_a_given_heading():
     assert "--heading" in axis.note
 
 
-def test_a_clock_offset_moves_the_times_and_nothing_else():
+def test_shift_clock_changes_times_only():
     track, _ = line_track(30.0)
     moved = shift_clock(track, -0.1)
     np.testing.assert_allclose(moved.samples.index, track.samples.index - 0.1, atol=1e-12)
@@ -209,7 +213,7 @@ def test_a_clock_offset_moves_the_times_and_nothing_else():
     assert replace(moved, samples=track.samples) == track
 
 
-def test_axes_hold_what_the_source_measures_in_the_segment():
+def test_make_axes_contain_measurements_of_segment():
     track, _ = line_track(30.0)
     track.samples["down_m"] = np.nan
     axes = make_axes(flight_of(track=track), track, ALL)
@@ -235,11 +239,11 @@ def straight(first_s, last_s):
     (((4.0, 6.0), (8.0, 12.0)), (4.0, 12.0)),  # first take-off to last touch-down
     (((0.0, 30.0),), (2.0, 18.0)),
     (((10.0, 30.0),), (10.0, 18.0)),
-    ((), (2.0, 18.0)),  # never took off
-    (((19.0, 20.0),), (2.0, 18.0)),  # the source does not run in flight
+    ((), (2.0, 18.0)),  # without take-off
+    (((19.0, 20.0),), (2.0, 18.0)),  # no positions in flight
     (ABSENT, (2.0, 18.0)),  # no land detector
 ])  # fmt: skip
-def test_the_segment_is_where_the_source_runs_and_the_vehicle_flies(airborne, expected):
+def test_choose_segment_is_airborne_part_of_source(airborne, expected):
     track = straight(2.0, 18.0)
     flight = flight_of(track=track, duration_s=20.0, airborne=airborne)
     segment = choose_segment(flight, track)
@@ -247,7 +251,7 @@ def test_the_segment_is_where_the_source_runs_and_the_vehicle_flies(airborne, ex
     assert segment.reason
 
 
-def test_either_end_can_be_given():
+def test_choose_segment_uses_given_ends():
     track = straight(2.0, 18.0)
     flight = flight_of(track=track, duration_s=20.0, airborne=((4.0, 12.0),))
     for start_s, end_s in ((5.0, None), (None, 9.0), (3.0, 15.0)):
@@ -256,8 +260,8 @@ def test_either_end_can_be_given():
         assert ("--start" in segment.reason) == (start_s is not None)
         assert ("--end" in segment.reason) == (end_s is not None)
     for start_s, end_s, said in (
-        (9.0, 9.0, "empty"), (9.0, 5.0, "empty"), (50.0, None, "empty"),
-        (5.0, 5.3, "too few"), (18.5, 19.5, "too few"),
+        (9.0, 9.0, "no positions"), (9.0, 5.0, "no positions"), (50.0, None, "no positions"),
+        (5.0, 5.3, "at least 3"), (18.5, 19.5, "at least 3"),
     ):  # fmt: skip
         with pytest.raises(SettingsError, match=said):
             choose_segment(flight, track, start_s, end_s)
@@ -275,7 +279,7 @@ def truth_at(time):
 
 
 def ekf2_of(offset, resets, velocity=0.0):
-    """EKF2 that publishes the truth plus an offset, shape (n, 3), of its own making."""
+    """Return EKF2 that publishes ground truth plus an offset, shape (n, 3)."""
     state = np.hstack([truth_at(STATE_TIME) + offset, np.full((len(STATE_TIME), 3), velocity)])
     known = table(STATE_TIME, state, Columns.POSITION + Columns.VELOCITY)
     absent = dict.fromkeys(AXIS_NAMES, ABSENT)
@@ -294,8 +298,8 @@ WHOLE = Segment(0.0, 19.9, "")
     ("at", "good"),
     [([2.0], 0), ([6.0], 0), ([17.0], 0), *(([5.0, 15.0], good) for good in range(3))],
 )
-def test_resets_that_change_the_frame_are_undone_exactly(at, good):
-    """The source is in the frame of the first, middle or last stretch, which fits it."""
+def test_continuous_state_removes_frame_resets(at, good):
+    """The source is in the frame of the first, middle or last stretch between resets."""
     deltas = np.array([[1.0, 0.5, 0.0], [-3.0, 2.0, 0.0]])[: len(at)]
     later = STATE_TIME[:, None] >= np.array(at)
     offset = later @ deltas - deltas[:good].sum(axis=0)
@@ -303,13 +307,13 @@ def test_resets_that_change_the_frame_are_undone_exactly(at, good):
     state, statement = continuous_state(ekf2_of(offset, resets), noisy_track(), WHOLE)
     np.testing.assert_allclose(state[Columns.POSITION], truth_at(STATE_TIME), atol=1e-12)
     assert f"{len(at)} of horizontal position" in statement
-    assert "undone" in statement
+    assert "removed" in statement
     assert "kept" not in statement
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
-def test_a_reset_that_corrects_an_error_or_the_velocity_is_kept(reset_s):
-    """EKF2 drifts off by 2 m and is then moved back onto the source."""
+def test_continuous_state_keeps_correcting_resets(reset_s):
+    """EKF2 drifts by 2 m and a reset moves it back to the source."""
     drift = np.where(reset_s > STATE_TIME, 2.0 * STATE_TIME / reset_s, 0.0)
     resets = [Reset(reset_s, kind, (-2.0, 0.0, 0.0)) for kind in ("position", "velocity")]
     ekf2 = ekf2_of(np.outer(drift, NORTH), resets)
@@ -320,7 +324,7 @@ def test_a_reset_that_corrects_an_error_or_the_velocity_is_kept(reset_s):
     assert "undone" not in statement
 
 
-def test_height_and_horizontal_position_are_decided_apart():
+def test_continuous_state_treats_height_separately():
     frame_change = np.where(STATE_TIME >= 8.0, 3.0, 0.0)
     drift = np.where(STATE_TIME < 12.0, 0.1 * STATE_TIME, 0.0)
     offset = np.stack([frame_change, 0.0 * drift, drift], axis=1)
@@ -333,13 +337,13 @@ def test_height_and_horizontal_position_are_decided_apart():
     assert "height" in statement.split("kept")[1]
 
 
-def test_a_reset_of_what_the_source_does_not_measure_is_kept():
+def test_continuous_state_keeps_unmeasured_resets():
     """A source without height cannot say that the frame changed."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
     offset = np.where(STATE_TIME[:, None] >= 8.0, [0.0, 0.0, 3.0], 0.0)
     ekf2 = ekf2_of(offset, [Reset(8.0, "position", (0.0, 0.0, 3.0))])
-    assert "undone" in continuous_state(ekf2, track, WHOLE)[1]
+    assert "removed" in continuous_state(ekf2, track, WHOLE)[1]
     state, statement = continuous_state(ekf2, blind, WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
     assert statement == "resets kept: 1 of height (they correct an error)"
@@ -348,8 +352,8 @@ def test_a_reset_of_what_the_source_does_not_measure_is_kept():
 @pytest.mark.parametrize(("reset_s", "said"), [
     (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"), (18.5, ""),
 ])  # fmt: skip
-def test_resets_outside_the_segment_change_nothing(reset_s, said):
-    """One at the start gave all that is seen its frame; one at the end moved the last sample."""
+def test_continuous_state_ignores_resets_outside_segment(reset_s, said):
+    """A reset at the start defines the frame; one at the end affects the last sample only."""
     ekf2 = ekf2_of(np.zeros(3), [Reset(reset_s, "position", (5.0, 5.0, 0.0))])
     state, statement = continuous_state(ekf2, noisy_track(), Segment(1.0, 18.0, ""))
     pd.testing.assert_frame_equal(state, ekf2.state)
@@ -359,10 +363,10 @@ def test_resets_outside_the_segment_change_nothing(reset_s, said):
 
 @pytest.mark.parametrize(
     ("across_m", "heading_deg", "called"),
-    [(1.0, None, "the aisle"), (4.0, None, "the longest direction"), (4.0, 30.0, "the aisle")],
+    [(1.0, None, "the aisle"), (4.0, None, "the main direction"), (4.0, 30.0, "the aisle")],
 )
-def test_an_aisle_is_what_was_flown_as_one_or_asked_for(across_m, heading_deg, called) -> None:
-    """An ellipse of 10 m by so much: what is not three times longer than wide is no aisle."""
+def test_axis_called_depends_on_elongation_and_heading(across_m, heading_deg, called) -> None:
+    """The track is an ellipse 10 m long; an aisle needs at least three times the width."""
     flight = aisle_flight(uwb=Uwb(sigma_m=0.01))
     (track,) = flight.positions
     samples = track.samples.copy()

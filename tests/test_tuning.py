@@ -1,4 +1,4 @@
-"""Tuning against data that the filter's own model made, with noises that are known."""
+"""Noise estimates against simulated data with known noises."""
 
 from functools import cache
 
@@ -36,7 +36,7 @@ def tuned(*axes: Axis, chosen: Settings = TRUE) -> AxisTuning:
 
 @cache
 def many() -> tuple[AxisTuning, ...]:
-    """The same flight with many seeds."""
+    """Return the tuning of one flight with many seeds."""
     return tuple(tuned(modelled(seed)) for seed in range(SEEDS))
 
 
@@ -44,37 +44,36 @@ def many() -> tuple[AxisTuning, ...]:
 
 
 @pytest.mark.parametrize(("name", "true"), [("sigma_z", SIGMA_Z), ("sigma_a", SIGMA_A)])
-def test_intervals_cover_the_truth_as_often_as_they_say(name: str, true: float) -> None:
-    """By hand over 1000 seeds of 400 measurements: SIGMA_Z 95.2 %, SIGMA_A 95.5 %."""
+def test_tune_intervals_contain_true_value_95_percent(name: str, true: float) -> None:
+    """With 1000 seeds of 400 measurements the coverage was 95.2 % (SIGMA_Z), 95.5 % (SIGMA_A)."""
     noises = [getattr(found, name) for found in many()]
     inside = sum(noise.low <= true <= noise.high for noise in noises)
-    # half a percent in either tail of a binomial distribution
+    # 0.5 % in each tail of the binomial distribution
     low, high = binom.ppf([0.005, 0.995], SEEDS, 0.95)
     assert low <= inside <= high
-    # and without bias, as far as so many seeds say: by hand SIGMA_Z -0.5 %, SIGMA_A -0.3 %
+    # no significant bias; with 1000 seeds it was -0.5 % (SIGMA_Z) and -0.3 % (SIGMA_A)
     values = np.array([noise.value for noise in noises])
     error = np.std(values) / np.sqrt(SEEDS)
     assert np.mean(values) == pytest.approx(true, abs=0.01 * true + 2.6 * error)
     assert error < 0.03 * true
 
 
-def test_nothing_is_called_an_outlier_where_there_is_none() -> None:
+def test_tune_clean_data_have_no_outliers() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
 
 
-def test_true_settings_have_nothing_to_gain_on_unseen_data() -> None:
+def test_held_out_true_settings_have_no_gain() -> None:
     gains = np.array([found.held_out.gain_nats for found in many()])
     assert np.mean(gains) < 0.0
     assert np.median(gains) <= 0.0
     assert np.max(gains) < 0.05
-    # on the data they were found on they always gain; twice that is χ² of two parameters: mean 1
-    # per flight
+    # on the data of the fit there is always a gain: half a χ² of two parameters, mean 1 per flight
     seen = np.array([found.gain_nats * found.count for found in many()])
     assert np.all(seen >= -1e-3)
     assert np.mean(seen) == pytest.approx(1.0, abs=2.6 / np.sqrt(SEEDS))
 
 
-def test_bad_settings_lose_on_unseen_data() -> None:
+def test_held_out_wrong_settings_have_a_gain() -> None:
     bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, input="zero")
     found = tuned(modelled(1), chosen=bad)
     assert found.held_out.gain_nats > 0.1
@@ -83,7 +82,7 @@ def test_bad_settings_lose_on_unseen_data() -> None:
     assert found.before.verdict != "consistent"
     assert found.after.verdict == "consistent"
     assert abs(found.after.lag1_autocorrelation) < abs(found.before.lag1_autocorrelation)
-    # nor do noises depend on what was chosen
+    # the estimates do not depend on the chosen settings
     other = tuned(modelled(1), chosen=Settings(sigma_a_m_s2=0.01, sigma_z_m=5.0, input="zero"))
     for name in ("sigma_a", "sigma_z"):
         one, two = ([getattr(getattr(each, name), of) for of in ("value", "low", "high")]
@@ -91,7 +90,7 @@ def test_bad_settings_lose_on_unseen_data() -> None:
         assert one == pytest.approx(two, rel=1e-4)
 
 
-def test_horizontal_axes_together_know_more_than_each_alone() -> None:
+def test_tune_two_axes_narrow_the_interval() -> None:
     for seed in range(2):
         north, east = modelled(seed), modelled(seed + 100)
         both = tuned(north, east)
@@ -107,7 +106,7 @@ def test_horizontal_axes_together_know_more_than_each_alone() -> None:
 # --- the map ---
 
 
-def test_the_map_is_the_likelihood_on_its_grid_and_the_interval_its_profile() -> None:
+def test_map_equals_likelihood_and_interval_its_profile() -> None:
     axis = modelled(5)
     found = tuned(axis)
     assert len(found.outlier_time_s) == 0
@@ -121,7 +120,7 @@ def test_the_map_is_the_likelihood_on_its_grid_and_the_interval_its_profile() ->
     best = total(found.sigma_a.value, found.sigma_z.value)
     for i, j in ((0, 0), (10, 30), (39, 5)):
         drop = total(grid_a[i], grid_z[j]) - best
-        # what may be an outlier counts a little less
+        # possible outliers have a slightly lower weight
         assert found.map.drop[i, j] == pytest.approx(drop, rel=0.02, abs=0.02)
     assert found.map.drop.min() == 0.0
     ends = ((grid_a, 1, found.filter_sigma_a), (grid_z, 0, found.sigma_z))
@@ -129,7 +128,7 @@ def test_the_map_is_the_likelihood_on_its_grid_and_the_interval_its_profile() ->
         profile = CubicSpline(np.log(grid), found.map.drop.min(axis=axis_of_other))
         for end in (noise.low, noise.high):
             assert profile(np.log(end)) == pytest.approx(PROFILE_DROP, abs=0.1)
-        # the map shows all that is likely
+        # the map contains the whole 95 % interval
         assert min(profile(np.log(grid[[0, -1]]))) > PROFILE_DROP
         assert noise.low < noise.value < noise.high
 
@@ -138,14 +137,14 @@ def test_the_map_is_the_likelihood_on_its_grid_and_the_interval_its_profile() ->
 
 
 @pytest.mark.parametrize("sigma_a", [0.05, 0.5])
-def test_noise_free_positions_bound_the_noise_and_give_no_value(sigma_a: float) -> None:
+def test_tune_noise_free_positions_give_upper_bound(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
     assert SIGMA_Z_SEARCH_M[0] <= found.sigma_z.high < 0.003
     assert found.sigma_a.low <= sigma_a <= found.sigma_a.high or sigma_a < 0.1
 
 
-def test_noises_at_an_end_of_the_search_have_the_other_end_only() -> None:
+def test_tune_noise_at_search_end_has_one_bound() -> None:
     noise = np.random.default_rng(0).normal(0.0, 1.0, 300)
     still, wild = (tuned(line(0.2 * np.arange(300), sigma * noise)) for sigma in (0.1, 30.0))
     assert still.sigma_a.value is still.sigma_a.low is None
@@ -155,28 +154,28 @@ def test_noises_at_an_end_of_the_search_have_the_other_end_only() -> None:
     assert wild.sigma_z.low > 9.0
 
 
-def test_too_few_measurements_are_said_to_be() -> None:
+def test_tune_too_few_measurements_are_unavailable() -> None:
     short = tune_axes("down", (modelled(1, MIN_MEASUREMENTS - 1),), TRUE)
     assert isinstance(short, Unavailable)
     assert short.what == "tuning, down"
-    assert f"{MIN_MEASUREMENTS - 1} measurements are too few" in short.reason
+    assert f"only {MIN_MEASUREMENTS - 1} measurements" in short.reason
     enough = tuned(modelled(1, MIN_MEASUREMENTS))
     assert isinstance(enough.held_out, Unavailable)
     assert f"{MIN_MEASUREMENTS // 2} measurements" in enough.held_out.reason
     assert enough.sigma_z.low < SIGMA_Z < enough.sigma_z.high
 
 
-def test_axes_are_named_and_pooled_only_where_they_share_their_times() -> None:
+def test_tune_pools_axes_with_equal_timestamps() -> None:
     north, east = modelled(1, 60), replace(modelled(2, 60), name="east")
-    told: list[str] = []
-    found = tune((north, east), TRUE, progress=told.append)
-    assert list(found) == told == ["north", "east", HORIZONTAL]
+    steps: list[str] = []
+    found = tune((north, east), TRUE, progress=steps.append)
+    assert list(found) == steps == ["north", "east", HORIZONTAL]
     assert list(tune((north, east), TRUE, (HORIZONTAL, "down"))) == [HORIZONTAL]
     late = replace(east, measurement_time_s=east.measurement_time_s + 0.01)
     assert list(tune((north, late), TRUE)) == ["north", "east"]
 
 
-# --- noise apart from what is constant ---
+# --- noise separated from constant errors ---
 
 
 def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> AxisTuning:
@@ -186,22 +185,22 @@ def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> Axi
     return found
 
 
-def test_biases_and_tilt_are_taken_out_of_the_noise() -> None:
-    """The filter that has no states for them needs more than the noise."""
+def test_tune_separates_biases_and_tilt_from_noise() -> None:
+    """KF has no states for biases and tilt, so its SIGMA_A is larger than the noise."""
     flight, _ = made_flight(3, offset_s=0.1)
     found, without = horizontal(flight), horizontal(flight, imu=False)
     assert found.sigma_a.low <= 0.1 <= found.sigma_a.high
     assert found.sigma_z.low <= 0.1 <= found.sigma_z.high
     assert found.filter_sigma_a.low > found.sigma_a.high
-    # where the constants are not taken out there is but one SIGMA_A, which is the filter's
+    # without fitted constants there is only KF's SIGMA_A
     assert without.sigma_a == without.filter_sigma_a
     assert without.sigma_a.value == pytest.approx(found.filter_sigma_a.value, rel=0.1)
     assert len(found.outlier_time_s) == 0
     assert found.noises.walk_m == 0.0
 
 
-def test_noise_as_large_as_the_motion_does_not_pass_for_a_scale() -> None:
-    """A scale whose signal held the noise itself would take a part of it (errors in variables)."""
+def test_tune_weak_motion_scale_does_not_bias_sigma_a() -> None:
+    """A scale signal that contains the noise would explain part of it (errors in variables)."""
     ratios = [
         horizontal(made_flight(seed, moving=0.1, sigma_a=0.5)[0]).noises.sigma_a_m_s2 / 0.5
         for seed in range(6)
@@ -209,18 +208,18 @@ def test_noise_as_large_as_the_motion_does_not_pass_for_a_scale() -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=2.6 * np.std(ratios) / np.sqrt(len(ratios)))
 
 
-def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
-    """0.1 m per root of a second, which would otherwise be called acceleration."""
+def test_tune_drifting_source_gets_random_walk() -> None:
+    """Add 0.1 m/√s, which would otherwise be estimated as acceleration noise."""
     flight, _ = made_flight(4, duration_s=90.0)
     track = flight.positions[0]
     steps = np.random.default_rng(4).normal(0.0, 0.1 * np.sqrt(0.2), (len(track.samples), 3))
     samples = track.samples.copy()
     samples[Columns.POSITION] += np.cumsum(steps, axis=0)
-    wandering = replace(flight, positions=(replace(track, samples=samples),))
-    told, untold = horizontal(wandering, drifts=True), horizontal(wandering)
-    assert told.noises.walk_m == pytest.approx(0.1, rel=0.25)
-    assert told.noises.sigma_z_m == pytest.approx(0.1, rel=0.15)
-    assert untold.noises.sigma_a_m_s2 > 1.5 * told.noises.sigma_a_m_s2
+    drifting = replace(flight, positions=(replace(track, samples=samples),))
+    with_walk, without_walk = horizontal(drifting, drifts=True), horizontal(drifting)
+    assert with_walk.noises.walk_m == pytest.approx(0.1, rel=0.25)
+    assert with_walk.noises.sigma_z_m == pytest.approx(0.1, rel=0.15)
+    assert without_walk.noises.sigma_a_m_s2 > 1.5 * with_walk.noises.sigma_a_m_s2
 
 
 # --- real and simulated logs ---
@@ -236,7 +235,7 @@ def test_a_source_that_wanders_has_a_walk_of_its_own() -> None:
         (Noise(None, None, None), "not determined"),
     ],
 )
-def test_a_noise_at_an_end_of_the_search_is_a_bound(noise: Noise, said: str) -> None:
+def test_format_noise_at_search_end_is_a_bound(noise: Noise, said: str) -> None:
     assert format_noise(noise, "m") == said
 
 

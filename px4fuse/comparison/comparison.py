@@ -1,4 +1,4 @@
-"""Our filter against EKF2 and ground truth: every number of the report."""
+"""Comparison of KF with EKF2 and with ground truth, axis by axis."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -34,21 +34,21 @@ Frame = pd.DataFrame | Unavailable
 def compare(
     flight: Flight, settings: Settings | None = None, **choices: Unpack[Choices]
 ) -> Comparison:
-    """Replay a flight and compare it with EKF2 and, where there is one, with the truth.
+    """Replay a flight with KF and compare it with EKF2, and with ground truth if available.
 
     Parameters
     ----------
     flight : Flight
     settings : Settings, optional
     **choices
-        As :class:`~px4fuse.comparison.preparation.Choices` has them.
+        See :class:`~px4fuse.comparison.preparation.Choices`.
 
     Raises
     ------
     MissingDataError
-        No position source, or no such axis.
+        The flight has no position source, or the source lacks a requested axis.
     SettingsError
-        An empty segment.
+        The segment is empty.
     """
     return compare_prepared(prepare(flight, settings, **choices))
 
@@ -56,13 +56,13 @@ def compare(
 def compare_prepared(
     prepared: Comparison, progress: Callable[[str], None] = lambda _: None
 ) -> Comparison:
-    """:func:`compare`, with what it begins with made."""
+    """Run KF on a prepared comparison; fill in its axes and its horizontal NIS."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, statement = projection.continuous_state(ekf2, prepared.source, prepared.segment)
         notes += [f"EKF2 {statement}"] if statement else []
         notes += ekf2.notes
-        # where resets are undone, positions of the horizon are in other frames
+        # after a removed reset, logged positions at the fusion horizon are in another frame
         is_unchanged = state.equals(ekf2.state)
         ekf2 = (
             ekf2 if is_unchanged else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
@@ -81,7 +81,7 @@ def compare_prepared(
 
 
 def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
-    """Everything about one axis; ``ekf2`` is the flight's, its resets treated."""
+    """Compare one axis; ``ekf2`` is EKF2 after the treatment of its resets."""
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
     truth = projection.project_truth(flight.truth, axis, segment)
     state: Frame
@@ -135,7 +135,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
 def _summarise_filter(
     innovations: Frame, variance: Frame, truth: AgainstTruth | Unavailable, gate: float
 ) -> FilterSummary | UnjudgedFilter:
-    """What a filter did, from its innovations, its variances, and those around each update."""
+    """Summarise a filter from its innovations, its variances and its errors."""
     sigmas: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
         for name, values in (
@@ -155,12 +155,12 @@ def _summarise_filter(
 
 
 def _known_values(frame: Frame, column: str) -> pd.Series:
-    """What is known of a column; nothing of one that is not there."""
+    """Return the values of a column without NaN; empty if the frame is Unavailable."""
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
 def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
-    """Our filter minus EKF2 along one axis, at EKF2's own sample times."""
+    """Compute KF - EKF2 along one axis at EKF2's sample times."""
     kf_minus_ekf2 = (
         np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
     )
@@ -187,7 +187,7 @@ def _rmse(error: Array) -> float:
 
 
 def kf_error_statistics(run: Replay, truth: Frame, ekf2_state: Frame) -> AgainstTruth | Unavailable:
-    """Our filter against the truth along one axis, when EKF2 is known beside it or at its steps."""
+    """Compute KF's errors against ground truth at EKF2's sample times, else at KF's steps."""
     times = (run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index.to_numpy()
     state, variance = (
         pd.DataFrame(dict(zip(columns, state_function(run, times), strict=True)), index=times)
@@ -199,10 +199,10 @@ def kf_error_statistics(run: Replay, truth: Frame, ekf2_state: Frame) -> Against
 def error_statistics(
     state: Frame, variance: Frame, truth: Frame, horizon: pd.DataFrame | None = None
 ) -> AgainstTruth | Unavailable:
-    """A filter against the truth along one axis: its errors, and NEES at its variances' times.
+    """Compute errors of a filter against ground truth along one axis, and its NEES.
 
-    ``horizon`` holds positions with the variances that are stated of these very positions, where
-    that is not the state itself.
+    NEES is computed at the timestamps of ``variance``. If the variances do not belong to ``state``,
+    ``horizon`` contains the positions with their variances.
     """
     if isinstance(state, Unavailable):
         return state
@@ -218,7 +218,7 @@ def error_statistics(
         return Unavailable(
             "error against ground truth", "no common samples", "Choose a segment with ground truth."
         )
-    # EKF2's variances are logged at a tenth of the state's rate: NEES at their own times
+    # EKF2's variances are logged at a tenth of the state's rate: NEES uses their timestamps
     nees = {
         variance_column: _mean_nees(time_s, error, variance[variance_column])
         for variance_column, error in zip(VARIANCES, errors, strict=True)
@@ -256,6 +256,6 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     ]
     if len(frames_of_axes) < 2:
         return None
-    # only updates that both axes have, at the very same times
+    # only updates with the same timestamp on both axes
     joint = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
     return assess_horizontal((joint[0], joint[1]), (joint[2], joint[3]))

@@ -1,10 +1,10 @@
-"""What the data say of noises, clock and heading, of a comparison or of what it begins with.
+"""Estimates of noises, time offset and frame misalignment from the data of a comparison.
 
-Innovations judge a filter against its source. An odometry is smooth over seconds and metres wrong
-after minutes: a filter that follows it closely has small innovations and a large error, so that no
-measurement noise follows from them, and the errors of scale and heading look like a clock that
-wanders. Which sources those are says ``Origin.may_drift``; :func:`widen_for_drift` says what is left of
-their clock estimate.
+Innovations compare a filter with its source only. Odometry is smooth over seconds and drifts by
+metres within minutes. A filter that follows it closely has small innovations and a large error, so
+its innovations do not give the measurement noise. Its scale and heading errors look like a changing
+time offset. ``Origin.may_drift`` marks such sources; :func:`widen_for_drift` widens the interval of
+their time offset.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,15 +23,17 @@ from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, SignalCache
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
 
+# Minimum IMU rate for a time offset
 MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
-# vehicle_imu integrates at this rate (IMU_INTEG_RATE): slower telemetry leaves samples out
+# Hz; rate of vehicle_imu (IMU_INTEG_RATE): slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
+# Measured stream rates are up to 2 % below the nominal rate
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# A step of the clock that drift cannot imitate: at 1 m/s a good UWB's noise
+# s; smaller steps of the time offset may be drift (0.1 s at 1 m/s is 0.1 m, the noise of UWB)
 MIN_CHANGE_S = 0.10
-# On either side of a step, so that each shows its own scatter
+# Parts on each side of a step, which give the scatter of that side
 MIN_PARTS = 2
 
 Progress = Callable[[str], None]
@@ -39,20 +41,20 @@ Tuning = Mapping[str, AxisTuning | Unavailable]
 
 
 def silent(_: str) -> None:
-    """Progress that is shown to nobody."""
+    """Ignore progress messages."""
 
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
-    """Of the first of these names of which noises are known."""
+    """Return the tuning of the first name for which it is available."""
     candidates = map(tuning.get, names)
     return next(
-        (tuning_of_axis for tuning_of_axis in candidates if isinstance(tuning_of_axis, AxisTuning)),
+        (candidate for candidate in candidates if isinstance(candidate, AxisTuning)),
         None,
     )
 
 
 def value_or_bound(noise: Noise, fallback: float) -> float:
-    """Most likely value of a noise, or its bound, or what was set."""
+    """Return the estimate of a noise, else its upper bound, else ``fallback``."""
     return noise.value or noise.high or fallback
 
 
@@ -62,17 +64,17 @@ def tuned(
     progress: Progress = silent,
     cache: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
-    """Most likely noises of a comparison's axes; an IMU too slow to tell biases is left out.
+    """Estimate the noises of a comparison's axes; without biases if the IMU rate is too low.
 
     Parameters
     ----------
     comparison : Comparison
     names : tuple of str, optional
-        Axis names and "horizontal"; by default all that there are.
+        Axis names and "horizontal"; default: all.
     progress : callable
-        Is given what is being done.
+        Called with the name of each step.
     cache : dict, optional
-        As :func:`px4fuse.filter.motion.motion` has it.
+        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
     """
     flight, slow_imu = comparison.flight, missing_imu_rate(comparison.flight)
     return tune(
@@ -91,11 +93,11 @@ def noises_and_clock(
     progress: Progress = silent,
     names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
-    """Most likely noises, and what must still be added to the stamps of the source.
+    """Estimate the noises and the time offset that remains after the applied one.
 
-    Beyond the offset that was set. Parameters are those of :func:`tuned`.
+    Parameters are those of :func:`tuned`.
     """
-    signal_cache: SignalCache = {}  # both need the same signals of the IMU
+    signal_cache: SignalCache = {}  # noises and time offset use the same IMU signals
     tuning = tuned(comparison, names, progress, signal_cache)
     if slow_imu := missing_imu_rate(comparison.flight):
         return tuning, slow_imu
@@ -120,7 +122,7 @@ def estimate_frame_rotation(
     clock: ClockOffset | Unavailable,
     progress: Progress = silent,
 ) -> HeadingError | Unavailable:
-    """Turn of the source's frame, with the noise and the clock offset that were found."""
+    """Estimate the frame misalignment in yaw with the estimated noise and time offset."""
     progress("heading")
     axis_tuning, sigma_z_m = first_axis_tuning(tuning, HORIZONTAL), comparison.settings.sigma_z_m
     if axis_tuning is not None:
@@ -139,11 +141,11 @@ def estimate_frame_rotation(
 
 
 def missing_imu_rate(flight: Flight) -> Unavailable | None:
-    """Why the IMU of a flight cannot tell a clock offset; None where it can.
+    """Return Unavailable if the IMU rate is too low for a time offset, else None.
 
     A ULog's sample is the mean over its interval. A telemetry message is the newest of several
-    samples, and PX4 has taken EKF2's own bias out of it (``HIGHRES_IMU.hpp``), which follows the
-    very positions that are in question.
+    samples, and PX4 has subtracted EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on
+    the positions to be tested.
     """
     if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
         return None
@@ -155,22 +157,22 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
         return None
     rate_text = f"{rate_hz:.{1 if rate_hz < 10 else 0}f} Hz"
     description = f"was logged at {rate_text}"
-    remedy = 'Put the line "sensor_combined 0" into etc/logging/logger_topics.txt on the SD card.'
+    remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
     if is_telemetry:
-        description = f"came by telemetry at {rate_text}, each sample picked out of several"
+        description = f"was received over telemetry at {rate_text}, decimated from a higher rate"
         remedy = f"Have the IMU sent at {needed_hz:g} Hz."
         if flight.log.has_ulog:
             remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
-    reason = f"the IMU {description}; at least {needed_hz:g} Hz are needed"
+    reason = f"the IMU {description}; at least {needed_hz:g} Hz needed"
     return Unavailable("clock offset", reason, remedy)
 
 
 def widen_for_drift(clock: ClockOffset) -> ClockOffset:
-    """The clock estimate of a source that may drift: no surer than its parts agree.
+    """Widen the interval of a time offset for a source that may drift.
 
-    Errors of scale and heading, and the walk of an odometry, move the offset of each part by more
-    than the noise does. The scatter of the parts about their steps is what they amount to: it
-    widens the interval, and only a step beyond it, of 0.1 s or more, is a change of the clock.
+    Scale errors, heading errors and drift of odometry change the offset of each part by more than
+    the noise. The scatter of the parts about their mean measures these errors and widens the
+    interval. Only a significant step of at least ``MIN_CHANGE_S`` is a change of the clock.
     """
     offset = np.array([part.offset_s for part in clock.parts])
     weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
@@ -197,15 +199,15 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
 
 
 def _weighted_square_sum(offset: Array, weight: Array) -> float:
-    """Σ w (x - weighted mean)²."""
+    """Return Σ w (x - weighted mean)²."""
     return float(np.sum(weight * (offset - np.average(offset, weights=weight)) ** 2))
 
 
 def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
-    """p-value of the largest step between parts against their own scatter, both sides estimated.
+    """Return the p-value of the largest step between parts, or None for too few parts.
 
-    Student's t of two weighted means whose common scatter comes from within the sides, times the
-    number of places looked at (Bonferroni); 1 where the step is below ``MIN_CHANGE_S``.
+    Student's t of two weighted means with a common scatter from within both sides, times the
+    number of tested places (Bonferroni). The p-value is 1 for a step below ``MIN_CHANGE_S``.
     """
     count = len(offset)
     split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)

@@ -1,4 +1,4 @@
-"""What happened when, for the time axes of every page: one list for all of them."""
+"""Events of a flight (gaps, rejections, resets, modes) for the time axes of all pages."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,29 +11,28 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.flight import Ekf2, FlightMode, Unavailable
 from px4fuse.record import Span
 
-# A source is silent where it leaves out this long, and so many of its intervals: jitter and single
-# losses pass
+# s, and number of intervals: a longer pause is a gap; jitter and single losses are shorter
 GAP_S = 1.0
 GAP_INTERVALS = 5.0
 
 
 @dataclass(frozen=True)
 class Events:
-    """What happened in the segment of a comparison; times in s from the first data.
+    """Events in the segment of a comparison; times in s from the first data.
 
     Attributes
     ----------
     gaps : tuple of (float, float)
-        Stretches without a position measurement, see :func:`source_gaps`.
+        Spans without a position measurement, see :func:`source_gaps`.
     dropouts : tuple of (float, float)
-        Stretches that the logger lost.
+        Spans in which the logger wrote no data.
     ground : tuple of (float, float)
-        Stretches on the ground, by the land detector.
+        Spans on the ground, from the land detector.
     take_off_s, landing_s : tuple of float
     modes : tuple of FlightMode
-        Empty where they are not logged.
+        Empty if not logged.
     resets_s : tuple of float
-        Of EKF2's position or velocity.
+        Resets of EKF2's position or velocity.
     rejected_s : mapping from axis name to ndarray
         Measurements that EKF2 rejected.
     """
@@ -49,26 +48,26 @@ class Events:
 
 
 def longest_s(interval_s: float) -> float:
-    """Interval beyond which a source with this usual one is silent."""
+    """Return the longest interval (s) that is not a gap, for a source's usual interval."""
     return max(GAP_S, GAP_INTERVALS * interval_s)
 
 
 def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
-    """Stretches (s) between measurements in which the source was silent.
+    """Return the spans (s) between measurements that are gaps of the source.
 
     Parameters
     ----------
     time_s : ndarray, shape (n,)
-        Of the measurements.
+        Timestamps of the measurements.
     rate_hz : float
-        Of the source between gaps.
+        Rate of the source between gaps.
     """
     is_gap = np.diff(time_s) > longest_s(1.0 / rate_hz)
     return tuple(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
 
 
 def collect_events(comparison: Comparison) -> Events:
-    """Everything that is worth a mark on a time axis."""
+    """Collect the events in the segment of a comparison."""
     flight, segment = comparison.flight, comparison.segment
     low, high = segment.start_s, segment.end_s
 

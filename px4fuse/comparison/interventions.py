@@ -1,10 +1,10 @@
-"""Causes by intervention: each thing that may make a filter inconsistent is changed, and replayed.
+"""Causes of inconsistency, found by re-running a filter with one change at a time.
 
-A discrepancy is a mean NIS outside its band, or an error beyond what a filter claims (NEES). Each
-candidate is tried alone, then with what the best one leaves. A cause is the smallest change that
-brings the number into its band, or else explains at least half of its logarithm; "since" stands
-before nothing else. A smaller noise by which the filter would claim less than its errors against
-the truth is none. Where a fault of the source explains as much as a setting, it comes first: a
+A discrepancy is a mean NIS outside its band, or errors larger than the reported σ (mean NEES). Each
+candidate change is re-run alone; if none suffices, the best one is combined with each other one. A
+cause is the smallest change that brings the statistic into its band, or else explains at least half
+of its logarithm. A smaller noise is not a cause if the reported σ would then be smaller than the
+errors against ground truth. A fault of a sensor that explains as much as a setting comes first: the
 setting would only hide it.
 """
 
@@ -60,33 +60,32 @@ from px4fuse.record import Positive, Record
 
 Of = Literal["nis", "nees", "apart"]
 Change = Mapping[str, float]
-# Squared errors of so many times what is claimed are beyond it: twice σ; clean flights stay below 3
+# Mean NEES from which errors exceed the reported σ (by 2 in σ); below 3 without a fault
 MIN_NEES_FINDING = 4.0
-# Beyond it a smaller noise is wrong where the errors are larger than claimed as it is
+# Largest mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
 MAX_NEES_AFTER_CHANGE = 2.0
-# Mean NIS above which the innovations themselves say so
+# Mean NIS above which the innovations already show that the σ is too small
 MAX_UNSUSPICIOUS_NIS = 1.5
-# Of the logarithm, and as far above 1 as below
+# Share of ln(statistic) that a cause explains: at least this, at most 2 minus this
 MIN_EXPLAINED_SHARE = 0.5
-# How far from all of the logarithm is nearly all: noises are never quite right
+# Distance from the whole logarithm within which a sensor fault suffices: noises are approximate
 SUFFICIENT_TOLERANCE = 0.25
-# Of the logarithm, for what is tried together with the best of the others
+# Share of ln(statistic) that a change must explain to be combined with the best one
 MIN_HELPFUL_SHARE = 0.1
 CLOCK, TURN, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD, RIGHT = "bias_forward_m_s2", "bias_right_m_s2"
-# What is wrong with a sensor, before any setting
+# Changes that correct a sensor; they precede changes of settings
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK, TURN, FORWARD))
-# What a filter is run with where the source is better than its rate can show (m): what motion
-# capture resolves in flight
+# m; smallest SIGMA_Z of a re-run: accuracy of motion capture in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# What a change of another needs along with it
+# Parts of a change that do not count as separate changes
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT))
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# Tilt and biases are acceleration's noise too, so that a calm flight asks for more than EKF2 takes
+# SIGMA_A also covers tilt error and bias, so EKF2_ACC_NOISE is raised only above this factor
 VIBRATION_FACTOR = 3.0
-# What EKF2 has besides the aid's own; PX4's default is tried where something else was flown
+# Parameters of EKF2 that are re-run with PX4's default if another value was flown
 PARAMETERS_OF_EKF2 = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
@@ -95,34 +94,37 @@ PARAMETERS_OF_EKF2 = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
+# Columns of north and east
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in LEVEL]
+# Misalignments within this many σ are not significant
 HEADING_SIGMAS = 3.0
 
 
 class Intervention(Record, frozen=True, kw_only=True):
-    """One change, and what it makes of a number that should be 1, or of a distance.
+    """One change, and the statistic before and after it.
 
     Attributes
     ----------
     of : {"nis", "nees", "apart"}
-        Mean NIS, mean NEES of position, or how far both filters are apart (m, RMS), which is asked
-        of causes alone.
+        Statistic: mean NIS, mean NEES of position, or RMS difference KF - EKF2 (m). The last one is
+        computed for causes only.
     filter : {"kf", "ekf2"}
     axis : str
     change : mapping from name to value
-        Fields of the settings, PX4's parameters, ``turned_deg`` (of the positions, clockwise seen
-        from above), ``outliers_left_out`` (how many), and the accelerometer's ``bias_forward_m_s2``
-        and ``bias_right_m_s2``, taken out.
+        Fields of Settings, PX4 parameters, ``turned_deg`` (rotation of the positions, clockwise
+        from above), ``outliers_left_out`` (number), and the removed accelerometer biases
+        ``bias_forward_m_s2`` and ``bias_right_m_s2``.
     before, after : float
-        The number without the change, of EKF2 by the log, and by a replay with it.
+        Statistic without the change (EKF2: from the log) and with it (from a re-run).
     explains : float
-        Share of its logarithm that the change takes away; above 1 it goes to the other side. Of a
-        distance the share of its mean square.
+        Share of ln(statistic) that the change removes; above 1 it overshoots. For the RMS
+        difference, the share of the mean square.
     brings_into_band : bool
-        Of a NIS its 95 % band; an error is beyond a claim from a NEES of :data:`MIN_NEES_FINDING` on.
+        True if the mean NIS is in its 95 % band, or the mean NEES below
+        :data:`MIN_NEES_FINDING`.
     denied_by_truth : bool
-        Whether the filter would then claim less than its errors.
+        True if the reported σ would then be smaller than the errors.
     """
 
     of: Of
@@ -137,7 +139,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     @property
     def is_cause(self) -> bool:
-        """Whether it explains enough of it, and not so much that it is something else."""
+        """True if it explains at least half of ln(statistic) and does not overshoot by more."""
         return (
             MIN_EXPLAINED_SHARE <= self.explains <= 2.0 - MIN_EXPLAINED_SHARE
             and not self.denied_by_truth
@@ -145,12 +147,12 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     @property
     def of_sensors(self) -> bool:
-        """Whether something is wrong with a sensor, which goes before any setting."""
+        """True if it corrects a sensor, which precedes changes of settings."""
         return not SENSOR_CHANGES.isdisjoint(self.change)
 
     @property
     def is_enough(self) -> bool:
-        """Whether nothing else has to be looked for: it is all of it, or of a sensor nearly all."""
+        """True if no other cause is needed: in the band, or nearly all by a sensor."""
         return self.brings_into_band or (
             self.of_sensors and abs(self.explains - 1.0) <= SUFFICIENT_TOLERANCE
         )
@@ -159,7 +161,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 def interventions_on(
     causes: Iterable[Intervention], owner: FilterName, axis: str, of: Of = "nis"
 ) -> list[Intervention]:
-    """What was tried on one discrepancy."""
+    """Return the re-runs for one discrepancy."""
     return [
         intervention
         for intervention in causes
@@ -170,7 +172,7 @@ def interventions_on(
 def cause_of(
     causes: Iterable[Intervention], owner: FilterName, axis: str, of: Of = "nis"
 ) -> Intervention | None:
-    """The cause of one discrepancy, by all that was tried; None where nothing explains it."""
+    """Return the cause of one discrepancy, or None if no re-run explains it."""
     return min(
         (
             intervention
@@ -188,7 +190,7 @@ def cause_of(
 
 
 class ErrorBeyondSigma(NamedTuple):
-    """An error to the truth (RMS, and its NEES) beyond the standard deviation that is claimed."""
+    """Position RMSE and NEES against ground truth, larger than the reported σ."""
 
     nees: float
     rmse_m: float
@@ -199,15 +201,15 @@ class ErrorBeyondSigma(NamedTuple):
 def error_beyond_reported_sigma(
     statement: FilterSummary | UnjudgedFilter,
 ) -> ErrorBeyondSigma | None:
-    """The error to the truth where it is larger than claimed, and no innovation says so."""
+    """Return the errors if they exceed the reported σ without effect on the innovations."""
     truth = statement.truth
     if isinstance(statement, Unavailable) or isinstance(truth, Unavailable):
         return None
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
     if nees < MIN_NEES_FINDING or statement.nis_mean >= MAX_UNSUSPICIOUS_NIS:
         return None
-    claimed_m = statement.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
-    return ErrorBeyondSigma(nees, rmse_m, claimed_m, statement.nis_mean)
+    reported_sigma_m = statement.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
+    return ErrorBeyondSigma(nees, rmse_m, reported_sigma_m, statement.nis_mean)
 
 
 def interventions(
@@ -218,7 +220,7 @@ def interventions(
     bias_scale_jump_fit: BiasScaleJumpFit | Unavailable,
     model: Model | Unavailable,
 ) -> tuple[Intervention, ...]:
-    """Try every candidate on every discrepancy.
+    """Re-run every candidate change for every discrepancy.
 
     Parameters
     ----------
@@ -226,10 +228,10 @@ def interventions(
     tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
     clock : ClockOffset or Unavailable
     heading : HeadingError or Unavailable
-    bias_scale_jump_fit : Explained or Unavailable
-        With the biases of the accelerometer.
+    bias_scale_jump_fit : BiasScaleJumpFit or Unavailable
+        Contains the accelerometer biases.
     model : Model or Unavailable
-        Of EKF2.
+        EKF2 of the same flight.
     """
     estimates = comparison, tuning, clock, heading
     filters: list[_FilterChanges] = [_KfChanges(*estimates, bias_scale_jump_fit)]
@@ -256,9 +258,9 @@ def planned_variants(
     heading: HeadingError | Unavailable,
     inputs: Inputs,
 ) -> list[Variant]:
-    """The variants of EKF2 that :func:`interventions` will ask for, as far as can be told before.
+    """Return the EKF2 variants that :func:`interventions` will need, as far as known.
 
-    One that is not among them is replayed when it is asked for.
+    Variants that are missing here are replayed on demand.
     """
     if not is_fused_source(comparison, inputs):
         return []
@@ -274,7 +276,7 @@ def planned_variants(
 def _difference_reduction(
     cause: Intervention, result: AxisComparison, changed: _FilterChanges
 ) -> list[Intervention]:
-    """How far a cause keeps both filters apart."""
+    """Compute the RMS difference KF - EKF2 (m) with and without a cause."""
     before, after = (
         changed.statistic_after(result, "apart", change) for change in ({}, cause.change)
     )
@@ -294,7 +296,7 @@ def _difference_reduction(
 
 
 def is_inconsistent(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[FilterSummary]:
-    """Whether a variance is not what innovations show, by more than chance and enough to matter."""
+    """Return True if the mean NIS is outside its band and σ is wrong by at least 25 %."""
     if isinstance(statement, Unavailable):
         return False
     return (
@@ -303,13 +305,13 @@ def is_inconsistent(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[Filt
 
 
 def _find_discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
-    """What of a filter is not as it should be."""
+    """Return the statistics of a filter that are outside their limits."""
     found: list[Of] = ["nees"] if error_beyond_reported_sigma(statement) else []
     return [*found, "nis"] if is_inconsistent(statement) else found
 
 
 def _try_candidates(changed: _FilterChanges, result: AxisComparison, of: Of) -> list[Intervention]:
-    """All candidates alone; where the best leaves the number outside its band, with the others."""
+    """Re-run all candidates alone; if none suffices, combine the best with each other one."""
     statement, candidates = result.filters[changed.owner], changed.candidates(result, of)
     assert isinstance(statement, FilterSummary)  # else it has no discrepancy
     truth = statement.truth
@@ -317,7 +319,7 @@ def _try_candidates(changed: _FilterChanges, result: AxisComparison, of: Of) -> 
     before = statement.nis_mean if nees is None or of == "nis" else nees
     is_checked_by_truth = of == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
 
-    def tried(change: Change) -> list[Intervention]:
+    def rerun(change: Change) -> list[Intervention]:
         statistic = changed.statistic_after(result, of, change)
         if statistic is None or statistic[0] <= 0.0:
             return []
@@ -341,7 +343,7 @@ def _try_candidates(changed: _FilterChanges, result: AxisComparison, of: Of) -> 
             )
         ]
 
-    single_changes = [each for change in candidates for each in tried(change)]
+    single_changes = [each for change in candidates for each in rerun(change)]
     helpful_changes = sorted(
         (
             intervention
@@ -356,36 +358,38 @@ def _try_candidates(changed: _FilterChanges, result: AxisComparison, of: Of) -> 
     return single_changes + [
         intervention
         for other in other_changes
-        for intervention in tried({**best_change.change, **other.change})
+        for intervention in rerun({**best_change.change, **other.change})
     ]
 
 
 def _rms_difference(run: Replay, state: pd.DataFrame) -> tuple[float, int] | None:
-    """Root mean square of ours - EKF2 in position (m), and of how many."""
-    found = difference(run, state)
-    return None if isinstance(found, Unavailable) else (found.position_rmse_m, found.count)
-
-
-def _mean_nees(judged: AgainstTruth | Unavailable) -> tuple[float, int] | None:
-    """Mean NEES of position, and of how many."""
-    if isinstance(judged, Unavailable) or judged.nees_position_mean is None:
+    """Return the RMS of KF - EKF2 in position (m) and the number of samples."""
+    kf_minus_ekf2 = difference(run, state)
+    if isinstance(kf_minus_ekf2, Unavailable):
         return None
-    return judged.nees_position_mean, judged.count
+    return kf_minus_ekf2.position_rmse_m, kf_minus_ekf2.count
+
+
+def _mean_nees(errors: AgainstTruth | Unavailable) -> tuple[float, int] | None:
+    """Return the mean NEES of position and the number of samples."""
+    if isinstance(errors, Unavailable) or errors.nees_position_mean is None:
+        return None
+    return errors.nees_position_mean, errors.count
 
 
 def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
-    """What was tuned for an axis: both horizontal ones together, where there are both."""
+    """Return the tuning of an axis: for horizontal axes the common one if available."""
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
 def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
-    """A direction in the frame in which the positions are turned (clockwise from above)."""
+    """Return a direction in the frame of positions that are rotated clockwise from above."""
     return np.asarray(Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction))
 
 
 @dataclass(frozen=True)
 class _FilterChanges:
-    """A filter, what the data ask to change of it, and what it does with changes."""
+    """Candidate changes of one filter, and its statistics after a change."""
 
     comparison: Comparison
     tuning: Tuning
@@ -395,7 +399,7 @@ class _FilterChanges:
     owner: ClassVar[FilterName]
 
     def discrepancies(self) -> list[tuple[AxisComparison, Of]]:
-        """Its discrepancies, each with its axis; EKF2 is replayed along horizontal ones."""
+        """Return the discrepancies with their axes; for EKF2 along horizontal axes only."""
         return [
             (result, of)
             for result in self.comparison.axes.values()
@@ -407,30 +411,30 @@ class _FilterChanges:
     def noise_candidates(
         self, statement: FilterSummary, tuned: AxisTuning, over: bool
     ) -> list[Change]:
-        """The noises that the data ask for, where their interval excludes those that were taken."""
+        """Return maximum-likelihood noises whose interval excludes the value in use."""
 
     @abstractmethod
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """What else may be wrong; ``tuned`` where the variance is not larger than what is shown."""
+        """Return further candidates; ``tuned`` is None if the reported σ is too large."""
 
     @abstractmethod
     def statistic_after(
         self, result: AxisComparison, of: Of, change: Change
     ) -> tuple[float, int] | None:
-        """Mean NIS or NEES along an axis with a change, or how far apart; and of how many."""
+        """Return a statistic along an axis after a change, and the number of its samples."""
 
     def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
-        """What to try along an axis."""
+        """Return the candidate changes for a discrepancy along an axis."""
         statement, origin = result.filters[self.owner], self.comparison.source.origin
         assert isinstance(statement, FilterSummary)  # else it has no discrepancy
-        is_overstated = of == "nis" and statement.nis_mean < 1.0
+        is_underconfident = of == "nis" and statement.nis_mean < 1.0
         tuned = tuning_of_axis(self.tuning, result.axis.name)
         changes = list[Change]()
-        # small innovations against such a source say too little of its errors
+        # innovations against GNSS or a drifting source do not show its slow errors
         hides_noise = origin.may_drift or origin.is_gnss
-        if tuned is not None and not (is_overstated and hides_noise):
-            changes += self.noise_candidates(statement, tuned, is_overstated)
-        if tuned is not None and not is_overstated and len(tuned.outlier_time_s):
+        if tuned is not None and not (is_underconfident and hides_noise):
+            changes += self.noise_candidates(statement, tuned, is_underconfident)
+        if tuned is not None and not is_underconfident and len(tuned.outlier_time_s):
             changes.append({OUTLIERS: float(len(tuned.outlier_time_s))})
         changes += self.time_offset_candidates()
         if result.axis.name == "down":
@@ -438,10 +442,10 @@ class _FilterChanges:
         if isinstance(turn := self.heading, HeadingError):
             is_significant = abs(turn.turn_deg) > HEADING_SIGMAS * turn.sigma_deg
             changes += [{TURN: -round(turn.turn_deg, 1)}] if is_significant else []
-        return changes + self.other_candidates(None if is_overstated else tuned)
+        return changes + self.other_candidates(None if is_underconfident else tuned)
 
     def time_offset_candidates(self) -> list[Change]:
-        """The offset of the stamps, where what was not taken of it is beyond chance."""
+        """Return the time offset if the part that the filter does not apply is significant."""
         if isinstance(self.clock, Unavailable) or not self.clock.determinable:
             return []
         applied_s = self.comparison.settings.clock_offset_s
@@ -452,7 +456,7 @@ class _FilterChanges:
 
 @dataclass(frozen=True)
 class _KfChanges(_FilterChanges):
-    """Our filter with changes."""
+    """KF with changes."""
 
     bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
 
@@ -461,7 +465,7 @@ class _KfChanges(_FilterChanges):
     def noise_candidates(
         self, statement: FilterSummary, tuned: AxisTuning, over: bool
     ) -> list[Change]:
-        """SIGMA_A and SIGMA_Z."""
+        """Return SIGMA_A and SIGMA_Z whose interval excludes the value in use."""
         changes = list[Change]()
         for name, noise in ((SIGMA_A, tuned.filter_sigma_a), (SIGMA_Z, tuned.sigma_z)):
             chosen_sigma = getattr(self.comparison.settings, name)
@@ -478,7 +482,7 @@ class _KfChanges(_FilterChanges):
         return changes
 
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """The accelerometer's bias."""
+        """Return the accelerometer biases if they are significant."""
         if (
             isinstance(self.bias_scale_jump_fit, Unavailable)
             or not self.bias_scale_jump_fit.has_bias
@@ -490,7 +494,7 @@ class _KfChanges(_FilterChanges):
     def _acceleration_without_bias(
         self, change: Change, direction: Array
     ) -> Acceleration | Unavailable:
-        """The acceleration along a direction, without the accelerometer's bias."""
+        """Return the acceleration along a direction after removal of the accelerometer biases."""
         flight, imu = self.comparison.flight, self.comparison.flight.imu
         if isinstance(imu, Unavailable):
             return imu
@@ -504,7 +508,7 @@ class _KfChanges(_FilterChanges):
     def statistic_after(
         self, result: AxisComparison, of: Of, change: Change
     ) -> tuple[float, int] | None:
-        """By our filter, run again."""
+        """Re-run KF with the change."""
         source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
         kf_settings: dict[str, Any] = {
             name: change[name] for name in change if name in vars(Settings())
@@ -515,7 +519,9 @@ class _KfChanges(_FilterChanges):
             rotated_direction = _rotate_direction(axis.direction, change[TURN])
             measured_m = along(within(source.samples, segment), Columns.POSITION, rotated_direction)
             axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
-            if is_gnss_rotation:  # GNSS knows north, and so does the truth: the attitude does not
+            if (
+                is_gnss_rotation
+            ):  # GNSS and ground truth refer to true north; the attitude is misaligned
                 rotated_axis = replace(axis, direction=rotated_direction)
                 truth = project_truth(self.comparison.flight.truth, rotated_axis, segment)
         if FORWARD in change:
@@ -549,9 +555,9 @@ class _KfChanges(_FilterChanges):
 
 @dataclass(frozen=True)
 class _Ekf2Changes(_FilterChanges):
-    """EKF2 with changes, where it fused what was analysed.
+    """EKF2 with changes, if it fused the analysed source.
 
-    Without a model, which must agree with the log, it only has candidates.
+    Without ``model`` only the candidates are available.
     """
 
     inputs: Inputs
@@ -569,12 +575,12 @@ class _Ekf2Changes(_FilterChanges):
         return float(np.sqrt(np.median(np.maximum(stated, flown[aid.noise] ** 2))))
 
     def time_offset_candidates(self) -> list[Change]:
-        """A delay is EKF2's own to set; there is none for stamps that are early."""
+        """Return a change of EKF2's delay, or else a shift of the timestamps."""
         delay = ml_delay_change(self.comparison, self.inputs, self.clock)
         return [delay] if delay else super().time_offset_candidates()
 
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """The gate, parameters that are not PX4's own, and the process noise."""
+        """Return the default gate, other PX4 defaults, and the process noise for vibration."""
         aid, flown = self.inputs.aid, self.inputs.settings
         default_values = {
             name: PARAMETERS[name].default for name in (aid.gate, *PARAMETERS_OF_EKF2)
@@ -590,10 +596,10 @@ class _Ekf2Changes(_FilterChanges):
         return [*changes, vibration_change] if vibration_change else changes
 
     def _vibration_noise(self, tuned: AxisTuning) -> Change:
-        """The process noise that the vibration asks for, as far as PX4's range goes.
+        """Return the maximum-likelihood process noise for vibration, within PX4's range.
 
-        EKF2 adds (EKF2_ACC_NOISE · step)² to the variance of the velocity in each step, ours
-        SIGMA_A² DT² in each DT.
+        EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds
+        SIGMA_A² · DT² in each DT.
         """
         steps = self.comparison.settings.dt_s / self.inputs.step_s
         flown, px4_maximum = self.inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
@@ -605,27 +611,27 @@ class _Ekf2Changes(_FilterChanges):
     def noise_candidates(
         self, statement: FilterSummary, tuned: AxisTuning, over: bool
     ) -> list[Change]:
-        """The source's noise."""
+        """Return the source's measurement noise if its interval excludes EKF2's value."""
         noise = tuned.sigma_z
         if (noise.low or 0.0) <= self.used_m <= (noise.high or np.inf):
             return []
-        asked_m = noise.value
-        if asked_m is None:  # EKF2's own innovations bound it too, and less tightly
-            asked_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-        return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, asked_m)]
+        ml_noise_m = noise.value
+        if ml_noise_m is None:  # EKF2's innovations give an upper bound
+            ml_noise_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
+        return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, ml_noise_m)]
 
     def statistic_after(
         self, result: AxisComparison, of: Of, change: Change
     ) -> tuple[float, int] | None:
-        """By a replay, along a horizontal axis; unchanged how far apart by the log."""
+        """Replay EKF2 with the change; the difference without a change is from the log."""
         assert self.model is not None
-        judged_s, axis = self.model.flown.judged_s, result.axis
+        compared_s, axis = self.model.flown.judged_s, result.axis
         ekf2_replay = self._replay_with(self.model, change)
         if TURN in change and self.comparison.source.origin.is_gnss:
-            # what is put right is the attitude: its frame is turned, north is where it was
+            # the change corrects the attitude: only its frame rotates, north stays
             axis = replace(axis, direction=_rotate_direction(axis.direction, -change[TURN]))
         weights = axis.direction[:2]
-        updates = ekf2_replay.updates[inside_spans(ekf2_replay.updates.index, judged_s)]
+        updates = ekf2_replay.updates[inside_spans(ekf2_replay.updates.index, compared_s)]
         if of == "nis":
             nu = along(updates, INNOVATION_COLUMNS, weights)
             s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
@@ -634,7 +640,7 @@ class _Ekf2Changes(_FilterChanges):
         if of == "apart":
             logged = result.ekf2_state
             state = state if change or isinstance(logged, Unavailable) else logged
-            return _rms_difference(result.replay, state[inside_spans(state.index, judged_s)])
+            return _rms_difference(result.replay, state[inside_spans(state.index, compared_s)])
         at_s, track = (
             updates["fused_at_s"],
             along(ekf2_replay.delayed, Columns.POSITION, axis.direction),
@@ -647,20 +653,20 @@ class _Ekf2Changes(_FilterChanges):
         return _mean_nees(error_statistics(state, result.ekf2_variance, result.truth, horizon))
 
     def _replay_with(self, model: Model, change: Change) -> Ekf2Replay:
-        """EKF2 with a change, each replayed once."""
+        """Return the replay of EKF2 with a change, from the cache if available."""
         if not change:
             return model.flown
         key = tuple(sorted(change.items()))
         if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
             model = with_misaligned_positions(model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
-            left_out_s, tuned = None, tuning_of_axis(self.tuning, HORIZONTAL)
+            excluded_s, tuned = None, tuning_of_axis(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
                 delay_s = 1e-3 * self.inputs.settings[self.inputs.aid.delay]
                 is_gnss_source = self.comparison.source.origin.fused_as_gnss
-                left_out_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
-                left_out_s = (
-                    left_out_s + (delay_s if is_gnss_source else 0.0) + change.get(CLOCK, 0.0)
+                excluded_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
+                excluded_s = (
+                    excluded_s + (delay_s if is_gnss_source else 0.0) + change.get(CLOCK, 0.0)
                 )
-            (self.replays[key],) = replay_settings(model, [settings], left_out_s)
+            (self.replays[key],) = replay_settings(model, [settings], excluded_s)
         return self.replays[key]

@@ -1,4 +1,4 @@
-"""What a comparison is: its records, by axis and by filter, and the tracks beside them."""
+"""Records of a comparison, by axis and by filter, with the tracks behind them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,12 +30,12 @@ FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 
 
 class AgainstTruth(Record, frozen=True, kw_only=True):
-    """One filter against ground truth that it has not used.
+    """Errors of one filter against ground truth, which no filter used.
 
-    NEES is per component (1 is consistent); it is strongly autocorrelated within one flight, so
-    no band is stated. EKF2's is of its position at its fusion horizon, where its variance is
-    stated, as far as that is logged; errors are those of what it publishes. None where the variance
-    or the true velocity is not logged.
+    NEES is per component (expected 1). It has no band, because it is strongly autocorrelated within
+    one flight. EKF2's position NEES uses the position at the fusion horizon, to which the variance
+    belongs, if that is logged; errors use EKF2's published state. None if the variance or the true
+    velocity is not available.
     """
 
     count: Count
@@ -46,15 +46,14 @@ class AgainstTruth(Record, frozen=True, kw_only=True):
 
 
 class FilterSummary(Consistency, frozen=True, kw_only=True):
-    """What one filter did along one axis: its consistency, its own σ, and its error.
+    """Consistency of one filter along one axis, its reported σ and its errors.
 
     Attributes
     ----------
     sigma_p_median_m, sigma_v_median_m_s : float or None
-        Median standard deviations over the segment; None where not logged.
+        Median reported σ over the segment; None if not logged.
     sigma_p_before_update_m, sigma_p_after_update_m : float or None
-        Medians just before and just after an update. For EKF2 from S and R: P⁻ = S - R,
-        P⁺ = P⁻R/S.
+        Median reported σ before and after an update; for EKF2 from P⁻ = S - R, P⁺ = P⁻R/S.
     truth : AgainstTruth or Unavailable
     """
 
@@ -66,7 +65,7 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
 
 
 class UnjudgedFilter(Unavailable, frozen=True, kw_only=True):
-    """A filter whose innovations say nothing, and why; else as :class:`FilterSummary`."""
+    """Filter without a consistency result, with the reason; else like :class:`FilterSummary`."""
 
     sigma_p_median_m: Positive | None = None
     sigma_v_median_m_s: Positive | None = None
@@ -76,7 +75,7 @@ class UnjudgedFilter(Unavailable, frozen=True, kw_only=True):
 
 
 class Difference(Record, frozen=True, kw_only=True):
-    """Ours minus EKF2, at EKF2's own sample times."""
+    """KF - EKF2 at EKF2's sample times."""
 
     count: Count
     position_rmse_m: NotNegative
@@ -88,7 +87,7 @@ class Difference(Record, frozen=True, kw_only=True):
 
 
 class Updates(Record, frozen=True, kw_only=True):
-    """The measurements of one axis; ``input_gap_s`` is the longest gap of the IMU."""
+    """Measurements of one axis; ``input_gap_s`` is the time without IMU data (s)."""
 
     count: Count
     first_s: float
@@ -98,19 +97,19 @@ class Updates(Record, frozen=True, kw_only=True):
 
 
 class AxisResult(Record, frozen=True, kw_only=True):
-    """One axis.
+    """Result of the comparison along one axis.
 
     Attributes
     ----------
     heading_deg : float or None
     direction : (float, float, float)
-        Its unit vector in NED.
+        Unit vector in NED.
     note : str
     updates : Updates
-    filters : mapping from "kf" (ours) and "ekf2" to FilterSummary or UnjudgedFilter
+    filters : mapping from "kf" and "ekf2" to FilterSummary or UnjudgedFilter
     difference : Difference or Unavailable
     rejected_share : float or None
-        Of the source's samples that EKF2 rejected; None where that is not logged.
+        Share of the source's samples that EKF2 rejected; None if not logged.
     """
 
     heading_deg: float | None = None
@@ -123,14 +122,14 @@ class AxisResult(Record, frozen=True, kw_only=True):
 
 
 class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
-    """:class:`AxisResult`, with the tracks.
+    """:class:`AxisResult` with the KF run and the tracks.
 
     Attributes
     ----------
     axis : Axis
     replay : Replay
     ekf2_state : DataFrame or Unavailable
-        ``position_m, velocity_m_s`` in the segment, resets treated as the comparison says.
+        ``position_m, velocity_m_s`` in the segment, after the treatment of resets.
     ekf2_variance : DataFrame or Unavailable
         ``position_variance_m2, velocity_variance_m2_s2`` in the segment.
     ekf2_innovations : DataFrame or Unavailable
@@ -153,7 +152,7 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is compared and, once the filters ran, what they did.
+    """Inputs of a comparison and, after the filters ran, their results per axis.
 
     Attributes
     ----------
@@ -162,15 +161,15 @@ class Comparison:
     source_reason : str
     segment : Segment
     settings : Settings
-        As used: ``input`` is "zero" where the log has no acceleration.
+        Settings as used: ``input`` is "zero" if the log has no acceleration.
     lines : tuple of Axis
     notes : tuple of str
-        Choices made on the way.
+        Notes for the user about the log and about automatic choices.
     missing : tuple of Unavailable
     axes : mapping from axis name to AxisComparison
-        Empty before the filters ran.
+        Empty before the filters run.
     horizontal : mapping from "kf" and "ekf2" to HorizontalNis
-        North and east together, as far as both were analysed.
+        North and east together; empty if one of them was not analysed.
     """
 
     flight: Flight
@@ -187,12 +186,12 @@ class Comparison:
     __repr__ = one_line_repr
 
     def __getitem__(self, axis: str) -> AxisComparison:
-        """Everything about one axis, by its name.
+        """Return the comparison along an axis, by its name.
 
         Raises
         ------
         MissingDataError
-            It was not analysed.
+            The axis was not analysed.
         """
         if axis not in self.axes:
             raise MissingDataError(
@@ -203,5 +202,5 @@ class Comparison:
 
     @property
     def main(self) -> AxisComparison:
-        """The axis of the lab: the aisle, else the first."""
+        """Main axis: the aisle, else the first."""
         return self.axes.get(AISLE) or next(iter(self.axes.values()))

@@ -1,4 +1,4 @@
-"""What a comparison begins with: the source, the segment and the axes, before any filter runs."""
+"""Choice of source, segment and axes of a comparison, before any filter runs."""
 
 from dataclasses import replace
 from typing import TypedDict, Unpack
@@ -26,43 +26,39 @@ from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 from px4fuse.request import HeightName
 from px4fuse.trajectory.rotation import interpolate, matrix
 
-# Of the names under which logs have external positions, PX4's topics and MAVLink's messages
+# Origins of external positions by their PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
 NOT_ITS_OWN_TRUTH = Unavailable(
     "ground truth",
-    ("the position source is the only reference in the log, and KF uses it as its input"),
-    "Choose another --position-source; this one then serves as ground truth.",
+    "the position source is the only reference in the log, and KF uses it as its input",
+    "Choose another --position-source; this one is then used as ground truth.",
 )
-
-
-# A receiver's height is much noisier than its position, and SIGMA_Z is one number
+# Default axes of GNSS: its height is much noisier than its position, and SIGMA_Z is one number
 GNSS_AXES = (AISLE, "north", "east")
 
 
 class Choices(TypedDict, total=False):
-    """What of a flight is compared.
+    """Optional choices for a comparison.
 
     Attributes
     ----------
     axes : tuple of str
-        From "north", "east", "down", "aisle"; by default all that the source supports, of GNSS
-        the horizontal ones.
+        From "north", "east", "down", "aisle"; default: all that the source supports, with GNSS the
+        horizontal ones.
     heading_deg : float
-        Of the aisle.
+        Heading of the aisle axis.
     position_source : str
         Name of a track of the flight.
     source_kind : {"uwb", "vio", "mocap", "gnss"}
-        What it is; by default what its messages make of it.
+        Kind of the source; default: from its messages.
     height : {"gnss", "barometer"}
-        What "down" is from where the source is GNSS; by default the one that EKF2 fused, GNSS
-        first.
+        Height source of "down" with GNSS; default: the one that EKF2 fused, GNSS first.
     start_s, end_s : float
         Segment, seconds from the first data.
     input_required : bool
-        Raise instead of falling back to ``input="zero"`` where the log has no acceleration.
+        Raise SettingsError instead of using ``input="zero"`` if the log has no acceleration.
     sigma_z_given : bool
-        By default. Otherwise SIGMA_Z of GNSS is what EKF2 takes, its median √R, where that is
-        known.
+        Default True. If False, SIGMA_Z of GNSS is EKF2's median √R, if known.
     """
 
     axes: tuple[str, ...] | None
@@ -88,14 +84,14 @@ def prepare(
     flight : Flight
     settings : Settings, optional
     **choices
-        As :class:`Choices` has them.
+        See :class:`Choices`.
 
     Raises
     ------
     MissingDataError
-        No position source, or no such axis.
+        The flight has no position source, or the source lacks a requested axis.
     SettingsError
-        An empty segment; no acceleration while that is required.
+        The segment is empty, or required acceleration is missing.
     """
     settings = settings or Settings()
     track, reason = choose_source(flight, choices.get("position_source"))
@@ -123,16 +119,16 @@ def prepare(
         if choices.get("input_required"):
             raise SettingsError(f"{flight.log.name}: `input` imu: {acceleration}")
         settings = replace(settings, input="zero")
-        notes += (f"no acceleration input ({acceleration.reason}): constant velocity was used",)
+        notes += (f"no acceleration input ({acceleration.reason}): KF assumes constant velocity",)
         missing += () if acceleration in missing else (acceleration,)
     return Comparison(flight, track, reason, segment, settings, lines, notes, missing)
 
 
 def flight_for_source(flight: Flight, track: PositionTrack) -> Flight:
-    """The flight with EKF2's innovations of GNSS where that is the source, else as it is."""
+    """Return the flight with EKF2's GNSS innovations if GNSS is the source, else unchanged."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
-    # what the log lacks of another source is no lack here
+    # missing data of other sources do not affect this comparison
     missing_of_vision, streams = _missing_of_vision(flight.ekf2), dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
@@ -146,7 +142,7 @@ def flight_for_source(flight: Flight, track: PositionTrack) -> Flight:
 
 
 def _missing_of_vision(ekf2: Ekf2) -> tuple[Unavailable, ...]:
-    """Innovations that are not there, each with the reason."""
+    """Return the missing innovations of EKF2, each with its reason."""
     return tuple(part for part in ekf2.innovations.values() if isinstance(part, Unavailable))
 
 
@@ -157,18 +153,18 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     ----------
     flight : Flight
     name : str, optional
-        One of the track names; by default the best one; GNSS only where EKF2 fused it.
+        Name of a track; default: the most direct one, and GNSS only if EKF2 fused it.
 
     Returns
     -------
     track : PositionTrack
     reason : str
-        One sentence: why this one.
+        Reason for the choice, for the output.
 
     Raises
     ------
     MissingDataError
-        The log holds no (such) track; the text says what was looked for and what would log it.
+        The log has no track, or none of this name.
     """
     if name is None:
         for track in flight.positions:
@@ -188,7 +184,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
 
 
 def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """The positions of the vehicle, where EKF2 is told that the sensor is not at its origin."""
+    """Subtract the lever arm of the sensor (EKF2 parameters) from the positions."""
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
@@ -210,20 +206,20 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_name: HeightName | None
 ) -> PositionTrack:
-    """The track with the barometer for its height, where that is asked for or what EKF2 fused.
+    """Replace the track's height by the barometer's if requested or if EKF2 fused that.
 
-    A barometer has no zero: it is put where EKF2's is.
+    A barometer has no absolute zero: the median difference to EKF2's height defines it.
     """
     ekf2, heights, name = flight.ekf2, flight.barometer, flight.log.name
     if height_name and not track.origin.fused_as_gnss:
-        raise SettingsError(f"{name}: `height` is for GNSS, and the position is {track.name}.")
+        raise SettingsError(f"{name}: `height` needs a GNSS position; this one is {track.name}.")
     is_fused_by_ekf2 = fused_aid(ekf2, BAROMETER.name) and not fused_aid(ekf2, GNSS.vertical)
     uses_barometer = height_name == "barometer" or (
         height_name is None and track.origin.fused_as_gnss and is_fused_by_ekf2
     )
     if not uses_barometer or heights is None:
         if height_name == "barometer":
-            raise MissingDataError(f"{name}: no height by a barometer.", GNSS.to_log)
+            raise MissingDataError(f"{name}: no barometer height in the log.", GNSS.to_log)
         return track
     zero_m, zero_text = heights["down_m"].iloc[0], "its first height"
     if isinstance(ekf2, Ekf2):
@@ -231,15 +227,15 @@ def _use_barometer_height(
         offset_m = (
             float(np.nanmedian(heights["down_m"] - down)) if np.isfinite(down).any() else zero_m
         )
-        zero_m, zero_text = offset_m, "where it is EKF2's in the median"
-    note = f"down is by the barometer, from {zero_text}"
-    description = f"{track.description}, height by the barometer"
+        zero_m, zero_text = offset_m, "the median of EKF2's height"
+    note = f"the down axis uses the barometer, with its zero set to {zero_text}"
+    description = f"{track.description}, barometer height"
     notes = (*track.notes, note)
     return replace(track, barometer=heights - zero_m, description=description, notes=notes)
 
 
 def explain_missing_source(flight: Flight) -> Unavailable:
-    """Why no track of a flight is a position source by itself, and what would be one."""
+    """Return the reason why no track is a position source by default, and the remedy."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
     unused = next((track.name for track in flight.positions if not track.origin.is_automatic), "")
     looked_for = "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
@@ -250,7 +246,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     if flight.log.format.startswith("MAVLink"):
         looked_for = "no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
         ulog = ", or the ULog" if flight.log.has_ulog else ""
-        remedy = f"give the positioning system's own file with `position`{ulog}."
+        remedy = f"give the position file of the positioning system with `position`{ulog}."
     if unused:
         remedy = (
             "The log contains only GPS, which EKF2 did not fuse: use it with "
@@ -264,7 +260,7 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin == POSITION_FILE:
         return "given with --position"
     if track.origin.fused_as_gnss:
-        return "what EKF2 fused; no other position is in the log"
+        return "fused by EKF2; the only position in the log"
     origin_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
     better_sources = [
         part.source
@@ -273,12 +269,12 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         and LOGGED_ORIGINS[part.source].preference < track.origin.preference
     ]
     if not better_sources:
-        return f"the best source: logged as it arrived{origin_text}"
-    return f"the best that this log has{origin_text}; no usable {', '.join(better_sources)}"
+        return f"most direct source: as received by PX4{origin_text}"
+    return f"most direct source in this log{origin_text}; not usable: {', '.join(better_sources)}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
-    """The same track with ``clock_offset_s`` added to its time stamps."""
+    """Add ``clock_offset_s`` to the timestamps of a track."""
     if clock_offset_s == 0.0:
         return track
     shifted_frames = {
@@ -292,7 +288,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
 def choose_segment(
     flight: Flight, track: PositionTrack, start_s: float | None = None, end_s: float | None = None
 ) -> Segment:
-    """Choose the part of the log to analyse: where the source runs and the vehicle flies.
+    """Choose the part of the log to analyse: source available and vehicle airborne.
 
     Parameters
     ----------
@@ -304,19 +300,19 @@ def choose_segment(
     Raises
     ------
     SettingsError
-        The chosen part is empty or holds fewer than three measurements.
+        The segment is empty or contains fewer than three measurements.
     """
     runs_s = track.samples.index[[0, -1]].tolist()
     low, high = max(runs_s[0], 0.0), min(runs_s[1], flight.log.duration_s)
     if isinstance(flight.airborne, Unavailable):
-        reason = "the whole span of the source: the log has no land detector"
+        reason = "whole duration of the source (no land detector in the log)"
     elif not flight.airborne:
-        reason = "the whole span of the source: the vehicle never took off"
+        reason = "whole duration of the source (the vehicle never took off)"
     else:
-        reason = "the whole span of the source: it does not run in flight"
+        reason = "whole duration of the source (no positions in flight)"
         flying = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
         if flying[0] < flying[1]:
-            (low, high), reason = flying, "where the source runs and the vehicle flies"
+            (low, high), reason = flying, "source available and vehicle airborne"
     if start_s is not None or end_s is not None:
         low, high = low if start_s is None else start_s, high if end_s is None else end_s
         ends = {"--start": start_s, "--end": end_s}

@@ -1,4 +1,4 @@
-"""EKF2 and ground truth along one axis: resets treated, variances and innovations projected."""
+"""EKF2 and ground truth along one axis: resets, variances and innovations."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -21,44 +21,44 @@ from px4fuse.flight import (
     Unavailable,
 )
 
-# EKF2 never trusts external vision better than this (ev_pos_control.cpp, EKF2.cpp)
+# m; lower limit of EKF2's measurement noise (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-# EKF2 takes a height of GNSS for less exact than its position (gnss_height_control.cpp)
+# EKF2's factor from GNSS position noise to height noise, in σ (gnss_height_control.cpp)
 GNSS_HEIGHT_SCALE = 1.5
 MIN_COMMON_SAMPLES = 3
-# What is projected along an axis, from which columns, and by which power of its direction
+# Projected quantity: its NED columns, and the power of the direction that weights them
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_m": (Columns.POSITION, 1),
     "velocity_m_s": (Columns.VELOCITY, 1),
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Undoing resets must bring EKF2 this much closer to the measurements (median squared distance);
-# below that the published output, which the vehicle flew on, stands.
+# Resets are removed only if that reduces EKF2's median squared distance to the measurements to
+# this share; otherwise the published output, which controlled the vehicle, is kept.
 MAX_DISTANCE_RATIO = 0.95
 
 
 def continuous_state(
     ekf2: Ekf2, track: PositionTrack, segment: Segment
 ) -> tuple[pd.DataFrame, str]:
-    """EKF2's state with its resets undone, where undoing them is right.
+    """Remove resets from EKF2's state if they change its frame.
 
-    A reset that changes EKF2's frame must be undone before positions are compared. A reset that
-    moves EKF2 back onto the measurements corrects an error, and undoing it would carry that error
-    through the rest of the flight. The measurements decide: the resets are undone where that
-    brings the series clearly closer to them (median distance).
+    A reset that changes EKF2's frame must be removed before positions are compared. A reset that
+    moves EKF2 back to the measurements corrects an error; its removal would add that error to the
+    rest of the flight. Resets are removed if that clearly reduces the median distance to the
+    measurements.
 
     Returns
     -------
     state : DataFrame
         Position and velocity as in :attr:`Ekf2.state`.
     statement : str
-        What was done, empty where there was no reset in the segment.
+        Resets removed and kept, for the notes; empty without a reset in the segment.
     """
     resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
     state = ekf2.state.copy() if resets_inside else ekf2.state
     kept_resets: list[str] = []
-    undone_resets: list[str] = []
+    removed_resets: list[str] = []
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -73,7 +73,7 @@ def continuous_state(
         if not resets:
             continue
         reset_texts = kept_resets
-        if quantity == "position":  # a velocity has no frame origin to lose
+        if quantity == "position":  # a velocity does not depend on the frame's origin
             samples = within(track.samples, segment)[columns].dropna()
             best_state = min(
                 _continuous_candidates(ekf2.state[columns], resets, axes),
@@ -82,11 +82,11 @@ def continuous_state(
             if _median_square_distance(
                 samples, best_state
             ) < MAX_DISTANCE_RATIO * _median_square_distance(samples, ekf2.state):
-                state[columns], reset_texts = best_state, undone_resets
+                state[columns], reset_texts = best_state, removed_resets
         reset_texts.append(f"{len(resets)} of {label}")
     statements = []
-    if undone_resets:
-        statements.append(f"resets undone: {', '.join(undone_resets)} (they change the frame)")
+    if removed_resets:
+        statements.append(f"resets removed: {', '.join(removed_resets)} (they change the frame)")
     if kept_resets:
         statements.append(f"resets kept: {', '.join(kept_resets)} (they correct an error)")
     return state, "; ".join(statements)
@@ -95,17 +95,17 @@ def continuous_state(
 def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Continuous position, in the frame of each stretch between resets."""
+    """Yield the continuous position in the frame of each stretch between resets."""
     deltas = np.array([reset.delta for reset in resets])[:, axes]
     after = np.array([published.index >= reset.time_s for reset in resets]).T
     for stretch in range(len(resets) + 1):
-        # relative to this stretch: resets before it still to come are added, later ones taken away
+        # in the frame of this stretch: add the resets before it, subtract those after it
         shift = (~after[:, :stretch]) @ deltas[:stretch] - after[:, stretch:] @ deltas[stretch:]
         yield published + shift
 
 
 def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
-    """Median squared distance of the state from samples."""
+    """Return the median squared distance (m²) between state and samples."""
     squared = np.zeros(len(samples))
     for column in samples:
         squared += (np.interp(samples.index, state.index, state[column]) - samples[column]) ** 2
@@ -113,7 +113,7 @@ def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float
 
 
 def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
-    """What a frame holds of :data:`PROJECTED_COLUMNS` along the axis, within the segment."""
+    """Project the columns of :data:`PROJECTED_COLUMNS` onto the axis, within the segment."""
     rows = within(frame, segment)
     available = {name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame}
     projected = {
@@ -123,7 +123,7 @@ def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
-    """Variances along the axis; EKF2 logs no covariance between axes, so none is added."""
+    """Project EKF2's variances onto the axis, without cross-covariances (not logged)."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
@@ -135,12 +135,12 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
 
 
 def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
-    """EKF2's position (m) at its fusion horizon and the variance that it states of it, or None.
+    """Return EKF2's position (m) at the fusion horizon with its variance (m²), or None.
 
-    What is published is that position carried to the present by the output predictor, which lags;
-    the variance says nothing about that. Where EKF2 met external vision, its position before the
-    update is observation minus innovation, and its variance P⁻ = S - R; before v1.16 the log also
-    has its delayed state. EKF2 logs no covariance between axes, so none is added.
+    The published position is predicted from there to the present by the output predictor, which
+    lags; the variance does not include that. With external vision, the position before the update
+    is observation minus innovation, and its variance P⁻ = S - R. Before v1.16 the log also
+    contains the delayed state. EKF2 logs no covariance between axes, so none is added.
     """
     weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
     aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
@@ -165,7 +165,7 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
 def project_innovations(
     flight: Flight, ekf2: Ekf2, track: PositionTrack, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """EKF2's innovations along the axis, with its variances just before and after each update.
+    """Project EKF2's innovations onto the axis, with P before and after each update.
 
     Columns as :attr:`Ekf2.innovations` plus ``prior_variance_m2`` (P⁻ = S - R) and
     ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
@@ -173,7 +173,7 @@ def project_innovations(
     if track.aid(axis.name) is None:
         return Unavailable(
             "EKF2 innovations",
-            (f"EKF2 never fuses {track.name}; the logged innovations belong to another source"),
+            f"EKF2 never fuses {track.name}; the logged innovations belong to another source",
             "Choose the source that EKF2 fused (--position-source).",
         )
     frames = []
@@ -194,20 +194,20 @@ def project_innovations(
     prior = (s_total - r).where(s_total > r)
     rows["observation_variance_m2"] = r
     rows["prior_variance_m2"] = prior
-    # a rejected sample updates nothing
+    # a rejected sample does not change P
     rows["posterior_variance_m2"] = (prior * r / s_total).where(~(rows["rejected"] > 0), prior)
     return rows
 
 
 def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array) -> pd.DataFrame:
-    """Innovations along a horizontal direction, at the times that north and east share."""
+    """Project innovations onto a horizontal direction, at timestamps common to both axes."""
     common = north.index.intersection(east.index)
     n, e = north.loc[common], east.loc[common]
     c, s = float(direction[0]), float(direction[1])
-    projected = c * c * n + s * s * e  # variances; the rest is set below
+    projected = c * c * n + s * s * e  # correct for variances only; the other columns follow
     projected["innovation_m"] = c * n["innovation_m"] + s * e["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
-        # the larger: before v1.14 PX4 keeps one ratio for both; a rejection is of the vector
+        # the larger: before v1.14 PX4 logs one ratio for both axes, and rejects both together
         projected[column] = np.fmax(n[column], e[column])
     return projected
 
@@ -219,14 +219,14 @@ def observation_variance(
     segment: Segment,
     default_noise_m: float = math.nan,
 ) -> float:
-    """R (m²) that EKF2 used for the source where it does not log it, NaN if unknown.
+    """Return the R (m²) that EKF2 used for the source if it is not logged; NaN if unknown.
 
-    ``default_noise_m`` is taken for EKF2's own noise where the parameter is not in the log.
+    ``default_noise_m`` replaces EKF2's noise parameter if that is not in the log.
 
-    R = EKF2_EVP_NOISE², or the sender's variance if larger, unless EKF2_EV_NOISE_MD is 1
-    (EKF2.cpp, ev_pos_control.cpp); of GNSS EKF2_GPS_P_NOISE², half as much again in σ for height,
-    or the receiver's accuracy if larger (gps_control.cpp, gnss_height_control.cpp); of the
-    barometer EKF2_BARO_NOISE² (baro_height_control.cpp).
+    External vision: R = EKF2_EVP_NOISE², or the sender's variance if larger and EKF2_EV_NOISE_MD
+    is not 1 (EKF2.cpp, ev_pos_control.cpp). GNSS: EKF2_GPS_P_NOISE², for height 1.5 times in σ, or
+    the receiver's accuracy if larger (gps_control.cpp, gnss_height_control.cpp). Barometer:
+    EKF2_BARO_NOISE² (baro_height_control.cpp).
     """
     aid, parameters, ekf2 = track.aid(axis.name), flight.log.parameters, flight.ekf2
     if aid is not None and isinstance(ekf2, Ekf2) and aid.name in ekf2.aids:
@@ -236,7 +236,7 @@ def observation_variance(
         return math.nan
     scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
     r = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
-    # what a file of its own reports is not what EKF2 was sent
+    # the variance in a position file was not sent to EKF2
     ignores_reported = track.alignment is not None or aid == BAROMETER
     if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
         return r
@@ -248,7 +248,7 @@ def observation_variance(
 def project_truth(
     truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """Position and velocity of the ground truth along the axis."""
+    """Project position and velocity of the ground truth onto the axis."""
     if isinstance(truth, Unavailable):
         return truth
     projected = project(truth.samples, axis, segment)

@@ -1,7 +1,7 @@
-"""What the data ask of EKF2's parameters, and what a replay says of a remedy, EKF2's or ours.
+"""Maximum-likelihood EKF2 parameters, and the replayed effect of a change to EKF2 or KF.
 
-A change is proposed with its effect, and only where the replay confirms it. Where EKF2 cannot be
-replayed, the words say so.
+A change is proposed with its effect and only if the replay confirms it. If EKF2 cannot be replayed,
+the text states that.
 """
 
 import math
@@ -28,23 +28,24 @@ from px4fuse.flight import Unavailable
 from px4fuse.plain import capitalise_first
 from px4fuse.request import OPTIONS
 
-# EKF2 takes R from the sender where that is more than this many times EKF2_EVP_NOISE
+# Ratio of √R to EKF2_EVP_NOISE above which R is from the sender
 MIN_REPORTED_RATIO = 1.25
-# One prediction of EKF2 (EKF2_PREDICT_US), and what a message takes to arrive
+# ms; one prediction step of EKF2 (EKF2_PREDICT_US), and the transmission time of a message
 UPDATE_MS, ARRIVAL_MS = 10.0, 30.0
+# ms; EKF2_DELAY_MAX is rounded up to a multiple
 DELAY_STEP_MS = 50.0
-# How a remedy to type is written; who prints it knows the log (px4fuse.report.commands)
+# Placeholder of the command to paste; px4fuse.report.commands inserts the log
 COMMAND = "px4fuse compare LOG"
-# A noise must bring |log mean NIS| below this share of itself: what does less is not its cause
+# A noise change must reduce |ln(mean NIS)| to less than this share
 MAX_LOG_NIS_RATIO = 0.8
-# Half of the rejections are an effect, not a single sample
+# A change must reduce the rejected share to less than this share
 MAX_REJECTED_RATIO = 0.5
-# Times of the error to the truth that are no accident: errors last for seconds, so that a flight of
-# two minutes has some fifty that are independent, which tell their root mean square to a tenth
+# Significant ratio of two RMSEs: errors are correlated over seconds, so a flight of two minutes has
+# about fifty independent ones, and the standard error of their RMSE is 10 %
 MAX_ERROR_RATIO = 1.10
-# The same of our filter, which is replayed exactly: hardly a settings changes it by less
+# Significant ratio of two RMSEs of KF, whose replay is exact
 MAX_KF_ERROR_RATIO = 1.005
-# Shares of rejected samples below this are not worth a word
+# Share of rejected samples below which a text omits it
 REJECTED_SHOWN = 0.005
 
 
@@ -54,23 +55,23 @@ def ml_ekf2_parameters(
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
 ) -> dict[str, float]:
-    """EKF2's parameters as the data ask for them, by PX4 name and in PX4's units.
+    """Return maximum-likelihood EKF2 parameters, by PX4 name and in PX4's units.
 
     Parameters
     ----------
     comparison : Comparison
     model : Model
-        Of its flight.
+        EKF2 of the same flight.
     tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
     clock : ClockOffset or Unavailable
 
     Returns
     -------
     dict
-        Empty where the data tell nothing, or the source that was analysed is not the one that EKF2
-        fused. The delay only where what was flown is outside its interval. The noise of a source
-        that may drift, or of GNSS, only where EKF2 trusts it even more than its short-term noise
-        allows: small innovations against such a source say nothing about its error.
+        Empty without an estimate or if EKF2 did not fuse the analysed source. The delay is given
+        only if the flown value is outside its interval. For GNSS and drifting sources, the noise is
+        included only if EKF2 uses less than the short-term noise: their innovations do not show the
+        slow errors.
     """
     if not is_fused_source(comparison, model.inputs):
         return {}
@@ -87,7 +88,7 @@ def ml_ekf2_parameters(
 
 
 def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
-    """Whether EKF2 fused what was analysed."""
+    """Return True if EKF2 fused the analysed source."""
     source = comparison.source
     return source.name == inputs.received.source and source.alignment is None
 
@@ -95,7 +96,7 @@ def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
 def ml_delay_change(
     comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
-    """EKF2's delay as the data ask for it; empty where they do not tell, or it is as flown."""
+    """Return EKF2's maximum-likelihood delay; empty without an estimate or if it is as flown."""
     if isinstance(clock, Unavailable) or not clock.determinable:
         return {}
     age_s, flown = comparison.source.age_s, inputs.settings[inputs.aid.delay]
@@ -106,14 +107,15 @@ def ml_delay_change(
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
-    """What EKF2 takes the source as along an axis, with the names of its parameters."""
+    """Return the aid that EKF2 fuses the source as, along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
 def delay_ms(comparison: Comparison) -> float | None:
-    """What EKF2 takes positions of the source to be older than their stamps (ms).
+    """Return the age of positions (ms, relative to their timestamps) that EKF2 assumes.
 
-    None where the log does not tell, EKF2 never fuses the source, or takes the times of a receiver.
+    None if the parameter is not logged, EKF2 never fuses the source, or the receiver states its
+    own measurement times.
     """
     source = comparison.source
     if source.origin.aid is None:
@@ -125,9 +127,9 @@ def delay_ms(comparison: Comparison) -> float | None:
 def noise_change(
     aid: Aid, settings: Mapping[str, float], used_m: float, noise_m: float
 ) -> dict[str, float]:
-    """What to set so that EKF2 takes a position's standard deviation (m) to be this.
+    """Return the parameters that set EKF2's position noise to ``noise_m``.
 
-    Two digits, within PX4's range; ``settings`` and ``used_m`` are what it took.
+    Two digits, within PX4's range. ``settings`` and ``used_m`` (median √R) are those as flown.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
     is_reported = used_m > MIN_REPORTED_RATIO * settings.get(aid.noise, math.inf)
@@ -138,15 +140,16 @@ def noise_change(
 
 
 def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
-    """What to set so that EKF2 takes positions to be this older than their stamps.
+    """Return the parameters that set the position age that EKF2 assumes to ``delay_ms``.
 
-    Nothing where PX4's range ends before, or no parameter tells; 0 for stamps that are early.
+    Empty if the delay exceeds PX4's range or the source has its own measurement times; 0 for early
+    timestamps.
     """
     delay = inputs.aid.delay
-    known = PARAMETERS[delay]
-    if delay_ms > known.maximum or inputs.received.own_times:
+    parameter = PARAMETERS[delay]
+    if delay_ms > parameter.maximum or inputs.received.own_times:
         return {}
-    changes = {delay: max(float(round(delay_ms)), known.minimum)}
+    changes = {delay: max(float(round(delay_ms)), parameter.minimum)}
     needed, flown = changes[delay] + ARRIVAL_MS, inputs.settings
     if not inputs.rules.horizon_by_delay and needed > flown["EKF2_DELAY_MAX"]:
         changes["EKF2_DELAY_MAX"] = DELAY_STEP_MS * math.ceil(needed / DELAY_STEP_MS)
@@ -154,26 +157,29 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
 
 
 def noise_used_m(model: Model) -> float:
-    """Median √R (m) of EKF2 as flown."""
+    """Return the median √R (m) of EKF2 as flown."""
     updates = model.flown.updates
     columns = ["observation_variance_north_m2", "observation_variance_east_m2"]
     return float(np.sqrt(np.median(updates[columns].to_numpy())))
 
 
 def format_whatif_effect(before: Summary, after: Summary) -> str:
-    """What a change of EKF2's parameters does, in numbers, by replays without it and with it."""
+    """Format the effect of changed EKF2 parameters from replays without and with the change."""
     texts = []
     if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN:
-        texts.append(f"rejected {before.rejected_share:.0%} → {after.rejected_share:.0%}")
+        texts.append(
+            f"rejected {100 * before.rejected_share:.0f} % → {100 * after.rejected_share:.0f} %"
+        )
     texts.append(f"mean NIS {_format_nis(before.nis_mean)} → {_format_nis(after.nis_mean)}")
     flown_rmse, changed_rmse = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
     if isinstance(flown_rmse, Unavailable):
         texts.append(
-            f"innovations {_innovation_std_m(before):.3f} → {_innovation_std_m(after):.3f} m rms, no truth"
+            f"innovation σ {_innovation_std_m(before):.3f} → {_innovation_std_m(after):.3f} m"
+            " (no ground truth)"
         )
     else:
-        texts.append(f"position error {flown_rmse:.2f} → {changed_rmse:.2f} m")
-    return f"{', '.join(texts)} (replayed)"
+        texts.append(f"position RMSE {flown_rmse:.2f} → {changed_rmse:.2f} m")
+    return f"{', '.join(texts)} (re-run)"
 
 
 def format_ekf2_remedy(
@@ -184,19 +190,19 @@ def format_ekf2_remedy(
     why: str = "",
     fallback_remedy: str,
 ) -> str:
-    """A change of EKF2's parameters in words, as a remedy where no replay denies it.
+    """Format a change of EKF2's parameters as an action with its replayed effect.
 
     Parameters
     ----------
     model : Model or Unavailable
-        Of the flight.
+        EKF2 of the flight.
     changes : mapping
     helps : callable
-        From EKF2 as flown and as changed to whether that is a remedy.
+        Returns True if the change helps, from the summaries as flown and with the change.
     why : str
-        Words before it: what the data ask for.
+        Text before the action.
     fallback_remedy : str
-        What to do where the replay says that it is none.
+        Action if the replay shows that the change does not help.
     """
     setting = f"{why}set {format_settings(changes)}"
     replays = model if isinstance(model, Unavailable) else what_if(model, [changes])
@@ -204,22 +210,22 @@ def format_ekf2_remedy(
         return f"{capitalise_first(setting)}. {format_not_replayed(replays)}"
     before, (after,) = replays.replayed, replays.whatif
     if not after.steady:
-        settings_text = format_settings(changes)
         return (
-            f"{fallback_remedy} What {settings_text} would do is chaotic: single rejections decide."
+            f"{fallback_remedy} The effect of setting {format_settings(changes)} is not "
+            "predictable: single rejections decide."
         )
     effect = format_whatif_effect(before, after)
     if helps(before, after):
         return f"{capitalise_first(setting)}: {effect}."
     settings_text = ", ".join(f"{name} {value:.3g}" for name, value in changes.items())
-    return f"{fallback_remedy} {settings_text} is no remedy: {effect}."
+    return f"{fallback_remedy} {settings_text} does not help: {effect}."
 
 
 def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, float] | None:
-    """Position error (m) of our filter to the truth, as it is and with other settings.
+    """Return KF's position RMSE (m) with the current and with other settings.
 
-    Root of the sum of the mean squares of all axes but the aisle, which is made of the others.
-    None without a truth.
+    Root of the summed mean squares of all axes except the aisle, which is a combination of the
+    others. None without ground truth.
     """
     if isinstance(comparison.flight.truth, Unavailable):
         return None
@@ -250,7 +256,7 @@ def format_kf_remedy(
     suffix: str = "",
     unseen_nats: float | None = None,
 ) -> str:
-    """Other settings of our filter as a remedy, as far as truth or unseen data confirm it.
+    """Format other settings of KF as an action, if ground truth or held-out data confirm it.
 
     Parameters
     ----------
@@ -258,14 +264,15 @@ def format_kf_remedy(
     changes : mapping from field of Settings to value
         Rounded to three digits.
     suffix : str
-        Words behind the options that make them.
+        Text after the options.
     unseen_nats : float or None
-        What settings found on one half gain per measurement of the other; None where not known.
+        Log-likelihood gain per measurement of the second half with settings estimated on the first;
+        None if unknown.
     """
     rounded_settings: dict[str, Any] = {
         name: float(f"{value:.3g}") for name, value in changes.items()
     }
-    typed = (
+    options_text = (
         " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded_settings.items())
         + suffix
     )
@@ -274,30 +281,33 @@ def format_kf_remedy(
     if errors is None:
         if unseen_nats is not None and unseen_nats <= 0.0:
             return (
-                f"No change advised: {typed} is the maximum-likelihood estimate, but "
+                f"No change advised: {options_text} is the maximum-likelihood estimate, but "
                 "settings estimated on the first half do not improve the second half."
             )
-        return f"{COMMAND} {typed}."
+        return f"{COMMAND} {options_text}."
     before, after = errors
-    effect = f"position error {before:.3f} → {after:.3f} m (replayed)"
+    effect = f"position RMSE {before:.3f} → {after:.3f} m (re-run)"
     if after > MAX_KF_ERROR_RATIO * before:
-        return f"Leave it: {typed} fits the innovations better, but not the truth: {effect}."
-    return f"{COMMAND} {typed}: {effect}."
+        return (
+            f"No change advised: {options_text} fits the innovations better, but increases the "
+            f"error: {effect}."
+        )
+    return f"{COMMAND} {options_text}: {effect}."
 
 
 def format_not_replayed(why: Unavailable) -> str:
-    """That a remedy was not tried, and why."""
+    """Format the reason why a remedy could not be replayed."""
     return f"Not replayed: {why.reason}."
 
 
 def format_settings(changes: Mapping[str, float]) -> str:
-    """Parameters and the values to set."""
+    """Format parameters with the values to set: "EKF2_EV_DELAY to 264 ms and ..."."""
     texts = (f"{name} to {value:.3g} {PARAMETERS[name].unit}" for name, value in changes.items())
     return " and ".join(map(str.rstrip, texts))
 
 
 def noise_helps(before: Summary, after: Summary) -> bool:
-    """Whether another noise brings the mean NIS nearer to 1, and neither rejects nor errs more."""
+    """Return True if the mean NIS is nearer to 1, without more rejections or a larger RMSE."""
     is_nearer = abs(math.log(after.nis_mean)) < MAX_LOG_NIS_RATIO * abs(math.log(before.nis_mean))
     is_worse = after.rejected_share > before.rejected_share or _increases_error(
         before, after, MAX_ERROR_RATIO
@@ -306,13 +316,13 @@ def noise_helps(before: Summary, after: Summary) -> bool:
 
 
 def rejects_less(before: Summary, after: Summary) -> bool:
-    """Whether far fewer samples are rejected, and the position is not worse."""
+    """Return True if the rejected share is less than half, without a larger position RMSE."""
     rejects_fewer = after.rejected_share < MAX_REJECTED_RATIO * before.rejected_share
     return rejects_fewer and not _increases_error(before, after, MAX_ERROR_RATIO)
 
 
 def delay_helps(before: Summary, after: Summary) -> bool:
-    """Whether the innovations become smaller, and the error to the truth where there is one."""
+    """Return True if the innovations are smaller, without more rejections or a larger RMSE."""
     is_smaller = (
         _innovation_std_m(after) < _innovation_std_m(before)
         and after.rejected_share <= before.rejected_share
@@ -321,7 +331,7 @@ def delay_helps(before: Summary, after: Summary) -> bool:
 
 
 def _increases_error(before: Summary, after: Summary, factor: float) -> bool:
-    """Whether the error to the truth becomes so many times what it was; not where none is known."""
+    """Return True if the position RMSE grows by more than ``factor``; False if unknown."""
     error, flown_error = after.position_rmse_to_truth_m, before.position_rmse_to_truth_m
     return (
         isinstance(error, float) and isinstance(flown_error, float) and error > factor * flown_error
@@ -329,7 +339,7 @@ def _increases_error(before: Summary, after: Summary, factor: float) -> bool:
 
 
 def _innovation_std_m(summary: Summary) -> float:
-    """Standard deviation of the innovations per axis (m)."""
+    """Return the RMS over the axes of the innovation standard deviation (m)."""
     return math.sqrt(np.mean([axis.innovation_std_m**2 for axis in summary.axes.values()]))
 
 

@@ -1,7 +1,7 @@
-"""Why EKF2 differs from our filter, along each horizontal axis, in steps and in words.
+"""Explanation of the difference KF - EKF2 along each horizontal axis, step by step.
 
-The steps are those of :mod:`px4fuse.ekf2.walk`, from our filter as it was set to the logged EKF2.
-The sentences are made of them last: what each filter does, with numbers, and when it mattered.
+The steps are those of :mod:`px4fuse.ekf2.walk`, from KF as set to the logged EKF2. For the largest
+steps, sentences state both filters' behaviour, the share and the time of the largest effect.
 """
 
 from dataclasses import replace
@@ -22,38 +22,36 @@ from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
-from px4fuse.record import table
 
-# Filters whose errors differ by less are equally close to the truth
+# Relative difference of two position RMSEs below which a text calls them equal
 EQUAL_RMSE_TOLERANCE = 0.05
-# Shares of the mean square below this are not worth a word
+# Share of the mean square below which a text omits the second step
 MIN_NOTABLE_SHARE = 0.05
-# How much farther apart than where they were walked both must be elsewhere to be said (m, times)
+# m, and factor on the largest replayed difference: a larger difference elsewhere is reported
 MIN_ELSEWHERE_M, MIN_ELSEWHERE_RATIO = 0.5, 3.0
-REASONS = table(__file__, "steps.toml", dict[str, str])
 
 
 def explain_ekf2_difference(
     comparison: Comparison, model: Model | Unavailable, clock: ClockOffset | Unavailable
 ) -> dict[str, Why | Unavailable]:
-    """Why EKF2 differs along each axis of a comparison.
+    """Explain the difference KF - EKF2 along each axis of a comparison.
 
     Parameters
     ----------
     comparison : Comparison
     model : Model or Unavailable
-        Of the comparison's flight.
+        EKF2 of the same flight.
     clock : ClockOffset or Unavailable
-        Says how old positions are, as the data have it.
+        Estimated age of the positions.
 
     Returns
     -------
     mapping from axis name to Why or Unavailable
-        Of down only where nothing else was compared: the model is of horizontal position.
+        "down" only if no other axis was compared: the replay covers horizontal positions only.
     """
     results = {name: result for name, result in comparison.axes.items() if name != "down"}
     if not results:
-        reason = "the model of EKF2 is of horizontal position"
+        reason = "the EKF2 replay covers horizontal positions only"
         return {
             "down": Unavailable(
                 ways.ANALYSIS_NAME, reason, "Analyse a horizontal axis too (--axis)."
@@ -76,12 +74,12 @@ def explain_ekf2_difference(
 
 
 def explanation_variants(comparison: Comparison, inputs: Inputs) -> list[Variant]:
-    """The variants of EKF2 that :func:`explain_ekf2_difference` asks for."""
+    """Return the EKF2 variants that :func:`explain_ekf2_difference` needs."""
     return list(ways.step_variants(inputs, _settings(comparison, inputs)).values())
 
 
 def _settings(comparison: Comparison, inputs: Inputs) -> Settings:
-    """Of our filter, whose clock offset is that of the source that was analysed."""
+    """Return KF's settings; without time offset if EKF2 fused another source."""
     same = comparison.source.name == inputs.received.source
     return comparison.settings if same else replace(comparison.settings, clock_offset_s=0.0)
 
@@ -99,28 +97,28 @@ def _unreplayed_part(result: AxisComparison, spans: Spans) -> UnreplayedPart | N
 
 
 def add_sentences(why: Why, axis_label: str, reasons: dict[str, str]) -> Why:
-    """The same with sentences: what makes EKF2 differ along an axis, the weightiest first.
+    """Add sentences: the steps that explain the difference along an axis, largest first.
 
     Parameters
     ----------
     why : Why
     axis_label : str
-        The axis in a sentence.
+        Name of the axis in a sentence.
     reasons : dict
-        What EKF2 does at each step, and what ours does.
+        Behaviour of EKF2 and KF, by step.
     """
     reasons = {**reasons, ways.GATE: f"{reasons[ways.GATE]}{_rejection_text(why)}"}
     first, second, *_ = sorted(why.steps, key=lambda step: -step.position_mean_square_m2)
-    half = 0.5 * why.position_mean_square_m2
-    quantifier = "Most" if first.position_mean_square_m2 >= half else "The largest part"
     cause = (
-        f"{quantifier} of what ours and EKF2 are apart along {axis_label} is the {first.name} "
-        f"({_format_share(first, why)}): {reasons[first.name]}"
+        f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name} "
+        f"({_format_share(first, why)}). {reasons[first.name]}."
     )
-    sentences = [f"{cause}{_moment_text(first)}."]
+    sentences = [f"{cause} {_moment_text(first)}"]
     if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * why.position_mean_square_m2:
-        share, reason = _format_share(second, why), reasons[second.name]
-        sentences.append(f"Then the {second.name} ({share}): {reason}{_moment_text(second)}.")
+        sentences.append(
+            f"Second: {second.name} ({_format_share(second, why)}). {reasons[second.name]}. "
+            f"{_moment_text(second)}"
+        )
     sentences += [_velocity_sentence(why), *_truth_sentences(why)]
     far_m = max(MIN_ELSEWHERE_M, MIN_ELSEWHERE_RATIO * float(np.max(np.abs(why.kf_minus_ekf2_m))))
     if why.outside is not None and why.outside.maximum_m > far_m:
@@ -129,89 +127,120 @@ def add_sentences(why: Why, axis_label: str, reasons: dict[str, str]) -> Why:
             f"EKF2 differ by up to {why.outside.maximum_m:.1f} m (at "
             f"{why.outside.at_s:.0f} s)."
         )
-    return structs.replace(why, sentences=tuple(sentences), cause=f"{cause}.")
+    return structs.replace(why, sentences=tuple(sentences), cause=cause)
 
 
-def _format_share(part: Step, why: Why) -> str:
-    share = part.position_mean_square_m2 / why.position_mean_square_m2
-    if share > 1.0:  # the steps add up to all of it, and some have a negative sign
-        return "all of the mean square and more, which other changes take back"
-    return f"{share:.0%} of the mean square"
+def _format_share(step: Step, why: Why) -> str:
+    share = step.position_mean_square_m2 / why.position_mean_square_m2
+    if share > 1.0:  # the shares add up to 100 %, and some are negative
+        return "more than the whole mean square; other steps reduce it"
+    return f"{100 * share:.0f} % of the mean square"
 
 
-def _moment_text(part: Step) -> str:
-    return f"; largest effect at {part.moved_at_s:.1f} s ({part.position_moved_m:.2f} m)"
+def _moment_text(step: Step) -> str:
+    return f"Largest effect at {step.moved_at_s:.1f} s ({step.position_moved_m:.2f} m)."
 
 
 def _rejection_text(why: Why) -> str:
-    coast = why.coast
-    if coast is None:
+    """Format the longest run of rejected samples as a sentence; empty without one."""
+    run = why.coast
+    if run is None:
         return ""
-    samples = f"{coast.samples} samples in a row" if coast.samples > 1 else "a sample"
+    samples = f"{run.samples} samples in a row" if run.samples > 1 else "a sample"
     return (
-        f": at {coast.start_s:.0f} s it rejected {samples} and drifted "
-        f"{coast.distance_m:.2g} m in {coast.duration_s:.1f} s"
+        f". At {run.start_s:.0f} s EKF2 rejected {samples} and drifted "
+        f"{run.distance_m:.2g} m in {run.duration_s:.1f} s"
     )
 
 
 def _step_reasons(
     comparison: Comparison, model: Model, clock: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    """What EKF2 does at each step, and what ours does."""
+    """Format the behaviour of KF and EKF2 at each step."""
     settings, inputs, source = comparison.settings, model.inputs, comparison.source
-    flown, delay, data, samples = inputs.settings, inputs.aid.delay, "", ways.SAMPLES
+    flown, aid = inputs.settings, inputs.aid
+    samples = (
+        f"KF predicts every {settings.dt_s:g} s and starts on its own; EKF2 predicts every "
+        f"{1e3 * inputs.step_s:.0f} ms"
+    )
     if settings.input == "zero":
-        samples = "no input"
+        samples = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != inputs.received.source:
-        samples = "another source"
+        samples = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
+    age_ms = 1e3 * (source.age_s - settings.clock_offset_s)
+    delay = (
+        f"EKF2 assumes positions are {flown[aid.delay]:g} ms old ({aid.delay}), KF {age_ms:.0f} ms"
+    )
     if isinstance(clock, ClockOffset) and clock.determinable:
         ends_s = (clock.offset_s, *clock.interval_s[::-1])
         ml_delay_ms, low, high = (1e3 * (source.age_s - at) for at in ends_s)
-        data = f", and the data ask for {ml_delay_ms:.0f} ms (95 % {low:.0f} to {high:.0f})"
-    equal_noise = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
-    trusts_imu_more = equal_noise < settings.sigma_a_m_s2
-    facts = {
-        "settings": settings,
-        "source": source,
-        "inputs": inputs,
-        "aid": inputs.aid,
-        "data": data,
-        "flown": flown,
-        "delay_ms": flown[delay],
-        "noise_m": noise_used_m(model),
-        "same": equal_noise,
-        "age_ms": 1e3 * (source.age_s - settings.clock_offset_s),
-        "step_ms": 1e3 * inputs.step_s,
-        "trusted": "the IMU more, and each position less"
-        if trusts_imu_more
-        else "each position more",
-        "horizon_ms": 1e3 * inputs.horizon_s,
-        "rejected": model.agreement.rejected_share_logged,
+        delay += (
+            f". The maximum-likelihood estimate is {ml_delay_ms:.0f} ms "
+            f"(95 % {low:.0f} to {high:.0f} ms)"
+        )
+    equivalent_sigma_a = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
+    imu, positions = (
+        ("more", "less") if equivalent_sigma_a < settings.sigma_a_m_s2 else ("less", "more")
+    )
+    return {
+        ways.SAMPLES: samples,
+        ways.STAMPS: delay,
+        ways.NOISE: (
+            f"EKF2 uses a measurement noise of {noise_used_m(model):.2g} m ({aid.noise}), "
+            f"KF {settings.sigma_z_m:.2g} m"
+        ),
+        ways.BIASES: "EKF2 estimates the accelerometer bias; KF does not",
+        ways.PROCESS: (
+            f"EKF2_ACC_NOISE {flown['EKF2_ACC_NOISE']:g} corresponds to SIGMA_A "
+            f"{equivalent_sigma_a:.2g} m/s²; KF uses {settings.sigma_a_m_s2:.2g} m/s². "
+            f"EKF2 weights the IMU {imu} and the positions {positions}"
+        ),
+        ways.ATTITUDE: (
+            "EKF2 corrects its attitude with the positions; KF uses the logged attitude"
+        ),
+        ways.FIELD: (
+            "EKF2 estimates heading with the magnetometer; KF uses EKF2's published heading"
+        ),
+        ways.SPEED: "EKF2 also fuses GNSS velocity; KF only GNSS position",
+        ways.FLOWING: "EKF2 also fuses optical flow; KF only positions",
+        ways.VISION: "EKF2 fuses external vision and GNSS; KF only one of them",
+        ways.GATE: (
+            f"EKF2 rejects {100 * model.agreement.rejected_share_logged:.1f} % of the samples; "
+            "KF has no gate"
+        ),
+        ways.OUTPUT: (
+            f"EKF2 runs {1e3 * inputs.horizon_s:.0f} ms behind and predicts to the present with "
+            f"the IMU, smoothed with EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s; KF has no delay"
+        ),
     }
-    reasons = {step: text.format_map(facts) for step, text in REASONS.items()}
-    return {**reasons, ways.SAMPLES: reasons[samples]}
 
 
 def _velocity_sentence(why: Why) -> str:
     position, total = why.position_mean_square_m2, why.velocity_mean_square_m2_s2
     first = max(why.steps, key=lambda part: part.velocity_mean_square_m2_s2)
     share = first.velocity_mean_square_m2_s2 / total
-    # more than all of it makes good what an earlier step did: no cause by itself
-    mostly = f", in velocity mostly by the {first.name} ({share:.0%})" if share <= 1.0 else ""
+    # a share above 1 compensates an earlier step, so it is not a contribution by itself
+    largest = (
+        f" Largest contribution in velocity: {first.name} ({100 * share:.0f} %)."
+        if share <= 1.0
+        else ""
+    )
+    velocity_left_share = why.velocity_left_mean_square_m2_s2 / total
     return (
-        f"Where EKF2 was replayed they are {np.sqrt(position):.3f} m and {np.sqrt(total):.3f} m/s "
-        f"rms apart{mostly}; the model leaves {_unexplained_text(why.position_left_share)} of that in position "
-        f"and {_unexplained_text(why.velocity_left_mean_square_m2_s2 / total)} in velocity unexplained."
+        f"RMS difference KF - EKF2 over the replayed parts: {np.sqrt(position):.3f} m and "
+        f"{np.sqrt(total):.3f} m/s.{largest} Share of the mean square that the replay does not "
+        f"explain: {_unexplained_text(why.position_left_share)} in position, "
+        f"{_unexplained_text(velocity_left_share)} in velocity."
     )
 
 
 def _unexplained_text(share: float) -> str:
-    """Format the unexplained share of a mean square; above 1 the model explains nothing.
+    """Format the unexplained share of a mean square; "all" above 1.
 
     >>> _unexplained_text(0.0071), _unexplained_text(4.2)
-    ('0.7%', 'all')
+    ('0.7 %', 'all')
     """
-    return f"{share:.1%}" if share <= 1.0 else "all"
+    return f"{100 * share:.1f} %" if share <= 1.0 else "all"
 
 
 def _truth_sentences(why: Why) -> list[str]:
@@ -220,13 +249,14 @@ def _truth_sentences(why: Why) -> list[str]:
         return []
     if abs(kf_rmse_m - ekf2_rmse_m) <= EQUAL_RMSE_TOLERANCE * max(kf_rmse_m, ekf2_rmse_m):
         return [
-            f"To the truth both are equally close, {kf_rmse_m:.3f} m (ours) and {ekf2_rmse_m:.3f} m."
+            f"KF and EKF2 have the same position RMSE (within {100 * EQUAL_RMSE_TOLERANCE:.0f} %): "
+            f"KF {kf_rmse_m:.3f} m, EKF2 {ekf2_rmse_m:.3f} m."
         ]
     rmse_by_step = [kf_rmse_m, *(step.position_rmse_to_truth_m or 0.0 for step in why.steps)]
     changes, names = np.diff(np.square(rmse_by_step)), [step.name for step in why.steps]
     step_index = int(np.argmin(changes) if ekf2_rmse_m < kf_rmse_m else np.argmax(changes))
-    through = f"the {names[step_index]} ({rmse_by_step[step_index]:.3f} m before that step, {rmse_by_step[step_index + 1]:.3f} m after)"
+    before_m, after_m = rmse_by_step[step_index : step_index + 2]
     return [
-        f"{'EKF2' if ekf2_rmse_m < kf_rmse_m else 'Our filter'} is closer to the truth, {min(kf_rmse_m, ekf2_rmse_m):.3f} "
-        f"m against {max(kf_rmse_m, ekf2_rmse_m):.3f} m rms, mostly through {through}."
+        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. Step with the largest "
+        f"effect from KF to EKF2: {names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
     ]

@@ -1,1 +1,1 @@
-"""One axis: the filter's model, signals, replay, likelihood, consistency, noises and clock."""
+"""KF: model, signals, replay, likelihood and consistency; estimates of noises and time offset."""

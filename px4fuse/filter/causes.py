@@ -1,15 +1,15 @@
-"""Biases, scale and jumps that explain the innovations better than noise does.
+"""Biases, scale factor error and jumps that explain the innovations better than noise.
 
-The filter is linear. Whatever adds a known signal to the measurements or to the acceleration adds
-to the innovations what the same filter, with the same gains, makes of that signal. So each
-hypothesis is a column, the response of the innovations to its unit, and generalised least squares
-(whitened by √S) gives its size, its standard deviation and its likelihood (Willsky and Jones 1976,
-the generalised likelihood ratio). What could pass for it is fitted along: constant accelerometer
-biases, a turn of the frame, and a slow error of the acceleration as a tilt of the attitude makes
-it.
+The filter is linear: a known signal added to the measurements or to the acceleration adds the
+filter's response to the innovations. Each hypothesis is therefore a column, the response of the
+innovations to its unit. Generalised least squares (whitened by √S) gives its size,
+its standard deviation and its likelihood (generalised likelihood ratio, Willsky and Jones 1976).
+Effects that could be confused with it are fitted too: constant accelerometer biases, a rotation of
+the frame, and a slow acceleration error as caused by tilt.
 
-A scale also acts on the noise of the acceleration, so that its regression would be biased (errors
-in variables): what remains is weighed by the variance that it has at each scale (Deming 1943).
+A scale factor also multiplies the noise of the acceleration, which would bias its regression
+(errors in variables). So the residuals are weighted with their variance at each scale (Deming
+1943).
 """
 
 from __future__ import annotations
@@ -43,37 +43,37 @@ from px4fuse.flight import Columns, Flight, Unavailable
 
 ANALYSIS_NAME = "causes beyond noise"
 MIN_MEASUREMENTS = 50
-# Slow error of the logged attitude: its root mean square, and how far apart it is independent
+# rad RMS, and s: slow error of the logged attitude, and spacing of its independent values
 TILT_SIGMA_RAD = 0.002
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
-# With biases and tilt taken out, less noise of the acceleration is left than the filter needs
+# Factors on KF's SIGMA_A: without biases and tilt, less acceleration noise remains
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
-# A step is sought at no more times than these
+# Limit of the number of times at which a step is tested
 MAX_STEP_TIMES = 800
-# So many of them are tried together: the responses of all would be the largest arrays of a run
+# Step times per batch; limits the memory of the responses
 STEP_BATCH_SIZE = 200
-# The vehicle's own reading is relied on across this time, in which bursts of outliers end
+# s; measurements in this time after a step are ignored, so that a burst of outliers is not a step
 OUTLIER_BURST_S = 1.0
-# A run of outliers that begins within this time after a step belongs to it
+# s; outliers in this time after a step are tested again as measurements after the step
 OUTLIERS_AFTER_STEP_S = 6.0
-# Chance that a flight without a step shows one anywhere
+# Probability of a detected step in a flight without one
 STEP_FALSE_ALARM_P = 1e-3
-# Chance that a measurement that is no outlier beside a step is taken for one; places of it tried
+# Probability that a good measurement near a step is taken for an outlier; tested step times
 FALSE_OUTLIER_P, MAX_TRIED_TIMES = 1e-3, 6
 MAX_JUMPS = 3
 MIN_BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
-MIN_BIAS_SIGMAS = 4.0  # 6e-5 of clean flights lie beyond
-# Measurements that a step must have on either side
+MIN_BIAS_SIGMAS = 4.0  # false alarm probability 6e-5
+# Measurements required on each side of a step
 MIN_SIDE_MEASUREMENTS = 8
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and its standard deviation."""
+    """Value with its standard deviation."""
 
     value: float
     sigma: float
@@ -81,7 +81,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Jump:
-    """A step of the source that stays: time (s), size along each axis (m), and its χ²."""
+    """Lasting step of the source: time (s), size along each axis (m), and its χ²."""
 
     time_s: float
     step_m: tuple[Estimate, ...]
@@ -89,27 +89,26 @@ class Jump:
 
     @property
     def size_m(self) -> float:
-        """Length of the step."""
+        """Length of the step (m)."""
         return float(np.hypot.reduce([step.value for step in self.step_m]))
 
 
 @dataclass(frozen=True)
 class BiasScaleJumpFit:
-    """What explains the innovations of some axes better than noise alone.
+    """Biases, scale factor error and jumps, fitted to the innovations of horizontal axes.
 
     Attributes
     ----------
     forward_bias, right_bias : Estimate
-        Accelerometer bias (m/s²) along the body's axes; a constant tilt of the attitude is the
-        same where the nose keeps its heading.
+        Accelerometer bias (m/s²), body axes. At constant heading a constant tilt is equivalent.
     rotation : Estimate
-        Of the source's frame against the attitude (rad, clockwise seen from above), with the biases
-        accounted for.
+        Rotation of the source's frame relative to the attitude (rad, clockwise from above),
+        fitted together with the biases.
     scale : Estimate
-        Distances of the source over those that the IMU gives, minus 1.
+        Ratio of the source's distances to the IMU's distances, minus 1.
     jumps : tuple of Jump
     sigma_a_m_s2 : float
-        White noise of the acceleration that is left.
+        Remaining white noise of the acceleration.
     """
 
     forward_bias: Estimate
@@ -123,13 +122,15 @@ class BiasScaleJumpFit:
 
     @property
     def bias(self) -> Estimate:
-        """Size of both biases together (m/s²)."""
-        one, other = self.forward_bias, self.right_bias
-        return Estimate(math.hypot(one.value, other.value), math.hypot(one.sigma, other.sigma))
+        """Magnitude of both biases together (m/s²)."""
+        forward, right = self.forward_bias, self.right_bias
+        return Estimate(
+            math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
+        )
 
     @property
     def has_bias(self) -> bool:
-        """Whether the accelerometer has a bias that matters, beyond chance."""
+        """True if the bias exceeds 0.2 m/s² and 4 σ."""
         return self.bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * self.bias.sigma)
 
 
@@ -143,7 +144,7 @@ def bias_scale_jump_fit(
     outlier_time_s: Array,
     clock_offset_s: float,
 ) -> BiasScaleJumpFit | Unavailable:
-    """Estimate biases and scale, and look for jumps of the source.
+    """Estimate accelerometer biases and scale factor error, and detect jumps of the source.
 
     Parameters
     ----------
@@ -151,17 +152,17 @@ def bias_scale_jump_fit(
     axes : tuple of Axis
         Horizontal, with the same measurement times.
     settings : Settings
-        ``dt_s`` gives SIGMA_A its meaning.
+        Its ``dt_s`` defines the unit of SIGMA_A.
     sigma_a_m_s2, sigma_z_m : float
-        Noises that the two-state filter needs.
+        KF's maximum-likelihood noises.
     outlier_time_s : ndarray
-        Measurements to leave out.
+        Timestamps of measurements to exclude.
     clock_offset_s : float
-        Added to the stamps first.
+        Time offset added to the timestamps.
 
     Returns
     -------
-    Explained, or Unavailable where there is no acceleration or too few measurements.
+    BiasScaleJumpFit, or Unavailable without acceleration or with too few measurements.
     """
     model = make_design_matrix(flight, axes, settings, sigma_z_m, clock_offset_s)
     if isinstance(model, Unavailable):
@@ -184,14 +185,14 @@ def bias_scale_jump_fit(
 def _fit_sigma_a(
     model: DesignMatrix, sigma_a_grid: Array, skip: BoolArray
 ) -> tuple[float, DesignFit]:
-    """The most likely of some SIGMA_A, and what is fitted with it."""
+    """Return the maximum-likelihood SIGMA_A of a grid, and the fit with it."""
     fit_at = cache(lambda index: model.fit(float(sigma_a_grid[index]), skip))
     best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
     return float(sigma_a_grid[best_index]), fit_at(best_index)
 
 
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
-    """Index of the least of some scores that have one minimum, sought from the middle."""
+    """Return the index of the minimum of a unimodal sequence, searched from its middle."""
     index = count // 2
     step = 1 if index + 1 < count and score(index + 1) < score(index) else -1
     while 0 <= index + step < count and score(index + step) < score(index):
@@ -200,9 +201,9 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 
 
 def _fit_scale(model: DesignMatrix, sigma_a: float, skip: BoolArray) -> Estimate:
-    """Scale of the source minus 1, from the likelihood of a few; a turn's share is put back."""
+    """Estimate the scale factor error from the likelihood on a grid, corrected for rotation."""
     fit_at = cache(lambda at: model.fit(sigma_a, skip, float(SCALE_GRID[at])))
-    # with S's logarithm, which grows with the scale, this would be biased towards zero
+    # without ln S: it grows with the scale and would bias the estimate towards zero
     lowest_index = _index_of_minimum(lambda at: fit_at(at).square_sum, len(SCALE_GRID))
     at = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
     scores = np.array([fit_at(neighbour).square_sum / 2.0 for neighbour in (at - 1, at, at + 1)])
@@ -219,11 +220,11 @@ def _fit_scale(model: DesignMatrix, sigma_a: float, skip: BoolArray) -> Estimate
 def _find_jumps(
     model: DesignMatrix, sigma_a: float, skip: BoolArray
 ) -> tuple[tuple[Jump, ...], BoolArray]:
-    """Steps of the source that stay, in order of time, and what is an outlier beside them.
+    """Detect lasting jumps of the source; return them in time order, and the outliers.
 
-    Times are proposed by a scan over all, and by where runs of outliers begin: a step begins with
-    one. Each is then judged without what follows within a second, so that a burst of outliers is
-    none. Where exactly it is, which its size depends on, is found last.
+    Candidate times are from a scan over all times and from the starts of outlier runs, since a jump
+    begins with one. Each is tested without the measurements of the next second, so that a burst of
+    outliers is not a jump. The exact time, on which the size depends, is found last.
     """
     jumps: list[Jump] = []
     for _ in range(MAX_JUMPS):
@@ -258,7 +259,7 @@ def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
 def _significant_step_times(
     model: DesignMatrix, sigma_a: float, skip: BoolArray, times: Array | None = None
 ) -> list[float]:
-    """The times at which a step would explain more than chance, by default of all; most first."""
+    """Return the times of significant steps, largest χ² first; default: all times."""
     if times is None:
         times = model.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
         times = times[:: max(1, -(-len(times) // MAX_STEP_TIMES))]
@@ -271,7 +272,7 @@ def _significant_step_times(
 
 
 def _step_chi_squares(model: DesignMatrix, sigma_a: float, skip: BoolArray, times: Array) -> Array:
-    """χ² of a step at each time: what it takes away of the squares, summed over the axes."""
+    """Compute χ² of a step at each time: the reduction of the squares, summed over axes."""
     data, columns, log_s = model.whitened_design(sigma_a, skip)
     base_fit = model.regress(data, columns, log_s, skip)
     chi_square = np.zeros(len(times))
@@ -298,9 +299,9 @@ def _step_chi_squares(model: DesignMatrix, sigma_a: float, skip: BoolArray, time
 def _locate_jump(
     model: DesignMatrix, sigma_a: float, skip: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """A jump at the most likely time near its own, with its size, and what is an outlier then."""
+    """Find the exact time of a jump near its candidate; return it with size and outliers."""
     is_near = np.abs(model.time_s - jump.time_s) <= OUTLIER_BURST_S
-    # with the step in the middle of what is not known, what follows is no outlier where it agrees
+    # without the uncertain interval, later measurements that agree with the step are not outliers
     chi_square = model.with_step(jump.time_s)[0].residual_squares(sigma_a, skip | is_near)
     is_after = is_near | _is_in_window(model.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
     skip = np.where(
@@ -319,7 +320,7 @@ def _locate_jump(
                 np.where(is_near, chi_square > chdtri(len(model.intervals), FALSE_OUTLIER_P), skip),
             )
         )
-    # an outlier beside a step looks like one: fewest are left where it is
+    # an outlier near a step looks like a step; the true time leaves the fewest outliers
     time_s, skip = min(placements, key=lambda placement: np.count_nonzero(placement[1]))
     stepped_model, columns = model.with_step(time_s)
     design_fit = stepped_model.fit(sigma_a, skip)
@@ -330,7 +331,7 @@ def _locate_jump(
 def _test_step(
     model: DesignMatrix, sigma_a: float, skip: BoolArray, time_s: float, chance: float
 ) -> Jump | None:
-    """A step at a time, where what comes later still asks for it; None where that is chance."""
+    """Return the jump at a time if it is significant without the next second, else None."""
     skip_with_burst = skip | _is_in_window(model.time_s, time_s, OUTLIER_BURST_S)
     model, columns = model.with_step(time_s)
     count_before = np.count_nonzero(~skip_with_burst & (model.time_s < time_s))
@@ -353,21 +354,21 @@ def _test_step(
 
 @dataclass(frozen=True)
 class DesignFit:
-    """Generalised least squares of whitened innovations on their columns.
+    """Generalised least squares of whitened innovations on the columns of a design matrix.
 
     Attributes
     ----------
     axis : ndarray of int, shape (n,)
-        Which axis each row is of: all of one, then of the next.
+        Axis of each row, sorted by axis.
     residual : ndarray, shape (n,)
-        What the columns leave of the innovations.
+        Residual of the whitened innovations.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
     square_sum : float
-        Sum of squares that remains, what the prior adds included.
+        Residual sum of squares, including the prior's term.
     score : float
         Restricted negative log-likelihood.
     residual_rms : float
-        Root mean square that remains, 1 where the noises are right.
+        Root mean square of the residual; 1 for correct noises.
     """
 
     axis: IntArray
@@ -380,34 +381,33 @@ class DesignFit:
 
     @property
     def axis_rms(self) -> Array:
-        """Root mean square that remains along each axis, at least 1: one may be the noisier."""
+        """Root mean square of the residual along each axis, at least 1."""
         mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
         return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
-        """One coefficient, its σ widened where more remains than the noises say."""
+        """Return one coefficient; its σ is widened if the residual exceeds the assumed noise."""
         sigma = float(np.sqrt(self.covariance[column, column])) * max(self.residual_rms, 1.0)
         return Estimate(float(self.coefficients[column]), sigma)
 
 
 @dataclass(frozen=True)
 class DesignMatrix:
-    """Axes with their columns: what every hypothesis is fitted on.
+    """Innovations of all axes and the columns that are common to all hypotheses.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
-        Of the measurements, as they were stamped.
+        Timestamps of the measurements.
     intervals : tuple of Preintegrated
-        Of each axis, with several signals: what was measured, then what each constant adds.
+        Signals of each axis: the measurements, then the effect of each constant.
     hat_signals : (ndarray, ndarray), shape (m, h)
-        Position and velocity that slow accelerations add, with coefficients of their own for each
-        axis.
+        Position and velocity due to slow accelerations, with separate coefficients per axis.
     prior_sigma : ndarray, shape (k,)
-        Standard deviations of the columns' coefficients before the data, steps left out.
+        Prior standard deviations of the coefficients, without the steps.
     sigma_z_m : float
     step_columns : ndarray, shape (m, j)
-        Added to the measurements, in j more columns for each axis.
+        Unit steps added to the measurements: j more columns per axis.
     """
 
     time_s: Array
@@ -418,7 +418,7 @@ class DesignMatrix:
     step_columns: Array
 
     def with_step(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
-        """The same with one more step, and its column of each axis."""
+        """Return the design matrix with one more step, and the step's column of each axis."""
         model = replace(
             self, step_columns=np.hstack([self.step_columns, unit_steps(self.time_s, [time_s])])
         )
@@ -427,7 +427,7 @@ class DesignMatrix:
 
     @cached_property
     def axis_groups(self) -> list[list[int]]:
-        """Axes with the same filter: all, but where gaps in the IMU tell less of one."""
+        """Axes that share a filter: all, unless gaps in the IMU affect them differently."""
         has_same_filter = all(
             np.array_equal(intervals.noise_fixed, self.intervals[0].noise_fixed)
             for intervals in self.intervals
@@ -438,31 +438,31 @@ class DesignMatrix:
     def whitened(
         self, intervals: Preintegrated, sigma_a: float, skip: BoolArray
     ) -> tuple[Array, float]:
-        """Innovations over √S of signals along any axis, (m, k), and Σ ln S of those used."""
+        """Return innovations divided by √S for k signals, (m, k), and Σ ln S of those used."""
         nu, s = innovations(intervals, sigma_a, self.sigma_z_m, skip)
         nu /= np.sqrt(s)[:, None]
         return nu, float(np.sum(np.log(s[~skip])))
 
     def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> DesignFit:
-        """Fit all columns, with the acceleration (and its noise) scaled.
+        """Fit all columns with a scale factor on the acceleration and its noise.
 
         Parameters
         ----------
         sigma_a : float
         skip : ndarray of bool, shape (m,)
-            Measurements that are neither fused nor fitted.
+            Measurements to exclude from filter and fit.
         scale : float
         """
         return self.regress(*self.whitened_design(sigma_a, skip, scale), skip)
 
     def regress(self, data: Array, columns: Array, log_s: float, skip: BoolArray) -> DesignFit:
-        """Fit what :meth:`whitened_design` gave, without the measurements that are left out."""
+        """Fit the output of :meth:`whitened_design` without the skipped measurements."""
         axis = np.repeat(np.arange(len(data)), np.count_nonzero(~skip))
         data, columns = data[:, ~skip].ravel(), columns[:, ~skip].reshape(len(axis), -1)
         count = columns.shape[1]
         prior_sigma = np.append(self.prior_sigma, np.full(count - len(self.prior_sigma), np.inf))
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
-        # a column that nothing excites (a turn in hover) must not stop the others
+        # a column without excitation (rotation in hover) must not make the matrix singular
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
         moment, factor = columns.T @ data, cho_factor(information)
         covariance = cho_solve(factor, np.eye(count))
@@ -474,7 +474,7 @@ class DesignMatrix:
         return DesignFit(axis, residual, coefficients, covariance, square_sum, score, residual_rms)
 
     def residual_squares(self, sigma_a: float, skip: BoolArray) -> Array:
-        """What a fit leaves of every measurement, over its σ: squares summed over the axes."""
+        """Return the squared residual of every measurement over its variance, axes summed."""
         data, columns, log_s = self.whitened_design(sigma_a, skip)
         fit = self.regress(data, columns, log_s, skip)
         residual = data - columns @ fit.coefficients
@@ -483,7 +483,7 @@ class DesignMatrix:
     def whitened_design(
         self, sigma_a: float, skip: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Whitened innovations (a, m) of all axes and their columns (a, m, k), and Σ ln S."""
+        """Return whitened innovations (a, m) and columns (a, m, k) of all axes, and Σ ln S."""
         hat_count, step_count, axes = (
             self.hat_signals[0].shape[1],
             self.step_columns.shape[1],
@@ -492,7 +492,7 @@ class DesignMatrix:
         width = len(self.prior_sigma)
         data = np.empty((axes, len(skip)))
         columns = np.zeros((axes, len(skip), width + axes * step_count))
-        # acceleration in the source's own length: of what was measured, and of a turn of it
+        # scale the measured and the rotated acceleration to the source's unit of length
         factor = np.ones(1 + CONSTANT_COUNT)
         factor[[0, 1 + ROTATION]] = scale
         zero_signal, log_s = np.zeros_like(self.hat_signals[0]), 0.0
@@ -536,7 +536,7 @@ def make_design_matrix(
     sigma_z: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Lay out the axes with the columns that every hypothesis is fitted beside.
+    """Build the design matrix of the columns that all hypotheses share.
 
     Parameters
     ----------
@@ -544,11 +544,11 @@ def make_design_matrix(
     axes : tuple of Axis
         Horizontal, with the same measurement times.
     settings : Settings
-        ``dt_s`` gives SIGMA_A its meaning.
+        Its ``dt_s`` defines the unit of SIGMA_A.
     sigma_z : float
         Measurement noise (m).
     clock_offset_s : float
-        Added to the stamps first.
+        Time offset added to the timestamps.
     """
     acceleration, attitude = ned_acceleration(flight), flight.attitude
     for input_data in (acceleration, axes[0].acceleration, attitude):
@@ -575,7 +575,7 @@ def make_design_matrix(
         ]
         dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*columns, strict=True))
         measured = np.zeros_like(dp)
-        # the filter starts at the first one
+        # KF starts at the first measurement
         measured[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
         start = replace(interval_input.initial, position_m=0.0)
         intervals.append(replace(_replace_signals(interval_input, dp, dv, measured), initial=start))
@@ -595,7 +595,7 @@ def make_design_matrix(
 def _integrate_signal(
     acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline
 ) -> tuple[Array, Array]:
-    """Position and velocity that an acceleration adds between the measurements."""
+    """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements."""
     time = np.asarray(time_s, dtype=np.float64)
     velocity = np.interp(line.time_s, time, cumulative_integral(acceleration_m_s2, time))
     return integrate_acceleration(line, np.diff(velocity) / np.diff(line.time_s))
@@ -604,7 +604,7 @@ def _integrate_signal(
 def _common_accelerations(
     attitude: pd.DataFrame, acceleration: pd.DataFrame
 ) -> list[tuple[pd.Index, Array]]:
-    """NED acceleration that takes out a bias forward and right, and that a turn adds; and when."""
+    """Return NED accelerations, with times: minus unit biases forward and right, and rotation."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
@@ -613,7 +613,7 @@ def _common_accelerations(
 
 
 def _hat_functions(start_s: float, end_s: float) -> tuple[Array, Array]:
-    """Hat functions between knots, of which any slow signal is made, at times so fine (n, h)."""
+    """Return times (s) and hat functions (h, n) between knots, which model a slow signal."""
     count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     time = np.linspace(start_s, end_s, 20 * (count - 1) + 1)
     knots = np.linspace(start_s, end_s, count)
@@ -621,5 +621,5 @@ def _hat_functions(start_s: float, end_s: float) -> tuple[Array, Array]:
 
 
 def unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
-    """Unit steps of the measurements, shape (m, j)."""
+    """Return unit steps at ``starts_s``, sampled at ``time_s``: shape (m, j)."""
     return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)

@@ -1,14 +1,13 @@
-"""Clock offset between the position source and the IMU, by joint maximum likelihood.
+"""Time offset between position source and IMU, by joint maximum likelihood.
 
-Positions whose stamps are wrong by τ lag or lead what the IMU felt. Innovations hardly grow, since
-the filter follows; what shows is that they agree with the acceleration. So the likelihood of the
-positions is maximised over τ, jointly with everything that could pass for it: the constants of
-:mod:`px4fuse.filter.motion` are marginalised, and the noises are maximised at every τ.
+Positions whose timestamps are wrong by τ lag or lead the measured acceleration. Innovations hardly
+grow, because the filter follows; the disagreement with the acceleration shows the offset. So the
+likelihood of the positions is maximised over τ. The constants of :mod:`px4fuse.filter.motion` that
+could be confused with τ are marginalised, and the noises are maximised at every τ.
 
-The IMU is noisy, and its noise moves with τ too: it looks like motion that the positions do not
-follow. The estimate is not biased by that (the noise of the velocity is as often ahead as behind),
-but it scatters more than the likelihood's curvature says. By how much is simulated, and the
-interval is as much wider (a sandwich estimate: White 1982).
+The noise of the IMU moves with τ, too: it looks like motion that the positions do not follow. That
+does not bias the estimate, but increases its scatter beyond the curvature of the likelihood. The
+factor is simulated, and the interval is widened by it (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -39,25 +38,25 @@ from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.record import Count, NotNegative, Record, Share, Span
 
 FINE_POINTS, CURVE_POINTS = 11, 121
-# EKF2 that takes fixes for younger or older than they are turns its heading until both agree, by
-# 5° for 0.2 s: a heading that is believed would hide the offset
+# Prior σ of the heading. With a wrong GNSS delay, EKF2 rotates its heading until positions agree,
+# by 5° for 0.2 s: a narrow prior with GNSS would hide the time offset
 HEADING_SIGMA_RAD, GNSS_HEADING_SIGMA_RAD = float(CONSTANT_SIGMA[2]), 0.2
-# A wider interval says nothing that a student could use
+# s; a wider interval gives no usable time offset
 MAX_HALF_INTERVAL_S = 0.15
-# A part that says less than this about its own offset (s) says nothing about a change
+# s; parts with a larger σ are not used to detect a change
 MAX_PART_SIGMA_S = 0.15
-# Parts further apart than chance would put them (two-sided)
+# p value below which the offsets of the parts differ significantly
 MAX_CHANGE_P = 0.005
-# Standard deviations beyond which an offset is not chance: 0.3 % of clean flights lie there
+# Significance limit of an offset in σ: false alarm probability 0.3 %
 OFFSET_SIGMAS = 3.0
-# Flights simulated for the scatter that the IMU's noise adds
+# Simulations of the scatter due to IMU noise
 SIMULATION_COUNT = 96
-# Steps of ln σ by which the noises are tried at every offset
+# Step of ln σ for the derivatives with respect to the noises
 LOG_SIGMA_STEP = 0.1
 
 
 class PartOffset(Record, frozen=True):
-    """Offset of one part of the flight: start, end, offset and its standard deviation, all s."""
+    """Time offset of one part of the flight: start, end, offset and its σ, all in s."""
 
     start_s: float
     end_s: float
@@ -66,31 +65,30 @@ class PartOffset(Record, frozen=True):
 
 
 class Clock(Record, frozen=True, kw_only=True):
-    """What must be added to the position source's own stamps, what was applied included.
+    """Seconds to add to the position source's timestamps, including the applied offset.
 
     Attributes
     ----------
     offset_s : float
-        Most likely; negative where the stamps are late.
+        Maximum-likelihood estimate; negative if the timestamps are late.
     interval_s : (float, float)
         95 % profile-likelihood interval, widened by the IMU's noise.
     sigma_s : float
         Standard deviation by the curvature at the maximum, widened likewise.
     applied_s : float
-        What was added to the stamps before this was found.
+        Offset already added to the timestamps.
     determinable : bool
-        Whether the interval is narrow enough, and closed, to say anything.
+        True if the interval is closed and narrow enough.
     reason : str
-        Why not, where it is not; else empty.
+        Reason if not determinable, else empty.
     parts : tuple of PartOffset
         Offsets of consecutive parts.
     drift_ppm, drift_sigma_ppm : float or None
-        Of the source's clock against the autopilot's, from the parts; None with fewer than three.
+        Drift of the source's clock relative to the autopilot's; None with fewer than three parts.
     change_p : float or None
-        p-value of "all parts have the same offset", by the likelihood ratio; None with fewer than
-        two parts.
+        p-value of a constant offset (likelihood ratio test); None with fewer than two parts.
     count : int
-        Measurements.
+        Number of measurements.
     """
 
     offset_s: float
@@ -107,22 +105,22 @@ class Clock(Record, frozen=True, kw_only=True):
 
     @property
     def remaining_s(self) -> float:
-        """What must still be added, beyond what was applied (s)."""
+        """Offset that remains to be added beyond the applied one (s)."""
         return self.offset_s - self.applied_s
 
     @property
     def three_sigma_s(self) -> float:
-        """How far chance may take it from the truth: ``OFFSET_SIGMAS`` standard deviations (s)."""
+        """Limit of a significant offset: ``OFFSET_SIGMAS`` standard deviations (s)."""
         return OFFSET_SIGMAS * self.sigma_s
 
 
 class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):
-    """:class:`Clock`, with the likelihood that it was found from.
+    """:class:`Clock` with its likelihood curve.
 
     Attributes
     ----------
     curve_s, curve_drop : ndarray, shape (n,)
-        Offsets, and how far each lies below the greatest log-likelihood.
+        Offsets, and the drop of the log-likelihood at each from its maximum.
     sigma_a_m_s2, sigma_z_m : float
         Noises at the maximum.
     """
@@ -146,7 +144,7 @@ def estimate_time_offset(
     progress: Callable[[str], None] = lambda _: None,
     signals: SignalCache | None = None,
 ) -> ClockOffset | Unavailable:
-    """Estimate what must be added to the stamps of a position track.
+    """Estimate the time offset to add to the timestamps of a position track.
 
     Parameters
     ----------
@@ -155,21 +153,20 @@ def estimate_time_offset(
         As logged.
     segment : Segment
     settings : Settings
-        ``dt_s`` gives SIGMA_A its meaning.
+        Its ``dt_s`` defines the unit of SIGMA_A.
     noises : Noises
-        To start with, biases taken out; a walk where the source may wander by itself, as odometry
-        does.
+        Initial values without biases; with a random walk for a source that may drift (odometry).
     outlier_time_s : ndarray, optional
-        Measurements to leave out.
+        Timestamps of measurements to exclude.
     progress : callable
     signals : dict, optional
-        As :func:`px4fuse.filter.motion.motion` has it.
+        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
 
     Returns
     -------
-    ClockOffset, or Unavailable where there is no IMU, no attitude or too few measurements.
+    ClockOffset, or Unavailable without IMU or attitude or with too few measurements.
     """
-    # GNSS is noisier along the vertical, and one SIGMA_Z is fitted
+    # GNSS is noisier vertically, and all axes share one SIGMA_Z
     axes = 2 if track.origin.is_gnss else 3
     samples = within(track.samples, segment)[Columns.POSITION[:axes]]
     samples = samples.dropna(subset=Columns.POSITION[:2])
@@ -186,7 +183,7 @@ def estimate_time_offset(
     )
     if isinstance(prepared_motion, Unavailable):
         return prepared_motion
-    progress("clock offset")
+    progress("time offset")
     coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
     offset, _ = prepared_motion.search(noises)
     sigma, width = 0.0, 0.1
@@ -212,21 +209,19 @@ def estimate_time_offset(
             break
         width *= 2.0
     offset = _minimum_and_sigma(curve, profile)[0]
-    # an IMU sample is the mean over its interval, stamped somewhere in it
+    # an IMU sample is the mean over its interval; its timestamp may be anywhere in it
     resolution = 0.5 * prepared_motion.imu_interval_s
     ends = curve[0] if low is None else low, curve[-1] if high is None else high
     half_widths = np.hypot(np.array(ends) - offset, 1.96 * resolution)
     low, high = float(offset - half_widths[0]), float(offset + half_widths[1])
     reason = ""
     if not is_closed or (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
-        range_text = (
-            f"the positions fit offsets from {low:+.2f} s to {high:+.2f} s almost equally well"
-        )
-        reason = f"{range_text}: too little acceleration, or too noisy a source"
+        range_text = f"offsets from {low:+.2f} s to {high:+.2f} s have nearly the same likelihood"
+        reason = f"{range_text}: too little acceleration, or too much position noise"
     parts: tuple[PartOffset, ...] = ()
     change_p = None
     if not reason:
-        progress("changes of the clock")
+        progress("changes of the time offset")
         parts, change_p = _offset_per_part(prepared_motion, offset, noises, factor)
     drift, drift_sigma = _clock_drift(parts)
     applied = settings.clock_offset_s
@@ -250,7 +245,7 @@ def estimate_time_offset(
 
 
 def _offset_grid(offset: float, width: float, count: int) -> Array:
-    """Offsets within the search, so far to either side."""
+    """Return offsets from ``offset - width`` to ``offset + width``, within the search range."""
     low, high = np.clip([offset - width, offset + width], -MAX_OFFSET_S, MAX_OFFSET_S).tolist()
     return np.linspace(low, high, count)
 
@@ -258,9 +253,9 @@ def _offset_grid(offset: float, width: float, count: int) -> Array:
 def _profile_over_noises(
     prepared_motion: PreparedMotion, curve: Array, noises: Noises, offset: float
 ) -> Array:
-    """-ln p over offsets, the noises maximised at each by a Newton step from the best ones.
+    """Compute -ln p over offsets, with the noises maximised at each by a Newton step.
 
-    The step's slopes are taken at each offset; the bends, which hardly change, at the best one.
+    The gradient is evaluated at each offset, the Hessian, which hardly changes, at the best one.
     """
     sigma_z, sigma_a = noises.sigma_z_m, noises.sigma_a_m_s2
     offsets = np.append(curve, offset)
@@ -284,7 +279,7 @@ def _profile_over_noises(
     mixed = profile_at(1, 1)[-1] + profile_at(-1, -1)[-1] - 2.0 * centre[-1]
     hessian[0, 1] = hessian[1, 0] = 0.5 * (mixed - hessian[0, 0] - hessian[1, 1])
     hessian /= LOG_SIGMA_STEP**2
-    if np.any(np.linalg.eigvalsh(hessian) <= 0.0):  # SIGMA_A at the end of its search
+    if np.any(np.linalg.eigvalsh(hessian) <= 0.0):  # SIGMA_A is at the end of its search range
         return centre[:-1]
     gain = 0.5 * np.einsum("it,ij,jt->t", slope, np.linalg.inv(hessian), slope)
     return np.asarray(centre[:-1] - gain)
@@ -293,11 +288,11 @@ def _profile_over_noises(
 def _variance_inflation(
     prepared_motion: PreparedMotion, offset: float, noises: Noises, information: float
 ) -> float:
-    """Variance of the estimate over that by the curvature alone, from simulated noise.
+    """Ratio of the estimate's variance to that from the curvature, from simulated noise.
 
-    The score of τ is eᵀM(v + n): e the residuals, v the velocity, n the noise of the velocity that
-    the IMU measures, M the inverse covariance with the constants taken out. Its part eᵀMn is
-    random even where nothing moves, and e holds the same noise.
+    The score of τ is eᵀM(v + n): e the residuals, v the velocity, n the velocity noise of the IMU,
+    M the inverse covariance with the constants marginalised. Its part eᵀMn is random even without
+    motion, and e contains the same noise.
     """
     positions = prepared_motion.at(offset)
     joined, count, axes = (
@@ -316,11 +311,11 @@ def _variance_inflation(
     dv[..., joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
     dv[..., joined] += q01 / q00 * dp[..., joined]
     error = noises.sigma_z_m * draw_normal(count)
-    # of the velocity, from the start of each stretch
+    # velocity noise from the start of each stretch
     speed = np.zeros_like(error)
     for begin, end in positions.stretches:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=speed[..., begin + 1 : end])
-    if noises.walk_m:  # the source's own walk is in the residuals, but nothing the IMU measured
+    if noises.walk_m:  # random walk of the source: in the residuals, not in the IMU
         dp[..., joined] += (
             noises.walk_m * np.sqrt(positions.length_s[joined]) * draw_normal(interval_count)
         )
@@ -332,7 +327,7 @@ def _variance_inflation(
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Minimum of a profile by a parabola, and the standard deviation that its bend gives."""
+    """Return the minimum of a profile (parabola) and the σ from its curvature."""
     index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
     shift, curvature = parabola_vertex(profile, index)
@@ -344,7 +339,7 @@ def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
 def _offset_per_part(
     prepared_motion: PreparedMotion, offset: float, noises: Noises, factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
-    """Offset of each stretch by itself, and the p-value of no change, by the likelihood ratio."""
+    """Estimate the offset of each stretch, and the p-value of a constant offset."""
     coarse = offset + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_POINTS)
     coarse = coarse[np.abs(coarse) <= MAX_OFFSET_S]
     coarse_profiles = fit_noises(
@@ -369,7 +364,7 @@ def _offset_per_part(
 
 
 def _clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
-    """Drift of the source's clock (ppm) with its standard deviation."""
+    """Return the drift of the source's clock (ppm) and its standard deviation."""
     if len(part_offsets) < 3:
         return None, None
     rows = [

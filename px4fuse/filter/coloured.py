@@ -1,23 +1,23 @@
-"""Whether the errors of successive positions hang together: a low pass, or a slow error.
+"""Time correlation of the source's errors: a low pass, or time-correlated noise.
 
-All models are judged by the likelihood of the same positions over the motion that the IMU has, with
-its biases, its tilt and the scale taken out (:mod:`px4fuse.filter.motion`), and each with the
-noises that make it most likely: the two-state filter's SIGMA_A, which has to cover the biases,
-would hide what is slow.
+All models are compared by the likelihood of the same positions over the motion from the IMU, with
+biases, tilt and scale factor error marginalised (:mod:`px4fuse.filter.motion`), and each with its
+own maximum-likelihood noises. The SIGMA_A of KF is not used: it covers the biases and would hide
+slow errors.
 
-A low pass of first order, z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ), makes the noise of
-successive positions agree and the positions lag behind the motion. Undone, u_k = (z_k - ρ z_(k-1))
-/ (1 - ρ), it gives back positions whose noise is white and which do not lag. So the likelihood of
-what was sent is that of u, times the Jacobian Π 1/(1 - ρ) of undoing it.
+A low pass of first order, z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ), correlates the noise of
+successive positions and makes the positions lag. Its inverse, u_k = (z_k - ρ z_(k-1)) / (1 - ρ),
+gives positions with white noise and without lag. So the likelihood of z is that of u times the
+Jacobian Π 1/(1 - ρ) of the inversion.
 
-A slow error of first order, c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w, is a third state that the
-measurement sees: z = p + c + v. It hangs together too, but lags behind nothing. Both are tried with
-the stamps as they are, and a slow error also with the clock offset that was found, the other
-reading of a lag.
+Time-correlated noise of first order, c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w, is a third state in the
+measurement: z = p + c + v. It is correlated, too, but does not lag. Both models use the timestamps
+as they are; time-correlated noise is also fitted with the estimated time offset, the other
+explanation of a lag.
 
-What is much slower than a second passes for an error of the IMU, so that such a time constant is a
-lower bound. A truth shows the errors themselves, and judges them where there is one: by their own
-likelihood, what a turned, moved or scaled frame and late stamps would add to them taken out
+Noise with a time constant much above a second cannot be distinguished from an IMU error, so such a
+τ is a lower bound. If ground truth is available, the errors themselves are used: by their
+likelihood after removal of the effects of a rotated, shifted or scaled frame and of late timestamps
 (restricted likelihood, Patterson and Thompson 1971).
 """
 
@@ -40,12 +40,12 @@ from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
-# Longer flights are judged by their middle, which is enough
+# Longer flights: only the middle is used, to limit the time
 MAX_MEASUREMENTS = 2000
-# Intervals longer than this many median ones begin anew: the low pass has forgotten
+# Intervals beyond this many median ones: correlation across them is negligible
 MAX_INTERVAL_RATIO = 3.0
-# A first look for slow errors: τ, share of SIGMA_Z's variance, SIGMA_A and all noises over those
-# without one
+# Coarse search for time-correlated noise: τ, its share of the variance SIGMA_Z², and factors on
+# SIGMA_A and on all noises
 COARSE_TAUS_S, COARSE_SHARES, COARSE_SIGMA_A_FACTORS = (
     (0.2, 0.6, 2.0, 6.0),
     (0.12, 0.35, 0.8),
@@ -53,37 +53,37 @@ COARSE_TAUS_S, COARSE_SHARES, COARSE_SIGMA_A_FACTORS = (
 )
 COARSE_SCALES = np.geomspace(0.7, 1.6, 12)
 COARSE_MEASUREMENTS = 1000
-# What it must find for more to be done, and what more must find: less is chance
+# Log-likelihood gain that the coarse search needs before the full fit, and that the fit needs
 MIN_COARSE_GAIN_NATS, MIN_GAIN_NATS = 0.5, 2.0
-# What a slow error with a clock offset must explain beyond a low pass, whose lag is its own: 1 for
-# each of its two further numbers (Akaike 1974)
+# Penalty for time-correlated noise with a time offset compared with a low pass: 1 for each of its
+# two further parameters (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
-# Time constants of a low pass, and how near in ln τ is near enough
+# Range of the low pass's time constant, and tolerance in ln τ
 LOW_PASS_TAU_S, LOG_TAU_TOLERANCE = (0.02, 3.0), 0.05
-# Against a truth: at most so many measurements, what must be gained (a likelihood ratio of 150 for
-# two more numbers), how near a sample of it must be (s: between them, at 2 m/s², it is known to
-# 1 cm), time constants and shares
+# With ground truth: limit of the measurements, required gain (likelihood ratio 150 for two more
+# parameters), and s to the next sample (error of the interpolation at 2 m/s²: 1 cm)
 MAX_TRUTH_MEASUREMENTS, MIN_TRUTH_GAIN_NATS, MAX_TRUTH_DISTANCE_S = 300, 5.0, 0.1
-# Parts of the flight with a clock offset each, which may change
+# Parts of the flight with a separate time offset
 OFFSET_PART_COUNT = 12
+# Grid of time constants and variance shares with ground truth
 TRUTH_TAUS_S, TRUTH_SHARES = np.geomspace(0.3, 80.0, 17), np.linspace(0.05, 0.999, 20)
 
 
 @dataclass(frozen=True)
 class SourceLowPass:
-    """A low pass in the source.
+    """Low pass of the position source.
 
     Attributes
     ----------
     correlation : float
-        Of the noise of successive positions; 0 where there is no low pass.
+        Correlation of the noise of successive positions; 0 without a low pass.
     lag_s : float
-        By how much positions come behind a steady motion, Δt ρ / (1 - ρ): less than the time
-        constant, by about half an interval.
+        Lag behind a steady motion, Δt ρ / (1 - ρ): the time constant minus about half an
+        interval.
     gain_nats : float
-        Log-likelihood above that of no low pass, with the stamps as they are or moved.
+        Log-likelihood gain over white noise (timestamps unchanged or shifted).
     sigma_z_m : float
-        White noise of a single position before the low pass.
+        White noise of a position before the low pass.
     """
 
     correlation: float
@@ -94,21 +94,22 @@ class SourceLowPass:
 
 @dataclass(frozen=True)
 class TimeCorrelatedNoise:
-    """A slow error beside the white noise of the positions.
+    """Time-correlated noise in addition to the white noise of the positions.
 
     Attributes
     ----------
     tau_s : float
-        Time in which it forgets itself.
+        Correlation time.
     low_s, high_s : float
-        Where that lies: 95 % by a truth; over the IMU it may be any longer (infinity).
+        95 % interval of the correlation time; from the IMU only a lower bound, then ``high_s`` is
+        infinite.
     slow_m, white_m : float
         Standard deviations of both parts, per axis.
     gain_nats : float
-        Log-likelihood above that of white noise alone.
+        Log-likelihood gain over white noise alone.
     lag_nats : float
-        What a low pass, which lags, explains beyond that, :data:`OFFSET_PENALTY_NATS` more where the slow
-        error asks for a clock offset besides.
+        Further gain of a low pass, which lags; plus :data:`OFFSET_PENALTY_NATS` if the
+        time-correlated noise is fitted with a time offset.
     """
 
     tau_s: float
@@ -121,7 +122,7 @@ class TimeCorrelatedNoise:
 
     @property
     def share(self) -> float:
-        """Share of the variance that is slow."""
+        """Share of the variance that is time-correlated."""
         return self.slow_m**2 / (self.slow_m**2 + self.white_m**2)
 
 
@@ -135,7 +136,7 @@ def time_correlation_fit(
     clock_offset_s: float,
     jumps: Sequence[Jump] = (),
 ) -> tuple[SourceLowPass, TimeCorrelatedNoise | Unavailable] | Unavailable:
-    """Look for a low pass and for a slow error of the source.
+    """Fit a low pass and time-correlated noise of the source.
 
     Parameters
     ----------
@@ -143,19 +144,19 @@ def time_correlation_fit(
     axes : tuple of Axis
         With the same measurement times.
     settings : Settings
-        ``dt_s`` gives SIGMA_A its meaning.
+        Its ``dt_s`` defines the unit of SIGMA_A.
     noises : Noises
-        About the most likely ones with neither.
+        Initial values: estimates for white noise.
     outlier_time_s : ndarray
-        Measurements to leave out.
+        Timestamps of measurements to exclude.
     clock_offset_s : float
-        What would have to be added to the stamps if there were neither.
+        Estimated time offset with white noise.
     jumps : sequence of Jump
-        Steps of the source along these axes, which are taken out.
+        Steps of the source along these axes, to be subtracted.
     """
     time = axes[0].measurement_time_s
     if len(time) < MIN_MEASUREMENTS:
-        return too_few_measurements("errors that hang together", len(time), MIN_MEASUREMENTS)
+        return too_few_measurements("time-correlated errors", len(time), MIN_MEASUREMENTS)
     first_row = max(0, (len(time) - MAX_MEASUREMENTS) // 2)
     rows = slice(first_row, first_row + MAX_MEASUREMENTS)
     time, measured_m = time[rows], np.column_stack([axis.measurement_m[rows] for axis in axes])
@@ -168,7 +169,7 @@ def time_correlation_fit(
     directions, signals = np.array([axis.direction for axis in axes]), SignalCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
-        """Positions with a low pass undone, and what undoing it adds to -ln p."""
+        """Invert a low pass; return the positions and the Jacobian's contribution to -ln p."""
         rho = (
             np.where(is_short_interval, np.exp(-interval / tau_s), 0.0)
             if tau_s
@@ -176,7 +177,7 @@ def time_correlation_fit(
         )
         previous_m = np.concatenate([measured_m[:1], measured_m[:-1]])
         unfiltered = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
-        # what was undone with an outlier is one too: left out of all models, which are compared
+        # the inversion spreads an outlier to the next position: exclude both from all models
         is_good = ~(is_outlier | (is_short_interval & np.concatenate([[False], is_outlier[:-1]])))
         prepared_motion = prepare_motion(
             flight,
@@ -188,7 +189,7 @@ def time_correlation_fit(
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
-        # nothing is known of where a stretch begins: the first one says nothing
+        # the first position of a stretch is not predicted, so it has no likelihood
         is_used = np.isin(time, np.delete(prepared_motion.time_s, prepared_motion.edges[:-1]))
         return prepared_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
@@ -208,8 +209,8 @@ def time_correlation_fit(
         _best_of_grid(coarse_motion, offsets, candidates)
         for candidates in ([noises], correlated_noises)
     )
-    label = "slow errors of the source"
-    no_correlation = Unavailable(label, "its errors do not hang together", "")
+    label = "time-correlated noise of the source"
+    no_correlation = Unavailable(label, "its errors are not time-correlated", "")
     if white_score - correlated_score < MIN_COARSE_GAIN_NATS:
         return low_pass, no_correlation
     (white_fit, _), (correlated_fit, offset_s) = (
@@ -224,14 +225,15 @@ def time_correlation_fit(
         white_fit.noises,
         _score_of_fit(correlated_fit),
     )
-    if (
-        white_full_score - correlated_score < MIN_GAIN_NATS
-    ):  # of a low pass, a slow error explains much as well
+    # time-correlated noise explains much of a low pass, too
+    if white_full_score - correlated_score < MIN_GAIN_NATS:
         return low_pass, no_correlation
 
     def unfiltered(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        assert not isinstance(prepared_motion, Unavailable)  # it was not, of the same measurements
+        assert not isinstance(
+            prepared_motion, Unavailable
+        )  # the same measurements were available above
         correlated_score = _fit_noises_at(prepared_motion, 0.0, white_noises)
         return _score_of_fit(correlated_score) + jacobian_term, correlated_score.noises
 
@@ -269,16 +271,18 @@ def fit_time_correlation_to_truth(
     jumps: Sequence[Jump],
     by_imu: TimeCorrelatedNoise | Unavailable,
 ) -> TimeCorrelatedNoise | Unavailable:
-    """A slow error in the positions' errors against a truth, where that says more than the IMU.
+    """Fit time-correlated noise to the errors against ground truth.
+
+    Return ``by_imu`` if that has the larger gain or ground truth is insufficient.
 
     Parameters
     ----------
     axes, outlier_time_s, clock_offset_s, jumps
-        As :func:`time_correlation_fit` has them.
+        See :func:`time_correlation_fit`.
     truths : sequence of DataFrame
         True ``position_m`` along each axis.
-    by_imu : Coloured or Unavailable
-        What :func:`time_correlation_fit` found, with the lag that only it can tell.
+    by_imu : TimeCorrelatedNoise or Unavailable
+        Result of :func:`time_correlation_fit`, which also gives the lag.
     """
     min_gain, lag_nats = MIN_TRUTH_GAIN_NATS, 0.0
     if isinstance(by_imu, TimeCorrelatedNoise):
@@ -301,7 +305,7 @@ def fit_time_correlation_to_truth(
     residual_basis = np.linalg.qr(nuisance_columns, mode="complete")[0][
         :, nuisance_columns.shape[1] :
     ]
-    residuals, share, grid_fitss = residual_basis.T @ (measured_m - true_m), TRUTH_SHARES, []
+    residuals, share, grid_scores = residual_basis.T @ (measured_m - true_m), TRUTH_SHARES, []
     half = 0.5 * np.array([len(axes), len(residuals)])
     for tau in TRUTH_TAUS_S:
         correlation = (
@@ -311,14 +315,14 @@ def fit_time_correlation_to_truth(
         variance = 1.0 - share + share * eigenvalues[:, None]
         square = ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / variance) / len(residuals)
         score = half @ [np.log(variance).sum(axis=0), np.log(square).sum(axis=0)]
-        grid_fitss.append((score, square.mean(axis=0)))
-    score, square = np.transpose(grid_fitss, (1, 0, 2))  # by time constant and share
+        grid_scores.append((score, square.mean(axis=0)))
+    score, square = np.transpose(grid_scores, (1, 0, 2))  # shape (time constants, shares)
     tau_index, share_index = divmod(int(np.argmin(score)), len(share))
     gain = half[1] * np.log(np.mean(residuals**2, axis=0)).sum() - score.min(axis=1)
     if gain.max() < min_gain:
         return by_imu
     first_tau, last_tau = np.flatnonzero(gain > gain.max() - PROFILE_DROP)[[0, -1]]
-    # the ends lie between time constants that were tried
+    # the ends of the interval are between grid points
     tau_s = np.append(TRUTH_TAUS_S, np.inf)[[tau_index, max(first_tau - 1, 0), last_tau + 1]]
     sizes_m = np.sqrt(
         square[tau_index, share_index] * np.array([share[share_index], 1.0 - share[share_index]])
@@ -341,7 +345,7 @@ def _score_of_fit(fit: NoiseFit) -> float:
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidates: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """The most likely of some noises, with others of SIGMA_A and all of them scaled: -ln p, it."""
+    """Return the lowest -ln p of some noises with scaled SIGMA_A and common scale, and them."""
     results = []
     for positions in map(prepared_motion.at, offsets_s):
         for candidate, factor in product(candidates, COARSE_SIGMA_A_FACTORS):

@@ -1,4 +1,4 @@
-"""NIS, NEES, bias, whiteness and verdicts: the same functions for our filter and for EKF2.
+"""NIS, bias, whiteness and verdict of innovations, with the same functions for KF and EKF2.
 
 Definitions: Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications to Tracking and
 Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
@@ -12,30 +12,31 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 from px4fuse.arrays import Array
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
 
+# "overstated": underconfident, σ too large; "understated": overconfident, σ too small
 Verdict = Literal["consistent", "variance overstated", "variance understated"]
 
-# Fewer innovations than this say nothing: the 95 % band of the mean NIS is then wider than 0.3–2.1.
+# With fewer innovations the 95 % band of the mean NIS is wider than 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE = 0.95
 LJUNG_BOX_LAGS = 10
-# √S that is off by fewer times is no finding: R is a rule of thumb, and tracks hardly change
+# Factor of √S below which there is no finding: R is a rule of thumb, and tracks hardly change
 SIGMA_FACTOR_FINDING = 1.25
-GATE_SIGMA = 5.0  # EKF2_EVP_GATE's default, used where no gate is in force
+GATE_SIGMA = 5.0  # √S; default of EKF2_EVP_GATE, for KF and for logs without a gate
 
 
 class NisVerdict(Record, frozen=True, kw_only=True):
-    """What the mean NIS of a filter's innovations says of their variance.
+    """Mean NIS with its 95 % band, and the verdict on the reported σ.
 
     Attributes
     ----------
     count : int
-        Innovations used.
+        Number of innovations.
     nis_mean : float
-        Mean of ν²/S over its degrees of freedom; 1 is consistent.
+        Mean of ν²/S per degree of freedom; expected 1.
     nis_band : (float, float)
-        Two-sided 95 % chi-square band of that mean, for white innovations.
+        Two-sided 95 % chi-square band of the mean NIS, for white innovations.
     sigma_factor : float
-        Claimed over shown standard deviation, 1/√nis_mean: above 1 √S is too large.
+        Ratio of reported to actual σ, 1/√nis_mean: above 1, √S is too large.
     verdict : str
     """
 
@@ -47,28 +48,28 @@ class NisVerdict(Record, frozen=True, kw_only=True):
 
     @property
     def sigma_error_factor(self) -> float:
-        """By how many times √S is too large or too small, 1 or more."""
+        """Factor between reported and actual σ, at least 1; ``verdict`` gives the direction."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
 class Consistency(NisVerdict, frozen=True, kw_only=True):
-    """Whether a filter's innovations are what its own variances say.
+    """Statistics of a filter's innovations compared with its reported variances.
 
     Attributes
     ----------
     innovation_mean_m, innovation_std_m : float
     sqrt_s_median_m : float
-        Median of √S, what the filter expected of the standard deviation.
+        Median of √S, the standard deviation that the filter expects.
     outside_two_sigma : float
-        Fraction outside ±2√S; 0.046 is expected.
+        Fraction outside ±2√S; expected 0.046.
     outside_gate : float
         Fraction outside the gate.
     bias_t, bias_p : float
         Student's t of the mean against zero, and its two-sided p-value.
     lag1_autocorrelation : float
-        Of the normalised innovations; positive says that the filter follows too slowly.
+        Lag-1 autocorrelation of ν/√S; positive if the filter lags behind the positions.
     ljung_box_p : float
-        p-value of "white" over ``ljung_box_lags`` lags.
+        p-value of the Ljung-Box whiteness test over ``ljung_box_lags`` lags.
     ljung_box_lags : int
     """
 
@@ -85,16 +86,16 @@ class Consistency(NisVerdict, frozen=True, kw_only=True):
 
 
 class HorizontalNis(NisVerdict, frozen=True, kw_only=True):
-    """NIS of north and east together, two degrees of freedom, divided by two.
+    """NIS of north and east together: two degrees of freedom, divided by two.
 
-    EKF2 logs no covariance between the two, so their correlation is left out for both filters.
+    The covariance between north and east is omitted for both filters: EKF2 does not log it.
     """
 
 
 def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
-    """Two-sided 95 % band of the mean of ``count`` NIS values of ``dimensions`` degrees of freedom.
+    """Return the two-sided 95 % band of the mean of ``count`` NIS values, per dimension.
 
-    Divided by the dimensions, so that 1 is consistent whatever they are.
+    The expected mean is 1 for any number of ``dimensions``.
 
     >>> low, high = nis_band(128, 2)
     >>> round(2 * low, 2), round(2 * high, 2)
@@ -107,7 +108,7 @@ def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
 
 
 def classify_mean_nis(nis_mean: float, band: tuple[float, float]) -> Verdict:
-    """Two-sided verdict on a mean NIS."""
+    """Return the two-sided verdict on a mean NIS."""
     if nis_mean < band[0]:
         return "variance overstated"
     if nis_mean > band[1]:
@@ -116,7 +117,6 @@ def classify_mean_nis(nis_mean: float, band: tuple[float, float]) -> Verdict:
 
 
 def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
-    """Fields of :class:`NisVerdict`."""
     mean, band = float(np.mean(nis)) / dimensions, nis_band(len(nis), dimensions)
     return {
         "count": len(nis),
@@ -128,9 +128,9 @@ def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
 
 
 def autocorrelation(values: Array, lags: int) -> Array:
-    """Autocorrelation of a series at lags 1 to ``lags``, about zero, not about its mean.
+    """Return the autocorrelation of a series at lags 1 to ``lags``, without mean removal.
 
-    r(l) = Σ ν(k) ν(k+l) / Σ ν(k)²; bias is tested apart.
+    r(l) = Σ ν(k) ν(k+l) / Σ ν(k)²; the bias has a separate test.
     """
     power = float(np.dot(values, values))
     return np.array([np.dot(values[:-lag], values[lag:]) / power for lag in range(1, lags + 1)])
@@ -139,16 +139,16 @@ def autocorrelation(values: Array, lags: int) -> Array:
 def assess(
     innovation_m: Array, innovation_variance_m2: Array, gate: float = GATE_SIGMA
 ) -> Consistency | Unavailable:
-    """Assess innovations against the variances that their filter gave them.
+    """Test innovations against the variances that their filter reports.
 
     Parameters
     ----------
     innovation_m : ndarray, shape (n,)
-        Measurement minus prediction, prior, in time order.
+        Measurement minus predicted measurement, in time order.
     innovation_variance_m2 : ndarray, shape (n,)
         S, positive.
     gate : float
-        In standard deviations.
+        Gate in √S.
 
     Returns
     -------
@@ -193,7 +193,7 @@ def assess(
 def assess_horizontal(
     north: tuple[Array, Array], east: tuple[Array, Array]
 ) -> HorizontalNis | None:
-    """Joint statement on two axes whose innovations share their times.
+    """Test north and east together; their innovations have the same timestamps.
 
     Parameters
     ----------

@@ -1,9 +1,10 @@
-"""Most likely noises of positions: SIGMA_A, SIGMA_Z, and which measurements are outliers.
+"""Maximum-likelihood noises of positions, SIGMA_A and SIGMA_Z, and the outliers.
 
-The innovations of a filter with the right noises are white and as large as it says, and these
-noises make them most likely (Schweppe 1965). A share of the measurements may come from a normal
-distribution many times as wide (Tukey 1960): how many, how wide and which is found by expectation
-and maximisation, one decision for all axes of a sample, with what *all* data say of its error.
+The innovations of a filter with correct noises are white and have the expected variance; these
+noises maximise their likelihood (Schweppe 1965). A share of the measurements may be from a normal
+distribution that is many times wider (Tukey 1960). Its share, its width and the outliers are
+estimated by expectation maximisation, with one decision for all axes of a sample, from the error
+given *all* data.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,42 +28,41 @@ from px4fuse.filter.marginal import (
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
 SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
-# From what no positioning system resolves
+# From 1 mm, better than any positioning system
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 WALK_SEARCH_M = (1e-4, 1.0)
 SLOW_SEARCH_M, SLOW_SEARCH_S = (1e-3, 10.0), (0.05, 60.0)
 MAX_PASSES = 12
-# Of the maximisation, in the end and while the outliers still change
+# Iterations of the maximisation: final, and while the outliers still change
 MAX_STEPS, ROUGH_MAX_STEPS = 50, 3
-# Outliers are at least this many times as wide as the rest: less is not told from it
+# Minimum ratio of the outliers' σ to SIGMA_Z: a smaller one cannot be distinguished
 MIN_WIDTH = 3.0
 FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.005, 10.0, 0.4
-# SIGMA_Z is at most this many times what the median of the squares says
+# Upper limit of SIGMA_Z relative to its estimate from the median square
 MAX_SIGMA_RATIO = 1.2
 MAX_PROBABILITY_CHANGE = 0.01
-# -ln p of each measurement where it cannot be computed; any that can be is far below
+# -ln p per measurement if it cannot be computed; larger than any computed value
 UNCOMPUTABLE_SCORE = 1e6
-# Step of ln σ for slopes
+# Step in ln σ for derivatives
 SLOPE_STEP = 1e-4
-# Nodes about each place, and their distance in ln σ; while the outliers still change, few
+# Interpolation nodes and their distance in ln σ; fewer while the outliers still change
 NODES, ROUGH_NODES = (10, 0.25), (6, 0.2)
-# Precision of a start that is known (1/m² and s²/m²): to a micrometre
+# 1/m² and s²/m²; precision of a known initial state: 1 µm
 KNOWN_START_PRECISION = 1e12
 
 
 @dataclass(frozen=True)
 class Noises:
-    """What is random.
+    """Parameters of the random errors.
 
     Attributes
     ----------
     sigma_a_m_s2, sigma_z_m : float
-        Of the acceleration, as the filter's, and of each measurement.
+        Noise of the acceleration (as KF's SIGMA_A) and of each measurement.
     walk_m : float
-        Random walk of the source itself, m per square root of a second; 0 for one that does not
-        drift.
+        Random walk of the source (m/√s); 0 for a source that does not drift.
     slow_m, tau_s : float
-        Standard deviation and time constant of a slow error of the source; 0 for none.
+        Standard deviation and time constant of the source's time-correlated noise; 0 for none.
     """
 
     sigma_a_m_s2: float
@@ -72,6 +72,7 @@ class Noises:
     tau_s: float = 0.0
 
 
+# Search ranges by field of Noises
 SEARCHES = {
     "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2,
     "sigma_z_m": SIGMA_Z_SEARCH_M,
@@ -82,22 +83,22 @@ SEARCHES = {
 
 
 class Likelihood:
-    """-ln p of the measurements but for a constant, over the noises.
+    """-ln p of the measurements (without a constant) as a function of the noises.
 
-    Where nothing but the noises of acceleration and measurements is random, all but a scale depends
-    on their ratio alone, smoothly: it is evaluated at nodes of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z,
-    when they are first needed, and polynomials give what is between. Singularities of the
-    likelihood lie π/2 off the real axis, so that these are as good as rounding.
+    With acceleration and measurement noise only, all but a scale depends smoothly on their ratio.
+    So -ln p is computed on demand at nodes of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z, and interpolated
+    with polynomials. Singularities of the likelihood are π/2 from the real axis, so the
+    interpolation error is at the level of rounding.
 
     Parameters
     ----------
     axis_positions : sequence of Positions
-        With one choice of the legs.
+        With one time offset.
     weight : ndarray, shape (m,)
     sigma_z_m : float
-        About what it will be: what is as good as known or unknown at a start scales with it.
+        Approximate value; the limits for a known or unknown initial state scale with it.
     rough : bool
-        Whether the maximum only needs to be near.
+        True if an approximate maximum is enough.
     """
 
     def __init__(
@@ -127,13 +128,13 @@ class Likelihood:
 
         @cache
         def values(ratio_index: int, z_index: int) -> Array:
-            """At the nodes about one place, from the first ones on."""
+            """Return -ln p at all nodes from the first ones on."""
             return np.array([row(ratio_index + node, z_index) for node in range(nodes)])
 
         self._values = values
 
     def __call__(self, noises: Noises) -> float:
-        """-ln p with some noises."""
+        """Return -ln p for some noises."""
         if noises.walk_m or noises.slow_m or not self.tabulated:
             return negative_log_likelihood(self.axis_positions, noises, self.weight)
         ln_z = log(noises.sigma_z_m) / self.step
@@ -152,7 +153,7 @@ def _barycentric_signs(count: int) -> Array:
 
 
 def _interpolation_weights(position: float, count: int) -> Array:
-    """Weights of values at 0, 1, ... for the polynomial through them (Berrut, Trefethen 2004)."""
+    """Return barycentric weights of values at 0, 1, ... (Berrut and Trefethen 2004)."""
     distances = position - np.arange(count)
     if not distances.all():
         return np.asarray(distances == 0.0, dtype=np.float64)
@@ -167,16 +168,16 @@ def fit_ratios(
     weight: Array,
     sigma_z_m: float,
 ) -> list[FittedPositions]:
-    """Fit with noises over SIGMA_Z; what is fixed is taken at a SIGMA_Z.
+    """Fit positions for some ratios SIGMA_A / SIGMA_Z; fixed noises are scaled by SIGMA_Z.
 
     Parameters
     ----------
     blocks : iterable of Positions
-        The same ones at other clock offsets.
+        The same positions with different time offsets.
     ratios : sequence of float
         SIGMA_A / SIGMA_Z, 1/s².
     walk : float
-        Walk of the source over SIGMA_Z.
+        Random walk of the source / SIGMA_Z.
     weight : ndarray, shape (m,)
     sigma_z_m : float
     """
@@ -194,7 +195,7 @@ def fit_ratios(
 
 
 def fit_noises(blocks: Iterable[Positions], noises: Noises, weight: Array) -> FittedPositions:
-    """Fit with some noises and weights."""
+    """Fit positions with given noises and weights."""
     sigma = noises.sigma_z_m
     ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
     if noises.slow_m:
@@ -205,7 +206,7 @@ def fit_noises(blocks: Iterable[Positions], noises: Noises, weight: Array) -> Fi
 def negative_log_likelihood(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> float:
-    """-ln p of the measurements of all parts but for a constant."""
+    """Return -ln p of the measurements of all axes, without a constant."""
     return float(
         sum(fit_noises([positions], noises, weight).totals()[0, 0] for positions in axis_positions)
     )
@@ -213,20 +214,20 @@ def negative_log_likelihood(
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """Noises of greatest likelihood.
+    """Maximum-likelihood noises with the weights of the measurements.
 
     Attributes
     ----------
     noises : Noises
     weight : ndarray, shape (m,)
-        What each measurement counts: 1 for a good one, 1/width² for an outlier.
+        Weight of each measurement: 1 for a good one, 1/width² for an outlier.
     outlier_probability : ndarray, shape (m,)
-        Probability that it is one.
+        Probability that the measurement is an outlier.
     score : Likelihood
         With these weights.
     widening : float
-        How much larger the variance of ln SIGMA_Z is than the score's bend says, since outliers,
-        their share and their width are themselves found.
+        Factor on the variance of ln SIGMA_Z from the curvature: outliers, their share and their
+        width are estimated, too.
     """
 
     noises: Noises
@@ -237,7 +238,7 @@ class NoiseFit:
 
 
 def filter_positions(intervals: Preintegrated) -> Positions:
-    """The lesson's filter of one axis: its constants are the errors of its start, with P₀."""
+    """Return KF along one axis as positions: its constants are the errors of the initial state."""
     count = len(intervals.measurement_m)
     initial = np.zeros((count + 1, 2))
     initial[0] = KNOWN_START_PRECISION
@@ -246,7 +247,7 @@ def filter_positions(intervals: Preintegrated) -> Positions:
     ]
     dp, dv = np.zeros((2, 1, 1, 3, count))
     dp[0, 0, 0], dv[0, 0, 0] = intervals.delta_position_m, intervals.delta_velocity_m_s
-    # an error of the start moves the first leg
+    # an error of the initial state affects the first interval
     dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, intervals.length_s[0]), 1.0
     return centre_on_path(
         Positions(
@@ -266,18 +267,18 @@ def filter_positions(intervals: Preintegrated) -> Positions:
 def maximise_likelihood(
     axis_positions: Sequence[Positions], start: Noises, weight: Array, outliers: bool = True
 ) -> NoiseFit:
-    """Fit the noises, and find the outliers.
+    """Estimate the noises and, if requested, the outliers.
 
     Parameters
     ----------
     axis_positions : sequence of Positions
         With the same measurements.
     start : Noises
-        To start with. A walk and a slow error are fitted where they are not zero.
+        Initial values. Random walk and time-correlated noise are fitted if not zero.
     weight : ndarray, shape (m,)
-        Of each measurement to start with.
+        Initial weight of each measurement.
     outliers : bool
-        Whether they are sought; else the weights stay.
+        True to estimate the outliers; else the weights are kept.
     """
     outlier_probability = np.zeros_like(weight)
     share, width, noises = FIRST_SHARE, FIRST_WIDTH, start
@@ -285,9 +286,11 @@ def maximise_likelihood(
         likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, rough=True)
         noises = _maximise(likelihood, noises, ROUGH_MAX_STEPS if pass_index else MAX_STEPS)
         square, count = _squares(axis_positions, noises, weight)
-        # outliers raise the noise that hides them: the median does not follow them
+        # outliers increase the noise estimate and hide; the median is robust against them
         median_square = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
-        if median_square > SIGMA_Z_SEARCH_M[1] ** 2:  # noise beyond the search is not outliers
+        if (
+            median_square > SIGMA_Z_SEARCH_M[1] ** 2
+        ):  # noise beyond the search range is not due to outliers
             break
         variance = min(noises.sigma_z_m**2, MAX_SIGMA_RATIO**2 * median_square)
         probability = _outlier_probability(square / variance, count, share, width)
@@ -320,7 +323,7 @@ def maximise_likelihood(
 def _squares(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> tuple[Array, Array]:
-    """:func:`expected_squares` of all parts together, at the most likely constants."""
+    """Return :func:`expected_squares` summed over axes, with maximum-likelihood constants."""
     results = []
     for positions in axis_positions:
         constants = fit_noises([positions], noises, weight).constants()[:, 0]
@@ -340,22 +343,21 @@ def _outlier_probability(square: Array, count: Array, share: float, width: float
 def outlier_variance_factor(
     square: Array, count: Array, outlier_probability: Array, width: float
 ) -> float:
-    """Variance of ln σ over that with known outliers, at the maximum of the likelihood.
+    """Return the ratio of the variance of ln σ to that with known outliers.
 
-    The information of the data is that of the complete data, in which each measurement is known to
-    be an outlier or not, less what is missing: the covariance of the score over what it may be
+    The information of the data is that of the complete data (each measurement known as outlier or
+    not) minus the missing information: the covariance of the score over the possible assignments
     (Louis 1982). Parameters are ln σ, ln width and the log odds of the share.
 
     Parameters
     ----------
     square : ndarray, shape (m,)
-        Of each measurement's error over σ², summed over its axes.
+        Squared error of each measurement / σ², summed over its axes.
     count : ndarray, shape (m,)
-        Axes.
+        Number of axes.
     outlier_probability : ndarray, shape (m,)
-        Probability that it is one.
     width : float
-        Outliers' σ over σ.
+        Outliers' σ / σ.
     """
     share = float(np.mean(outlier_probability))
     sigma_information, outlier_information = (
@@ -379,9 +381,8 @@ def outlier_variance_factor(
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = complete_information - missing_information
-    if (
-        np.linalg.eigvalsh(observed_information)[0] <= 0.0
-    ):  # hardly any outlier: what they are adds nothing
+    # with hardly any outlier, their estimation adds no uncertainty
+    if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
     return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))
 
@@ -392,10 +393,12 @@ def _maximise(likelihood: Likelihood, start: Noises, max_steps: int = MAX_STEPS)
     count = len(likelihood.weight)
 
     def score(logs: Array) -> float:
-        # of each measurement: the first step is as long as the slope, at most 1
+        # per measurement, so that the first step of L-BFGS-B is at most about 1
         try:
             return likelihood(to_noises(logs)) / count
-        except np.linalg.LinAlgError:  # so far from the data that rounding is all: the step is cut
+        except (
+            np.linalg.LinAlgError
+        ):  # far from the maximum, rounding dominates: the line search shortens the step
             return UNCOMPUTABLE_SCORE
 
     def to_noises(logs: Array) -> Noises:

@@ -1,12 +1,11 @@
-"""How the frame of the positions is turned against the vehicle's heading, over the flight.
+"""Misalignment of the positions' frame against the logged heading, over the flight.
 
-A magnetometer indoors may turn EKF2's heading by tens of degrees within one flight, so that one
-number for the whole flight would be wrong at every moment. Where the source carries an orientation
-of its own, the two headings are compared at its samples. Otherwise the positions are filtered
-along north and east together, with the acceleration of the IMU turned by the logged attitude, and
-the turn is a state that may walk: state [p, v, b, η], b what the acceleration is off by in NED
-(m/s²) and η the turn (rad) beyond the one about which the rotation is taken to first order.
-Whether it walks is told by the likelihood ratio.
+Indoors a magnetometer may rotate EKF2's heading by tens of degrees within one flight, so one angle
+for the flight is not enough. If the source has an orientation, both headings are compared.
+Otherwise the positions are filtered along north and east together, with the IMU acceleration
+rotated by the logged attitude. The state is [p, v, b, η]: b the acceleration error in NED (m/s²), η
+the rotation (rad) beyond the angle of linearisation, which may be a random walk. A likelihood ratio
+test decides if it is.
 """
 
 from itertools import product
@@ -27,38 +26,38 @@ from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.record import NotNegative, Record, Share
 
+# s; averaging time of the parts
 PART_LENGTH_S = 2.0
 MIN_PARTS = 3
 MIN_MEASUREMENTS = 50
 MIN_PART_SAMPLES = 3
-# More say nothing new about a heading, but cost time
+# More measurements hardly improve the heading and take time
 MAX_MEASUREMENTS = 1000
-# Parts further apart than chance would put them
+# p value and range (°) from which the heading error changes significantly
 MAX_DRIFT_P = 0.002
 MIN_DRIFT_DEG = 5.5
-# Turning faster, a late stamp looks like a wrong heading: 0.2 s of it are 2°
+# At higher yaw rates a late timestamp looks like a heading error: 0.2 s are 2°
 MAX_TURN_RATE_DEG_S = 10.0
-# What two headings differ by that agree: mounting, vibration, rounding
+# Smallest σ of a heading difference: mounting, vibration, rounding
 MIN_SIGMA_DEG = 0.5
 MAX_ATTITUDE_INTERVAL_S = 0.11
 LINEARISATIONS = 3
-# About a turn so near the last run is as good as about the right one
+# Change of the linearisation angle below which the iteration stops
 SMALL_TURN_RAD = 0.01
 STATE_COUNT = 7
-TURN = 6
+TURN = 6  # index of the rotation in the state
 ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])
-# Of the start: position (m), velocity (m/s), acceleration's error (m/s²) and turn (rad)
+# Initial σ: position (m), velocity (m/s), acceleration error (m/s²) and rotation (rad)
 INITIAL_SIGMAS = np.repeat([INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, 0.3, 0.6], [2, 2, 2, 1])
-GAP_SIGMA = 5.0  # m and m/s, over a gap of the IMU
-# Walks over one second: of the turn (rad; none first), of the acceleration's error (m/s²), and
-# SIGMA_A (m/s²)
+GAP_SIGMA = 5.0  # m and m/s; process noise in a gap of the IMU
+# Grid: random walks in 1 s of rotation (rad) and acceleration error (m/s²), and SIGMA_A (m/s²)
 TURN_WALKS = np.radians([0.0, 0.3, 1.0, 3.0])
 BIAS_WALKS = np.array([0.003, 0.03])
 SIGMA_A_GRID = np.array([0.03, 0.1, 0.3, 1.0])
 
 
 class HeadingPart(Record, frozen=True):
-    """Turn of one part of the flight: start and end (s), turn and its standard deviation."""
+    """Heading error of one part of the flight: start and end (s), angle and its σ (°)."""
 
     start_s: float
     end_s: float
@@ -67,23 +66,22 @@ class HeadingPart(Record, frozen=True):
 
 
 class HeadingError(Record, frozen=True):
-    """By how much the source's frame is turned against the logged attitude, over the flight.
+    """Misalignment of the source's frame in yaw against the logged attitude, over the flight.
 
     Attributes
     ----------
     turn_deg : float
         Mean over the flight.
     sigma_deg : float
-        Standard deviation of the mean: what the parts have in common is not averaged out.
+        Standard deviation of the mean; not reduced by averaging, as errors are common to all parts.
     drifts : bool
-        Whether the turn changes beyond chance, and by enough to matter.
+        True if the angle changes significantly and by at least ``MIN_DRIFT_DEG``.
     parts : tuple of HeadingPart
-        Consecutive, clockwise seen from above; what the frame and the attitude have in common all
-        along is in each.
+        Consecutive parts; angles clockwise from above, including the constant misalignment.
     drift_p : float
-        p-value of "it is the same throughout".
+        p-value of a constant angle.
     by : {"orientation", "positions"}
-        What it was found with.
+        Data from which the angle is estimated.
     """
 
     turn_deg: float
@@ -97,7 +95,7 @@ class HeadingError(Record, frozen=True):
 
     @property
     def ends(self) -> tuple[HeadingPart, HeadingPart]:
-        """The parts of the least and of the greatest turn, the earlier one first."""
+        """Parts with the smallest and the largest angle, in time order."""
         turns_deg = [heading_part.heading_error_deg for heading_part in self.parts]
         first_index, last_index = sorted((int(np.argmin(turns_deg)), int(np.argmax(turns_deg))))
         return self.parts[first_index], self.parts[last_index]
@@ -106,7 +104,7 @@ class HeadingError(Record, frozen=True):
 def combine_heading_parts(
     parts: tuple[HeadingPart, ...], drift_p: float, by: Literal["orientation", "positions"]
 ) -> HeadingError:
-    """What the parts of a flight say together."""
+    """Combine the parts of a flight into one result."""
     turns_deg = [heading_part.heading_error_deg for heading_part in parts]
     return HeadingError(
         turn_deg=float(np.mean(turns_deg)),
@@ -126,7 +124,7 @@ def estimate_heading_error(
     sigma_z_m: float,
     offset_s: float = 0.0,
 ) -> HeadingError | Unavailable:
-    """Estimate the turn of the source's frame against the logged attitude over the flight.
+    """Estimate the source frame's misalignment in yaw against the logged attitude.
 
     Parameters
     ----------
@@ -134,20 +132,22 @@ def estimate_heading_error(
     track : PositionTrack
     segment : Segment
     settings : Settings
-        ``dt_s`` gives SIGMA_A its meaning.
+        Its ``dt_s`` defines the unit of SIGMA_A.
     sigma_z_m : float
         Noise of the positions.
     offset_s : float
-        To be added to the track's stamps.
+        Added to the timestamps of the track.
 
     Returns
     -------
-    HeadingError, or Unavailable where there is no attitude, or too few measurements or IMU samples.
+    HeadingError, or Unavailable without attitude or with too few measurements or IMU samples.
     """
     if isinstance(flight.attitude, Unavailable):
         return flight.attitude
     if np.median(np.diff(flight.attitude.index.to_numpy())) > MAX_ATTITUDE_INTERVAL_S:
-        return Unavailable("heading error", "the attitude is too slow", "Log it at 10 Hz or more.")
+        return Unavailable(
+            "heading error", "the attitude rate is too low", "Log it at 10 Hz or more."
+        )
     by_orientation = None
     if track.orientation is not None:
         by_orientation = _compare_orientations(
@@ -178,13 +178,13 @@ def estimate_heading_error(
         )
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     result = _estimate_from_positions(acceleration, samples, settings.dt_s, sigma_z_m)
-    # how the source's own axes lie in the vehicle is not known, but that they do not turn is
+    # the mounting angle of the source is unknown but constant, so the orientations exclude a change
     return result if by_orientation is None else structs.replace(result, drift_p=1.0, drifts=False)
 
 
 def _mean_per_part(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart, ...]:
-    """Means over parts of equal length, in degrees."""
-    # of a long flight only some measurements were taken
+    """Return means over parts of equal length, in degrees."""
+    # long flights are downsampled, which limits the number of parts
     count = max(
         int(min((time[-1] - time[0]) / PART_LENGTH_S, len(time) / (2 * MIN_PART_SAMPLES))), 1
     )
@@ -203,7 +203,7 @@ def _mean_per_part(time: Array, turn: Array, sigma: Array) -> tuple[HeadingPart,
 
 
 def heading_rad(quaternions: pd.DataFrame) -> Array:
-    """Heading of attitudes, clockwise seen from above, without steps of a whole turn."""
+    """Return the heading of attitudes (rad, clockwise from above), unwrapped."""
     values = quaternions[Columns.QUATERNION].to_numpy(copy=True)
     angles: Array = Rotation.from_quat(values, scalar_first=True).as_euler("ZYX")[:, 0]
     return np.unwrap(angles)
@@ -212,7 +212,7 @@ def heading_rad(quaternions: pd.DataFrame) -> Array:
 def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
-    """The source's heading minus the attitude's, while the vehicle hardly turns."""
+    """Return the source's heading minus the attitude's, at low yaw rates; None if too few."""
     samples = within(orientation, segment)
     time = samples.index.to_numpy() + offset_s
     attitude_s = attitude.index.to_numpy()
@@ -227,7 +227,7 @@ def _compare_orientations(
     if np.count_nonzero(is_calm) < MIN_PARTS * MIN_PART_SAMPLES:
         return None
     time, turn = time[is_calm], turn[is_calm]
-    # what two neighbours differ by is noise; it does not shrink with their number
+    # differences of neighbours give the noise; it is not reduced by averaging
     noise = 1.4826 * np.median(np.abs(np.diff(turn))) / np.sqrt(2.0)
     sigma = np.full(len(time), max(float(noise), np.radians(MIN_SIGMA_DEG)))
     heading_parts = _mean_per_part(time, turn, sigma)
@@ -243,10 +243,10 @@ def _compare_orientations(
 def _estimate_from_positions(
     acceleration: pd.DataFrame, samples: pd.DataFrame, dt_s: float, sigma_z: float
 ) -> HeadingError:
-    """The turn as a state that may walk, by the most likely of some walks and noises."""
+    """Estimate the rotation as a state that may be a random walk, over a grid of noises."""
     time, measured_m = samples.index.to_numpy(), samples.to_numpy()
     interval_inputs = _interval_inputs(acceleration, time)
-    # of an acceleration that SIGMA_A is over one DT, the walk over a second
+    # √DT converts SIGMA_A, a σ over one DT, to a random walk in 1 s
     grid = np.array(list(product(TURN_WALKS, BIAS_WALKS, SIGMA_A_GRID * np.sqrt(dt_s))))
     has_no_walk = grid[:, 0] == 0.0
     turn = 0.0
@@ -263,17 +263,14 @@ def _estimate_from_positions(
     best_index = int(np.argmax(log_p))
     ratio = 2.0 * (log_p[best_index] - log_p[has_no_walk].max())
     smoothed, variance = _smooth_turn(steps, best_index)
-    # at the end of its range a walk is half of the time none
+    # one-sided test: the random walk cannot be negative
     p_value = 0.5 * float(chdtrc(1, ratio)) if ratio > 0.0 else 1.0
     sigma = np.sqrt(scale[best_index] * np.maximum(variance, 0.0))
     return combine_heading_parts(_mean_per_part(time, turn + smoothed, sigma), p_value, "positions")
 
 
 def _interval_inputs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Array, Array]:
-    """What the acceleration adds between measurements; how long that is; whether the IMU was there.
-
-    The first has shape (n, 4): north and east of position (m), then of velocity (m/s).
-    """
+    """Return Δp (m) and Δv (m/s) north and east, (n, 4), interval lengths (s) and IMU gaps."""
     imu_s, acceleration_m_s2 = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
     velocity = cumulative_integral(acceleration_m_s2, imu_s)
     integrals = np.hstack([velocity, cumulative_integral(velocity, imu_s)])
@@ -286,7 +283,7 @@ def _interval_inputs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Ar
 
 
 def _transitions(increments: Array, dt_s: Array, turn: float) -> tuple[Array, Array]:
-    """F and the input of every leg, the rotation to first order about ``turn``."""
+    """Return F and the input of every interval, linearised about the rotation ``turn``."""
     count, dt = len(dt_s), dt_s[:, None, None]
     cosine, sine = np.cos(turn), np.sin(turn)
     rotation = np.array([[cosine, -sine], [sine, cosine]])
@@ -302,11 +299,11 @@ def _transitions(increments: Array, dt_s: Array, turn: float) -> tuple[Array, Ar
 
 
 def _process_noise(dt_s: Array, gap: Array, noises: Array) -> Array:
-    """Q of every leg for each of k settings, shape (n, k, 7, 7)."""
+    """Return Q of every interval for each of k settings, shape (n, k, 7, 7)."""
     position, velocity, bias = (slice(axis, axis + 2) for axis in (0, 2, 4))
     identity, count = np.eye(2), len(noises)
     sigma_a_block = (noises[:, 2] ** 2)[:, None, None] * identity
-    # of each: what is added for one of q00, q01, q11, a second and a gap
+    # Q per unit of q00, q01, q11, per second and per gap
     unit_00, unit_01, unit_11, unit_second, unit_gap = unit_noises = np.zeros(
         (5, count, STATE_COUNT, STATE_COUNT)
     )
@@ -320,7 +317,7 @@ def _process_noise(dt_s: Array, gap: Array, noises: Array) -> Array:
 
 
 class _FilterStep(NamedTuple):
-    """F of one leg, and the states and covariances of k filters before and after their update."""
+    """F of one interval, and states and covariances of k filters before and after the update."""
 
     F: Array
     x_prior: Array
@@ -336,9 +333,9 @@ def _run_filters(
     noises: Array,
     sigma_z: float,
 ) -> tuple[Array, Array, list[_FilterStep]]:
-    """Ln p of k filters with the best scale of all noises, that of the variances, and all steps.
+    """Return ln p of k filters with the best common scale, its square, and all steps.
 
-    The first step is the start.
+    The first step is the initial state.
     """
     increments, length_s, has_gap = interval_inputs
     count = len(noises)
@@ -354,7 +351,7 @@ def _run_filters(
     ):
         x_prior, P_prior = x @ F.T + input_step, F @ P @ F.T + Q
         S = P_prior[:, :2, :2] + R
-        # S⁻¹ of two rows and columns, written out
+        # closed form of the 2 × 2 inverse of S
         determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
         inverse = S[:, ::-1, ::-1] * ADJUGATE_SIGNS / determinant[:, None, None]
         K = np.swapaxes(P_prior[:, :2, :], 1, 2) @ inverse
@@ -371,7 +368,7 @@ def _run_filters(
 
 
 def _smooth_turn(steps: list[_FilterStep], filter_index: int) -> tuple[Array, Array]:
-    """Turn at every measurement by all of them, and its variance (Rauch et al. 1965)."""
+    """Smooth the rotation over all measurements; return it with its variance (RTS, 1965)."""
     state, covariance = steps[-1].x[filter_index], steps[-1].P[filter_index]
     turns = [(state[TURN], covariance[TURN, TURN])]
     for step, next_step in zip(steps[-2::-1], steps[:0:-1], strict=True):

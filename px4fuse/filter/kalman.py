@@ -1,4 +1,4 @@
-"""The two-state Kalman filter of the lesson, with filterpy.
+"""KF: the lesson's two-state Kalman filter, computed with filterpy.
 
 State x = [position, velocity] along one axis; the input u is the acceleration over the step::
 
@@ -6,8 +6,8 @@ State x = [position, velocity] along one axis; the input u is the acceleration o
     update     y = z - Hx         S = HPHᵀ + R      K = PHᵀS⁻¹
                x = x + Ky         P = (I - KH)P
 
-F, B, Q and H stand in :mod:`px4fuse.filter.model`, the steps in :mod:`px4fuse.filter.steps`. What
-is run many times in this folder (likelihoods, ``quick``) has its own recursion, the same to 1e-9.
+F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the steps in :mod:`px4fuse.filter.steps`.
+``quick`` and the likelihoods, which run many times, have faster recursions, equal to 1e-9.
 """
 
 from collections.abc import Sequence
@@ -39,23 +39,23 @@ UPDATE_COLUMNS = [
 
 @dataclass(frozen=True)
 class Replay:
-    """The filter's run over one axis.
+    """Run of KF along one axis.
 
     Attributes
     ----------
     axis : Axis
     settings : Settings
     steps : DataFrame, shape (n, 7)
-        After each predict, and its update where there was one: ``position_m, velocity_m_s,
+        After each prediction and its update, if any: ``position_m, velocity_m_s,
         position_variance_m2, covariance_m2_s, velocity_variance_m2_s2``, and of the step that
-        *starts* there (0 at the last) its input ``acceleration_m_s2`` and
-        ``input_variance_m2_s4``, added to SIGMA_A² where the IMU has a gap.
+        *starts* there (0 at the last) the input ``acceleration_m_s2`` and
+        ``input_variance_m2_s4``, added to SIGMA_A² in gaps of the IMU.
     updates : DataFrame, shape (m, 8)
         At each measurement after the first: ``measurement_m, innovation_m`` (z - Hx, prior),
         ``innovation_variance_m2`` (HPHᵀ + R), ``gain_position`` (1), ``gain_velocity`` (1/s), and
         ``prior_position_m``, ``prior_position_variance_m2``, ``prior_velocity_variance_m2_s2``.
     input_gap_s : float
-        Seconds without IMU inside the replay, where Q was raised by the input's mean square.
+        Time without IMU data (s), in which Q is increased by the input's mean square.
     """
 
     axis: Axis
@@ -68,14 +68,14 @@ class Replay:
 
 
 def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Replay:
-    """Run the filter over one axis.
+    """Run KF along one axis.
 
     Parameters
     ----------
     axis : Axis
     settings : Settings
     initial : InitialState, optional
-        By default the first measurement, at rest; that measurement is then not fused again.
+        Default: first measurement, at rest; that measurement is not fused again.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    # scipy.stats, which filterpy imports, costs a third of a second: not where nothing is replayed
+    # late import: filterpy imports scipy.stats, which takes 0.3 s
     from filterpy.kalman import KalmanFilter  # noqa: PLC0415
 
     line = make_timeline(axis, settings, initial)
@@ -124,7 +124,7 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
 def as_replay(
     axis: Axis, settings: Settings, line: Timeline, states: Sequence[Row], updates: Sequence[Row]
 ) -> Replay:
-    """A replay of its rows: state and covariance after each step, and what each update was."""
+    """Build a replay from its rows: state and covariance per step, and the updates."""
     times = line.time_s, line.time_s[line.measurement >= 0]
     time, update_index = (pd.Index(update_time_s, name="time_s") for update_time_s in times)
     steps = pd.DataFrame(states, index=time, columns=model.STATES + model.COVARIANCES)
@@ -136,22 +136,22 @@ def as_replay(
 
 
 def _state_row(x: Array, P: Array) -> Row:
-    """State and covariance as a row of ``Replay.steps``."""
+    """Return state and covariance as a row of ``Replay.steps``."""
     return x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]
 
 
 def _step_before(run: Replay, times: Array) -> tuple[IntArray, Array, BoolArray]:
-    """The step before each time, how long ago it was (s), and whether the time is outside."""
+    """Return the index of the step before each time, the time since (s), and if it is outside."""
     edges = run.steps.index.to_numpy()
     step_index = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)
     return step_index, times - edges[step_index], (times < edges[0]) | (times > edges[-1])
 
 
 def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
-    """Position (m) and velocity (m/s) at other times, predicted from the step before each.
+    """Return position (m) and velocity (m/s) at other times, predicted from the step before.
 
-    Nothing later than the time itself is used: interpolating between two steps would let a
-    measurement act before it arrived. NaN outside the replay.
+    Nothing later than the time is used: interpolation between two steps would use a measurement
+    before it is received. NaN outside the replay.
     """
     index, elapsed_s, outside = _step_before(run, times)
     position, velocity, acceleration = (
@@ -162,7 +162,7 @@ def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
 
 
 def variance_at(run: Replay, times: Array) -> tuple[Array, Array]:
-    """Variances (m², m²/s²) that belong to :func:`state_at`: P = FPFᵀ + Q from the step before."""
+    """Return the variances (m², m²/s²) of :func:`state_at`: FPFᵀ + Q from the step before."""
     index, elapsed_s, outside = _step_before(run, times)
     p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[index].T
     extra = run.steps["input_variance_m2_s4"].to_numpy()[index]

@@ -1,8 +1,8 @@
-"""The same filter as :mod:`px4fuse.filter.kalman` over whole grids of settings at once.
+"""KF as in :mod:`px4fuse.filter.kalman`, for whole grids of settings at once.
 
-Between two position measurements nothing else enters the filter, so the input is preintegrated
-once: one step per measurement instead of one per DT, with every setting an array element.
-Agrees with the filterpy replay to 1e-9 for SIGMA_A and SIGMA_Z from 1e-3.
+No other data enter the filter between two position measurements, so the input is preintegrated:
+one step per measurement instead of one per DT, with an array element for every setting. Agrees with
+the filterpy replay to 1e-9 for SIGMA_A and SIGMA_Z from 1e-3.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, make_timeline
 
-# Half of the 95 % point of chi-square: the drop of log-likelihood that bounds an interval
+# nats; drop of the log-likelihood at the ends of a 95 % interval: half the 95 % point of χ²
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
-# ln σ at which the end of an interval is sought first
+# Distance in ln σ at which the search for the end of an interval starts
 FIRST_LOG_DISTANCE = 0.05
-# Step of ln σ for bends; of those, how far a parabola is followed at once, and how often
+# Step in ln σ for second differences; limits of a parabola's steps per iteration, and of iterations
 CURVATURE_STEP = 0.05
 MAX_PARABOLA_STEPS, MAX_PARABOLAS = 6.0, 4
 
 
 @dataclass(frozen=True)
 class Preintegrated:
-    """The input between consecutive measurements, each of shape (m,).
+    """Input integrated between consecutive measurements; arrays of shape (m,).
 
     Attributes
     ----------
     length_s : ndarray
     delta_position_m, delta_velocity_m_s : ndarray
-        What the acceleration alone adds to position and velocity.
+        Δp (m) and Δv (m/s) due to the acceleration.
     noise_unit : ndarray, shape (m, 3)
-        Q's elements 00, 01, 11 for SIGMA_A = 1 m/s².
+        Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s².
     noise_fixed : ndarray, shape (m, 3)
-        What IMU gaps add to them, whatever SIGMA_A is.
+        Additional Q in gaps of the IMU, independent of SIGMA_A.
     measurement_m : ndarray
     initial : InitialState
     """
@@ -65,13 +65,13 @@ class Preintegrated:
     initial: InitialState
 
     def first(self, count: int) -> Preintegrated:
-        """The first measurements only."""
+        """Return the first ``count`` measurements only."""
         arrays = {name: values[:count] for name, values in vars(self).items() if name != "initial"}
         return replace(self, **arrays)
 
 
 def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
-    """Preintegrate the input of one axis on the steps that the replay takes.
+    """Integrate the input of one axis over the prediction steps of the replay.
 
     Raises
     ------
@@ -103,13 +103,13 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
 
 
 def integrate_acceleration(line: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
-    """What an acceleration adds to position (m) and velocity (m/s) between the measurements.
+    """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements.
 
     Parameters
     ----------
     line : Timeline
     acceleration_m_s2 : ndarray, shape (n - 1,)
-        Over each of its steps.
+        Acceleration of each step.
 
     Returns
     -------
@@ -122,14 +122,14 @@ def integrate_acceleration(line: Timeline, acceleration_m_s2: Array) -> tuple[Ar
         zero_state,
         remaining_s,
     )
-    # numpy's stubs call the sums of weights integers
+    # numpy's stubs declare weighted bincounts as integers
     return np.asarray(np.bincount(interval_index, dp), float), np.asarray(
         np.bincount(interval_index, dv), float
     )
 
 
 def _interval_index(line: Timeline) -> tuple[IntArray, IntArray, Array]:
-    """Last step of each leg; of each step its leg, and the time from its end to the leg's."""
+    """Return each interval's last step, each step's interval, and the time to its end (s)."""
     end_steps = np.flatnonzero(line.measurement >= 0)
     interval_index = np.searchsorted(end_steps, np.arange(1, len(line.time_s)))
     return end_steps, interval_index, line.time_s[end_steps[interval_index]] - line.time_s[1:]
@@ -141,7 +141,7 @@ def innovations(
     sigma_z_m: ArrayLike,
     skip: BoolArray | None = None,
 ) -> tuple[Array, Array]:
-    """Innovations and their variances for every combination of settings.
+    """Compute innovations and their variances for every combination of settings.
 
     Parameters
     ----------
@@ -149,12 +149,12 @@ def innovations(
     sigma_a_m_s2, sigma_z_m : array_like
         Broadcast against each other to a grid of shape (...).
     skip : ndarray of bool, shape (m,), optional
-        Measurements that are compared but not fused.
+        Measurements with an innovation but without an update.
 
     Returns
     -------
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
-        Of k signals through one filter of shape (m, k) and (m,).
+        For k signals through one filter: shapes (m, k) and (m,).
     """
     steps = run_filter(intervals, sigma_a_m_s2, sigma_z_m, skip)
     nu, s = zip(*(step[:2] for step in steps), strict=True)
@@ -163,7 +163,7 @@ def innovations(
 
 @dataclass(frozen=True)
 class FilterStates:
-    """The filter just after each measurement, each of shape (m, ...) for a grid of settings."""
+    """KF after each measurement; arrays of shape (m, ...) for a grid of settings."""
 
     gain: Array
     velocity_m_s: Array
@@ -175,7 +175,7 @@ class FilterStates:
 def filter_states(
     intervals: Preintegrated, sigma_a_m_s2: ArrayLike, sigma_z_m: ArrayLike
 ) -> FilterStates:
-    """Gain, velocity and standard deviations for every combination of settings.
+    """Compute gain, velocity, reported σ and NIS for every combination of settings.
 
     Parameters
     ----------
@@ -197,9 +197,9 @@ def run_filter(
     skip: BoolArray | None,
     weight: Array | None = None,
 ) -> Iterator[tuple[Array, Array, Array, Array, Array, Symmetric[Array]]]:
-    """Run the filter over a grid of settings, measurement by measurement.
+    """Run KF over a grid of settings, measurement by measurement.
 
-    The filter is linear in what drives it: with Δp, Δv and measurements of shape (m, k) and one
+    The filter is linear: with Δp, Δv and measurements of shape (m, k) and one
     pair of settings, k signals run through one filter at once.
 
     Parameters
@@ -208,19 +208,19 @@ def run_filter(
     sigma_a_m_s2, sigma_z_m : array_like
         Broadcast against each other to a grid of shape (...).
     skip : ndarray of bool, shape (m,), or None
-        Measurements that are compared but not fused.
+        Measurements with an innovation but without an update.
     weight : ndarray, shape (m,), optional
-        What each measurement counts: its variance is SIGMA_Z² over that.
+        Weight of each measurement: its variance is SIGMA_Z² / weight.
 
     Yields
     ------
     tuple
-        ν (m), S (m²), gain, and after the update position (m), velocity (m/s) and covariance by
-        its elements 00, 01, 11: each of shape (...), and a plain float where that is ().
+        ν (m), S (m²), gain, and after the update position (m), velocity (m/s) and covariance
+        elements 00, 01, 11. Each has the grid's shape, or is a float for a single setting.
     """
     squares = (np.square(np.asarray(sigma, float)) for sigma in (sigma_a_m_s2, sigma_z_m))
     q, r = np.broadcast_arrays(*squares)
-    if not q.ndim:  # in plain floats: fifty times as fast as arrays of a single element
+    if not q.ndim:  # floats are fifty times faster than arrays of a single element
         q, r = q.item(), r.item()
     p, v = (
         intervals.initial.position_m,
@@ -254,14 +254,14 @@ def run_filter(
 
 
 def _measurement_rows(values: Array) -> list[Any]:
-    """What the filter takes in turn: numbers, or a row of several signals."""
+    """Return the values per measurement: numbers, or rows of several signals."""
     return values.tolist() if values.ndim == 1 else list(values)
 
 
 def score_grid(
     intervals: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
 ) -> Array:
-    """-ln p of all axes but for a constant, of the shape of the grid of settings.
+    """Compute -ln p of all axes (without a constant) on the grid of settings.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ def score_grid(
     sigma_a_m_s2, sigma_z_m : ndarray
         Broadcast against each other.
     weight : ndarray, shape (m,)
-        What each measurement counts: its variance is SIGMA_Z² over that.
+        Weight of each measurement: its variance is SIGMA_Z² / weight.
     """
     total = np.zeros(np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
     for interval in intervals:
@@ -279,19 +279,19 @@ def score_grid(
 
 
 def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
-    """Vertex of the parabola through three points of a profile.
+    """Return the vertex of the parabola through three points of a profile.
 
     Parameters
     ----------
     profile : ndarray, shape (n,)
-        At equal steps.
+        Values at equal steps.
     index : int
         Index of the middle one, 1 to n - 2.
 
     Returns
     -------
     shift : float
-        From the middle point to the minimum, in steps; 0 where there is none.
+        From the middle point to the minimum, in steps; 0 without a minimum.
     curvature : float
         Second difference, per square step.
     """
@@ -303,14 +303,14 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
 def profile_interval(
     grid: Array, profile: Array, allowed: float = PROFILE_DROP
 ) -> tuple[float | None, float | None]:
-    """Ends of the 95 % interval of a profile likelihood, None where it does not end on the grid.
+    """Return the ends of the 95 % interval of a profile; None for an end outside the grid.
 
     Parameters
     ----------
     grid, profile : ndarray, shape (n,)
-        Values, and the negative log-likelihood at each; between two of them it is a line.
+        Parameter values and their negative log-likelihood, interpolated linearly.
     allowed : float
-        How far above its minimum the interval reaches.
+        Height above the minimum at the ends of the interval.
     """
     drop = profile - profile.min()
     inside_indices = np.flatnonzero(drop <= allowed)
@@ -333,28 +333,27 @@ def profile_ends(
     bounds: tuple[float, float],
     widening: float = 1.0,
 ) -> tuple[float | None, float | None]:
-    """Ends of a parameter's 95 % profile-likelihood interval, None where beyond a bound.
+    """Return the ends of a 95 % profile-likelihood interval; None for an end beyond a bound.
 
     Parameters
     ----------
     score : callable
-        -ln p of ln of the parameter and ln of the other one, which is maximised out where there is
-        one.
+        -ln p as a function of ln of the parameter and ln of the other one, which is maximised out.
     best : (float, float)
-        Where it is least.
+        Logarithms at the minimum.
     bounds : (float, float)
-        Of the parameter itself.
+        Bounds of the parameter (not of its logarithm).
     widening : float
-        Of the variance, by what the score does not hold.
+        Factor on the variance for uncertainty that the score does not contain.
     """
     best_score, root_drop = score(*best), float(np.sqrt(PROFILE_DROP * widening))
 
     def find_end(direction: float, bound: float) -> float | None:
         other_log = best[1]
 
-        @cache  # where the other parameter is sought from depends on the call before
+        @cache  # the search for the other parameter starts at the previous result
         def excess(distance: float) -> float:
-            """How far √(drop), which is nearly a line, lies above that of the interval's end."""
+            """Return √drop minus its value at the interval's end; √drop is nearly linear."""
             nonlocal other_log
             if distance == 0.0:
                 return -root_drop
@@ -381,7 +380,7 @@ def profile_ends(
 
 
 def _minimise_by_parabolas(score: Callable[[float], float], start: float) -> tuple[float, float]:
-    """Least value of a score and where it is, by parabolas from near there."""
+    """Return the minimum of a score and its place, by parabolas from a nearby start."""
     for _ in range(MAX_PARABOLAS):
         profile = np.array([score(start + k * CURVATURE_STEP) for k in (-1.0, 0.0, 1.0)])
         middle = float(profile[1])

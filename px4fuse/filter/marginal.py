@@ -1,14 +1,14 @@
-"""Likelihood of positions along a few axes, with what is constant in each stretch taken out.
+"""Likelihood of positions along a few axes, with the constants of each stretch marginalised.
 
-Given the acceleration, what is known of the states x_k = [p, v] at the measurements is a sum of
-squares: each leg's x_{k+1} - Fx_k - [Δp, Δv] over its Q, and each measurement's z - p over its
-variance. Its matrix A has three bands below the diagonal, so that LAPACK factorises a flight in a
-millisecond; the marginal likelihood of the measurements, which is that of the filter's innovations
-(Schweppe 1965), follows from log|A| and the squares that remain at the minimum. Signals that enter
-linearly (data, or what a bias would add to them) are columns: the factorisation does not depend on
-them. Biases and the like have a prior, and are marginalised by the Schur complement of their
-products. A slow error of the source is a third state, c_{k+1} = ρ c_k + noise, that the measurement
-sees: z - p - c; it begins anew in each stretch.
+Given the acceleration, the information about the states x_k = [p, v] at the measurements is a sum
+of squares: x_{k+1} - Fx_k - [Δp, Δv] of each interval over its Q, and z - p of each measurement
+over its variance. Its matrix A has three bands below the diagonal, so LAPACK factorises a flight in
+a millisecond. The marginal likelihood of the measurements equals that of the filter's innovations
+(Schweppe 1965) and follows from log|A| and the residual squares at the minimum. Signals that enter
+linearly (data, or the effect of a bias) are columns; the factorisation does not depend on them.
+Biases and other constants have a prior and are marginalised by the Schur complement of their
+products. Time-correlated noise of the source is a third state, c_{k+1} = ρ c_k + noise, in the
+measurement: z - p - c. It starts anew in each stretch.
 """
 
 from __future__ import annotations
@@ -24,43 +24,43 @@ from scipy.linalg import lapack
 from px4fuse.arrays import Array, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
-# SIGMA_A and SIGMA_Z of a smooth path
+# SIGMA_A (m/s²) and SIGMA_Z (m) for the smooth path that is subtracted
 PATH_SIGMAS = 0.5, 0.1
-# Precision of a start (1/m²) above which it is known, below which as good as nothing is
+# 1/m²; precision above which the initial position counts as known
 KNOWN_START_PRECISION = 1e-3
-# Position noise of a leg that is always there, over a measurement's and over its own: Q has an
-# inverse, also that of a single step, which is of rank one, or without process noise
+# Minimum position noise of an interval, relative to the measurement noise and to its own Q: makes Q
+# invertible for a single step (rank one) or without process noise
 MIN_NOISE_SHARE = 1e-5
-# Signals whose states are found at once: more take more memory, and no less time
+# Signals per batch: larger batches need more memory and are not faster
 SIGNAL_BATCH_SIZE = 8
-# A determinant below this share of its terms is their rounding
+# Determinants below this share of their terms are rounding errors
 MIN_DETERMINANT_SHARE = 1e-12
 
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions of one source along a few axes, and what moves them.
+    """Positions of one source along a few axes, with the integrated acceleration.
 
     Attributes
     ----------
     measurement_m : ndarray, shape (m, a)
-        NaN where an axis has none.
+        NaN if an axis has no measurement.
     start : ndarray of int, shape (s,)
         First state of each stretch.
     length_s : ndarray, shape (m - 1,)
-        Of the legs between any two measurements, also where a stretch begins.
+        Intervals between successive measurements, also between stretches.
     noise_unit, noise_fixed : ndarray, shape (3, m - 1)
-        Q's elements 00, 01, 11 of each leg for SIGMA_A = 1 m/s², and what is added to them
-        whatever SIGMA_A is.
+        Elements 00, 01, 11 of Q of each interval for SIGMA_A = 1 m/s², and the part that does not
+        depend on SIGMA_A.
     initial : ndarray, shape (m, 2)
-        Precision of what is known of position and velocity beforehand: 0 for nothing.
+        Prior precision of position and velocity; 0 without a prior.
     constant_sigma : ndarray, shape (c,)
-        Prior standard deviations of the constants, which each stretch has for itself.
+        Prior standard deviations of the constants of each stretch.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
-        What the acceleration adds on each leg, and what each constant adds to that, for T clock
-        offsets; any value where a stretch begins.
+        Δp and Δv of each interval, and the effect of each constant on them, for T time offsets;
+        ignored between stretches.
     slow : (float, float) or None
-        Standard deviation (m) and time constant (s) of a slow error of the source.
+        Standard deviation (m) and time constant (s) of the source's time-correlated noise.
     """
 
     measurement_m: Array
@@ -81,19 +81,19 @@ class Positions:
 
     @cached_property
     def joined(self) -> BoolArray:
-        """Which legs lie in a stretch, shape (m - 1,)."""
+        """True for intervals inside a stretch, shape (m - 1,)."""
         return ~np.isin(np.arange(1, len(self.measurement_m)), self.start)
 
     def over(self, sigma_z_m: float, walk: float, weight: Array) -> tuple[Positions, Array]:
-        """The same with all that is random over SIGMA_Z, and the measurements' variances, (m,).
+        """Return positions in units of SIGMA_Z, and the measurement variances, (m,).
 
         Parameters
         ----------
         sigma_z_m : float
         walk : float
-            Random walk of the source over SIGMA_Z, per square root of a second.
+            Random walk of the source / SIGMA_Z, per √s.
         weight : ndarray
-            What each of the last measurements counts; one before is the filter's start.
+            Weight of each of the last measurements; an additional first one is KF's initial state.
         """
         noise_fixed = self.noise_fixed / sigma_z_m**2
         noise_fixed[0] += self.length_s * walk**2
@@ -107,9 +107,9 @@ class Positions:
     def systems(
         self, sigma_a_m_s2: float, variance_m2: Array
     ) -> Iterator[tuple[list[int], BandedSystem, int]]:
-        """Banded systems, each with the axes that it serves, and their degrees of freedom.
+        """Yield banded systems, each with its axes and degrees of freedom.
 
-        An axis that is measured at the same times as another shares its system.
+        Axes that are measured at the same times share a system.
         """
         is_measured = np.isfinite(self.measurement_m)
         noise = sigma_a_m_s2**2 * self.noise_unit + self.noise_fixed
@@ -123,7 +123,7 @@ class Positions:
             ]
             remaining_axes = [axis for axis in remaining_axes if axis not in axes]
             precision = self.initial.copy()
-            # a stretch that this axis hardly measures is held by its start, and says nothing
+            # a stretch with fewer than two measurements gets a prior and has no likelihood
             has_few = np.add.reduceat(is_axis_measured.astype(int), self.start) < 2
             is_used = is_axis_measured & ~np.repeat(
                 has_few, np.diff([*self.start, len(is_measured)])
@@ -134,7 +134,7 @@ class Positions:
                 (precision > self.initial) | (self.initial > KNOWN_START_PRECISION)
             )
             system = factorise(self.length_s, noise, self.joined, precision, self.slow)
-            # where the start is as good as unknown, what is known of it does not count
+            # an initial state that is practically unknown does not count in the likelihood
             log_unknown_precision = float(np.sum(np.log(precision[(precision > 0.0) & ~is_known])))
             system = replace(system, log_determinant=system.log_determinant + log_unknown_precision)
             yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.start)
@@ -142,16 +142,16 @@ class Positions:
 
 @dataclass(frozen=True)
 class FittedPositions:
-    """Positions fitted with one pair of noises, for T clock offsets.
+    """Positions fitted with one pair of noises, for T time offsets.
 
     Attributes
     ----------
     gram : ndarray, shape (s, T, 1 + c, 1 + c)
-        Products of the data and of the constants' signals, under the inverse covariance.
+        Inner products of data and constants' signals, weighted with the inverse covariance.
     log_determinant : float
     freedom : int
-        Measured positions less what the starts take of them: ln of the scale of all noises counts
-        so many times.
+        Measured positions minus those that determine initial states: factor of ln(scale of all
+        noises) in -ln p.
     constant_sigma : ndarray, shape (c,)
     """
 
@@ -161,22 +161,22 @@ class FittedPositions:
     constant_sigma: Array
 
     def scaled(self, sigma: float) -> FittedPositions:
-        """The same with all noises ``sigma`` times as large."""
+        """Return the fit with all noises multiplied by ``sigma``."""
         log_determinant = self.log_determinant + 2.0 * self.freedom * float(np.log(sigma))
         return replace(self, gram=self.gram / sigma**2, log_determinant=log_determinant)
 
     def constants(self) -> Array:
-        """Most likely constants, shape (s, T, c)."""
+        """Return the maximum-likelihood constants, shape (s, T, c)."""
         information = self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0)
         return np.asarray(-np.linalg.solve(information, self.gram[..., 1:, :1])[..., 0])
 
     def by_stretch(self, scales: Array = UNIT_SCALE) -> Array:
-        """-ln p of each stretch but for what the noises alone make, shape (k, s, T).
+        """Return -ln p of each stretch without the noises' determinant, shape (k, s, T).
 
         Parameters
         ----------
         scales : ndarray, shape (k,)
-            By which all noises are multiplied.
+            Factors on all noises.
         """
         gram = self.gram / scales[:, None, None, None, None] ** 2
         sigma = self.constant_sigma
@@ -188,7 +188,7 @@ class FittedPositions:
         return np.asarray(0.5 * (gram[..., 0, 0] - np.sum(cross * solved, axis=-1)) + log_lower)
 
     def totals(self, scales: Array = UNIT_SCALE) -> Array:
-        """-ln p of all with all noises so many times as large, but for a constant, (k, T)."""
+        """Return -ln p of all stretches (without a constant) for scaled noises, shape (k, T)."""
         noises_alone = 0.5 * self.log_determinant + self.freedom * np.log(scales)
         return np.asarray(self.by_stretch(scales).sum(axis=1) + noises_alone[:, None])
 
@@ -203,9 +203,10 @@ def fit_positions(
     positions : Positions
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
-        Of each measurement.
+        Variance of each measurement.
     measured_m : ndarray, shape (a, 1 or T, 1 + c, m), optional
-        Of the data and of each constant, where the positions only say which there are.
+        Signals of the data and of each constant; ``positions`` then only states which are
+        measured.
     """
     if measured_m is None:
         states, axes = positions.measurement_m.shape
@@ -232,15 +233,16 @@ def fit_positions(
 
 
 def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
-    """The same data about a smooth path through them, from zero where a stretch starts.
+    """Subtract a smooth path through the positions from measurements and increments.
 
-    The likelihood is the same, but it is no longer a small difference of large squares.
+    The likelihood is unchanged, but no longer a small difference of large squares. The path starts
+    at zero in each stretch.
 
     Parameters
     ----------
     positions : Positions
     scaled : bool
-        Whether the last constant is a scale of the positions: its signal becomes the path's.
+        True if the last constant is a scale of the positions: its signal becomes that of the path.
     """
     measured = positions.measurement_m.copy()
     dp, dv = positions.delta_position_m.copy(), positions.delta_velocity_m_s.copy()
@@ -252,7 +254,7 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
         path, speed = state[..., 0], state[..., 1]
         measured[:, axes] -= path[:, 0].T
         path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
-        # one path is taken out of all; a scale is of the path to which each input leads
+        # the first offset's path is subtracted for all; a scale multiplies each offset's path
         for array, increment in ((dp, path_increment), (dv, np.diff(speed))):
             array[axes, :, 0] -= increment[:, :1]
             if scaled:
@@ -263,25 +265,25 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
 def expected_squares(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, constants: Array
 ) -> tuple[Array, Array]:
-    """Expected square of each measurement's error given all data, summed over its axes.
+    """Return the expected square of each measurement error given all data, axes summed.
 
     Parameters
     ----------
     positions : Positions
-        With one clock offset.
+        For one time offset.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
     constants : ndarray, shape (s, c)
-        Most likely ones.
+        Maximum-likelihood estimates.
 
     Returns
     -------
     square_m2 : ndarray, shape (m,)
     count : ndarray, shape (m,)
-        Axes that were measured.
+        Number of measured axes.
     """
     weight = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
-    # of each leg, by the stretch in which it ends
+    # weights of each interval: those of the stretch in which it ends
     interval_weight = np.repeat(weight, np.diff([*positions.start, len(variance_m2)]), axis=0)[1:]
     increments = positions.delta_position_m, positions.delta_velocity_m_s
     dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_weight) for array in increments)
@@ -301,18 +303,18 @@ def products_by_stretch(
     signals: Sequence[Array],
     measured_m: Array,
 ) -> Array:
-    """Products of signals with others by stretch, with the constants' signals taken out.
+    """Return inner products of two sets of signals by stretch, constants marginalised.
 
     Parameters
     ----------
     positions : Positions
-        With one clock offset; their measurements only say which of them there are.
+        For one time offset; only states which measurements there are.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
     signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
         Measurements, Δp and Δv of k signals.
     measured_m : ndarray, shape (a, k, m)
-        Of the others, which have nothing on the legs.
+        Measurements of the second set, which has no Δp and Δv.
 
     Returns
     -------
@@ -323,7 +325,7 @@ def products_by_stretch(
     results = []
     for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
         batch = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
-        # one set of signals, then the other, then those of the constants
+        # first set of signals, second set, signals of the constants
         dp, dv = (
             np.concatenate([increment[batch], 0.0 * increment[batch], constant_signal], axis=1)[
                 :, None
@@ -355,23 +357,23 @@ def products_by_stretch(
 
 @dataclass(frozen=True)
 class BandedSystem:
-    """The normal equations of all states, factorised.
+    """Factorised normal equations of all states.
 
     Attributes
     ----------
     precision : ndarray, shape (m, 2)
-        Of the measured position (1/m²) and of the velocity, whose measured value is zero (s²/m²);
-        0 where there is none.
+        Precision of the measured position (1/m²) and of the velocity prior zero (s²/m²); 0
+        without.
     length_s : ndarray, shape (m - 1,)
-        Between any two states.
+        Intervals between successive states.
     inverse : ndarray, shape (3, m - 1)
-        Q⁻¹ by elements 00, 01, 11; zero where a stretch begins.
+        Elements 00, 01, 11 of Q⁻¹; zero between stretches.
     inverse_sqrt_q11 : ndarray, shape (m - 1,)
-        1/√Q₁₁, as Q⁻¹ has it but for rounding; zero where a stretch begins.
+        1/√Q₁₁, without the rounding of Q⁻¹; zero between stretches.
     bands, lower : ndarray, shape (2 + states, states · m)
         Bands of A and of its Cholesky factor.
     log_determinant : float
-        ln|A| + Σ ln|Q| - Σ ln precision: twice the part of -ln p that no signal enters.
+        ln|A| + Σ ln|Q| - Σ ln precision: twice the part of -ln p without signals.
     """
 
     precision: Array
@@ -384,25 +386,25 @@ class BandedSystem:
 
     @property
     def states(self) -> int:
-        """Of each time: position, velocity, and a slow error of the source where there is one."""
+        """Number of states per time: position, velocity and, if any, time-correlated noise."""
         return len(self.bands) - 2
 
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[tuple[Array, Array], Array]:
-        """Signals such that the products under the inverse covariance are a difference of two.
+        """Whiten signals: products under the inverse covariance become a difference of two.
 
-        Those of the rows, less those of what the states explain, and of the measurements over
-        their sigma besides, which most signals have none of.
+        They are the products of ``intervals`` minus those of ``explained``, plus those of the
+        measurements over their σ, which most signals do not have.
 
         Parameters
         ----------
         measured_m : ndarray, shape (..., m)
         dp, dv : ndarray, shape (..., m - 1)
-            Δp (m) and Δv (m/s) of the legs; any value where a stretch begins.
+            Δp (m) and Δv (m/s) of the intervals; ignored between stretches.
 
         Returns
         -------
         intervals : two ndarray, shape (..., m - 1)
-            Over their covariance's root, zero where a stretch begins.
+            Whitened Δp and Δv; zero between stretches.
         explained : ndarray, shape (..., states · m)
         """
         intervals, right = self._interval_sides(measured_m, dp, dv)
@@ -410,7 +412,7 @@ class BandedSystem:
         return intervals, explained.T.reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
-        """Most likely states: position and velocity first, shape (..., m, states); as `whiten`."""
+        """Return the estimated states, position and velocity first, shape (..., m, states)."""
         _, right = self._interval_sides(measured_m, dp, dv)
         state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.states))
@@ -418,9 +420,9 @@ class BandedSystem:
     def _interval_sides(
         self, measured_m: Array, dp: Array, dv: Array
     ) -> tuple[tuple[Array, Array], Array]:
-        """Legs as `whiten`, and the right side of the equations, shape (columns, states · m)."""
+        """Return whitened intervals, and the right side, shape (columns, states · m)."""
         i00, i01, _ = self.inverse
-        # Q⁻¹ = UᵀU; where a stretch begins it is zero
+        # Q⁻¹ = UᵀU; zero between stretches
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
         first, second = u00 * dp + u01 * dv, self.inverse_sqrt_q11 * dv
@@ -438,18 +440,18 @@ class BandedSystem:
         return (first, second), right_side.reshape(-1, self.states * len(self.precision))
 
     def position_variance(self) -> Array:
-        """Variance of each state's position given all data (m²), shape (m,).
+        """Return the variance of each state's position given all data (m²), shape (m,).
 
-        The information about a state is what all before it and what all after it leave of its own
-        block of A: the Cholesky factor's blocks from either end (Fraser and Potter 1969).
+        The information about a state is that from all earlier and all later states on its block of
+        A: the blocks of the Cholesky factors from both ends (Fraser and Potter 1969).
         """
-        # A with its rows and columns in reverse
+        # A with reversed rows and columns
         reversed_bands, size = np.zeros_like(self.bands), self.bands.shape[1]
         for below in range(4):
             reversed_bands[below, : size - below] = self.bands[below, : size - below][::-1]
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
         (a, c), b = (self.lower[0, at::2] for at in (0, 1)), self.lower[1, 0::2]
-        # of the reverse, each block has the velocity first
+        # blocks of the reversed matrix have the velocity first
         (d, f), e = (reversed_lower[0, at::2][::-1] for at in (0, 1)), reversed_lower[1, 0::2][::-1]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
@@ -469,16 +471,15 @@ def factorise(
     Parameters
     ----------
     length_s : ndarray, shape (m - 1,)
-        Of each leg.
+        Intervals between the states.
     noise : ndarray, shape (3, m - 1)
-        Its Q by elements 00, 01, 11.
+        Elements 00, 01, 11 of Q of each interval.
     joined : ndarray of bool, shape (m - 1,)
-        False where a stretch begins that knows nothing of what was before.
+        False between stretches, which are independent.
     precision : ndarray, shape (m, 2)
-        Of the measured positions, 1/m², 0 for one that is not used, and of the velocities around
-        zero.
+        Precision of the measured positions (1/m², 0 if not used) and of the velocity prior zero.
     slow : (float, float), optional
-        As :class:`Positions` has it; what is known of positions must then be measurements.
+        See :class:`Positions`; positions must then have measurements only, without priors.
 
     Raises
     ------
@@ -488,7 +489,7 @@ def factorise(
     q00, q01, q11 = noise
     measured = precision[:, 0]
     min_noise = MIN_NOISE_SHARE**2 * (1.0 / np.median(measured[measured > 0.0]) + q00)
-    # of a single step Q has no inverse but for that, which rounding would hide
+    # Q of a single step is invertible only by min_noise, which rounding would hide
     product = q00 * q11
     raw_determinant = product - q01**2
     determinant = (
@@ -499,7 +500,7 @@ def factorise(
     i00, i01, i11 = inverse
     slope = i00 * length_s
     cross = slope + i01
-    # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I]; by columns, as LAPACK keeps bands
+    # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I], by columns as in LAPACK's band storage
     states = 2 if slow is None else 3
     columns = np.zeros((len(precision), states, states + 2))
     position, velocity = columns[:, 0], columns[:, 1]
@@ -516,7 +517,7 @@ def factorise(
     if slow is not None:
         sigma, tau_s = slow
         rho = np.where(joined, np.exp(-length_s / tau_s), 0.0)
-        variance = sigma**2 * np.append(1.0, 1.0 - rho**2)  # of what is new in each state
+        variance = sigma**2 * np.append(1.0, 1.0 - rho**2)  # variance of the new part in each state
         error = columns[:, 2]
         position[:, 2] = measured
         error[:, 0] = measured + 1.0 / variance

@@ -1,16 +1,16 @@
-"""The lesson's filter along one axis, as formulas that the replay and every estimate share.
+"""Formulas of KF along one axis, which the replay and all estimates share.
 
 State x = [position, velocity]; input a, the acceleration averaged over the step::
 
     F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
     Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
 
-With dt = DT, Q is the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]] digit for digit. For other
-steps it keeps the velocity noise per second, so that SIGMA_A means the same at every rate.
+With dt = DT, Q equals the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]]. For other steps the
+velocity noise per second is the same, so SIGMA_A does not depend on the rate.
 
-The functions write out the products, element by element, so that they serve plain floats (one
-filter, where arrays of one element would take fifty times as long) and arrays (many at once).
-A covariance is its elements 00, 01, 11.
+The functions compute element by element, so they accept floats (one filter, fifty times faster than
+arrays of one element) and arrays (many filters). A covariance is the tuple of its elements 00, 01,
+11.
 """
 
 from typing import TypeVar
@@ -21,7 +21,7 @@ from px4fuse.arrays import Array
 
 STATES = ["position_m", "velocity_m_s"]
 COVARIANCES = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
-# The lesson's initial standard deviations, P₀ = diag(0.5², 1.0²)
+# m and m/s; the lesson's initial standard deviations, P₀ = diag(0.5², 1.0²)
 INITIAL_SIGMA_P_M = 0.5
 INITIAL_SIGMA_V_M_S = 1.0
 INITIAL_COVARIANCE = (INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2)
@@ -32,43 +32,43 @@ Symmetric = tuple[T, T, T]
 
 
 def symmetric_matrix(covariance: Symmetric[float]) -> Array:
-    """Symmetric matrix of its elements 00, 01, 11, shape (2, 2)."""
+    """Return the symmetric matrix of elements 00, 01, 11, shape (2, 2)."""
     p00, p01, p11 = covariance
     return np.array([[p00, p01], [p01, p11]])
 
 
 def transition(dt_s: float) -> Array:
-    """F, shape (2, 2)."""
+    """Return the transition matrix F, shape (2, 2)."""
     return np.array([[1.0, dt_s], [0.0, 1.0]])
 
 
 def input_matrix(dt_s: float) -> Array:
-    """B, shape (2, 1)."""
+    """Return the input matrix B, shape (2, 1)."""
     return np.array([[dt_s**2 / 2.0], [dt_s]])
 
 
 def process_noise_unit(dt_s: T) -> Symmetric[T]:
-    """Q(dt) over SIGMA_A² · DT, by element: what one step adds."""
+    """Return the process noise of one step, Q(dt) / (SIGMA_A² · DT): elements 00, 01, 11."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 
 def continuous_noise_unit(dt_s: T) -> Symmetric[T]:
-    """What many short steps of together ``dt_s`` add, over SIGMA_A² · DT, by element.
+    """Return the process noise of many short steps of total ``dt_s``, per SIGMA_A² · DT.
 
-    The limit of ΣFQFᵀ: the position's noise of one step, dt³/4, is dt³/3 where the acceleration
-    may change within it.
+    Limit of ΣFQFᵀ: the position element dt³/4 of one step becomes dt³/3, since the acceleration may
+    change within the interval.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
 
 def propagate_state(position: T, velocity: T, acceleration: T, dt_s: T) -> tuple[T, T]:
-    """X = Fx + Ba: position (m) and velocity (m/s) after ``dt_s``."""
+    """Return position (m) and velocity (m/s) after ``dt_s``: x = Fx + Ba."""
     new_position = position + velocity * dt_s + acceleration * dt_s**2 / 2.0
     return new_position, velocity + acceleration * dt_s
 
 
 def propagate_covariance(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
-    """FPFᵀ, by element: the covariance after ``dt_s``, before Q is added."""
+    """Return FPFᵀ by elements 00, 01, 11; Q is not added."""
     p00, p01, p11 = covariance
     return p00 + 2.0 * dt_s * p01 + dt_s**2 * p11, p01 + dt_s * p11, p11
 
@@ -76,9 +76,9 @@ def propagate_covariance(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
 def predict_step(
     position: T, velocity: T, covariance: Symmetric[T], acceleration: T, density: T, dt_s: T
 ) -> tuple[T, T, Symmetric[T]]:
-    """X = Fx + Ba, P = FPFᵀ + Q: position, velocity and covariance after ``dt_s``.
+    """Predict position, velocity and covariance: x = Fx + Ba, P = FPFᵀ + Q.
 
-    ``density`` (m²/s³) is what Q adds to the velocity's variance per second, SIGMA_A² · DT.
+    ``density`` (m²/s³) is the increase of the velocity variance per second, SIGMA_A² · DT.
     """
     (p00, p01, p11), (q00, q01, q11) = (
         propagate_covariance(covariance, dt_s),
@@ -92,12 +92,12 @@ def predict_step(
 def update_step(
     position: T, velocity: T, covariance: Symmetric[T], measured: T, variance: T
 ) -> tuple[tuple[T, T, T, T], tuple[T, T, Symmetric[T]]]:
-    """ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹; x = x + Kν, P = (I - KH)P.
+    """Update with a measurement: ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P.
 
     Returns
     -------
     tuple
-        ν (m), S (m²) and both gains; then position, velocity and covariance after it.
+        ν (m), S (m²) and both gains; then position, velocity and covariance after the update.
     """
     p00, p01, p11 = covariance
     nu, s = measured - position, p00 + variance

@@ -1,13 +1,14 @@
-"""Motion as the IMU alone has it, and what every constant error of the IMU would add to it.
+"""Motion from the IMU alone, and the effect of every constant IMU error on it.
 
-The attitude is integrated from the gyros, from the logged attitude at the start of each stretch:
-EKF2's own later attitude was corrected by the very positions that are in question, and carries
-their lateness. To first order the acceleration is linear in ten constants of each stretch: errors
-of the initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body)
-and the scale of the positions. Each one's own signal is integrated once, and a clock offset only
-moves where the integrals are read. The signal of the scale is the path's own acceleration, which
-:func:`px4fuse.filter.marginal.centre_on_path` puts in: that of the IMU holds the very noise that is
-sought, and would pass much of it off as scale (errors in variables, Fuller 1987).
+The attitude is integrated from the gyroscopes, starting at the logged attitude of each stretch.
+EKF2's later attitude is not used: EKF2 corrected it with the positions to be tested, so it contains
+their delay. To first order the acceleration is linear in ten constants of each stretch: errors of
+the initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body) and
+the scale of the positions. The signal of each constant is integrated once; a time offset only
+changes the times at which the integrals are read. The signal of the scale is the acceleration of
+the smooth path, inserted by :func:`px4fuse.filter.marginal.centre_on_path`. The IMU's acceleration
+would contain the noise to be estimated and explain much of it as scale (errors in variables, Fuller
+1987).
 """
 
 from __future__ import annotations
@@ -28,44 +29,45 @@ from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
 
-# Standard deviations of the constants, wide for consumer sensors: tilt and heading (rad), gyro
-# (rad/s) and accelerometer (m/s²), scale of the positions (1)
+# Prior σ of the constants, wide for consumer sensors: tilt and heading (rad), gyro bias (rad/s),
+# accelerometer bias (m/s²), scale of the positions (1)
 CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# To first order only while the angles stay small: longer flights are cut into stretches. A gyro
-# bias of 0.004 rad/s turns by 0.12 rad in one, whose square costs 0.07 m/s².
+# s; longer flights are cut, since the linearisation needs small angles: a gyro bias of 0.004
+# rad/s rotates by 0.12 rad in a stretch, with a second-order error of 0.07 m/s²
 STRETCH_S = 30.0
+# s; largest time offset of the search
 MAX_OFFSET_S = 0.6
-# The whole search is gone through in so many steps, with about so many of the measurements
+# Coarse search: number of offsets, and approximate number of measurements
 COARSE_POINTS, COARSE_MEASUREMENTS = 25, 600
-# Numbers of signals that are made at once, and of offsets at least
+# Limit of the signal values per batch, and minimum number of offsets in it
 SIGNALS_PER_BATCH, MIN_OFFSETS = 2**16, 3
-# Of all stretches together, and of one
+# Measurements required in all stretches together, and in one
 MIN_MEASUREMENTS, MIN_STRETCH_MEASUREMENTS = 30, 15
-# Of a stretch of which only some are taken
+# Measurements required in a stretch after downsampling
 MIN_KEPT_MEASUREMENTS = 5
-# The IMU is averaged to this interval before it is integrated
+# s; the IMU is averaged over this interval before integration
 STEP_S = 0.02
-# Of position (1/m²) and velocity (s²/m²) where a stretch starts: as good as nothing, but enough
-# for one in which an axis was hardly measured
+# Prior precision of position (1/m²) and velocity (s²/m²) at the start of a stretch: negligible, but
+# enough for an axis with hardly any measurement
 START_PRECISION = 1e-6, 1e-4
-# Slower, and what the acceleration did between samples is not known
+# s; above this IMU interval the motion between samples is unknown
 MAX_IMU_INTERVAL_S = 0.025
 
 
 @dataclass(frozen=True)
 class Signals:
-    """Acceleration of one stretch and of each constant, and their integrals.
+    """Acceleration of one stretch and of each constant, with their integrals.
 
-    ``table`` has shape (n, 3, 3, constants): position, velocity and acceleration along each axis,
-    with all constants zero, then what each constant but the scale adds. Each acceleration holds
-    from its time to the next.
+    ``table`` has shape (n, 3, 3, constants): position, velocity and acceleration along each axis of
+    NED. The first column is for all constants zero; the others are the effects of each constant
+    except the scale. Each acceleration holds until the next time.
     """
 
     time_s: Array
     table: Array
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
-        """Position and velocity at other times, shape (..., 3, constants)."""
+        """Return position and velocity at other times, shape (..., 3, constants)."""
         last_index = len(self.time_s) - 1
         at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = (time_s - self.time_s[at])[..., None, None]
@@ -75,33 +77,33 @@ class Signals:
         return position, velocity
 
 
-# Signals of one flight by their span, which are made once and used again
+# Signals of one flight by time span (s), for reuse
 SignalCache = dict[tuple[float, float], Signals]
 
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Positions of one source over the IMU's motion, in stretches, at any clock offset.
+    """Positions of one source with the IMU's motion, in stretches, for any time offset.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
-        Stamps of the measurements that lie in a stretch.
+        Timestamps of the measurements in stretches.
     measurement_m : ndarray, shape (m, a)
-        From the first of each stretch; NaN where there is none.
+        Relative to the first of each stretch; NaN if missing.
     weight : ndarray, shape (m,)
-        What each counts.
+        Weight of each measurement.
     edges : ndarray of int, shape (s + 1,)
         First measurement of each stretch, and their number.
     signals : tuple of Signals
-        Of each stretch.
+        Signals of each stretch.
     directions : ndarray, shape (a, 3)
         Unit vectors in NED.
     dt_s : float
-        DT, which gives SIGMA_A its meaning.
+        DT, which defines the unit of SIGMA_A.
     imu_interval_s : float
     heading_sigma_rad : float
-        Of the heading where a stretch starts.
+        Prior σ of the heading at the start of a stretch.
     """
 
     time_s: Array
@@ -115,7 +117,7 @@ class PreparedMotion:
     heading_sigma_rad: float = float(CONSTANT_SIGMA[2])
 
     def downsample(self, count: int) -> PreparedMotion:
-        """About so many of the measurements, in the stretches that keep a few; all without one."""
+        """Return about ``count`` of the measurements; all if no stretch keeps enough."""
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
         counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
         has_enough = counts >= MIN_KEPT_MEASUREMENTS
@@ -133,9 +135,7 @@ class PreparedMotion:
         return replace(self, **arrays, edges=np.cumsum([0, *counts[has_enough]]), signals=signals)
 
     def positions(self, offset_s: Array) -> Positions:
-        """Positions, with what moves them where their stamps are corrected by each offset.
-
-        The signal of the scale is zero.
+        """Return positions and increments for each time offset; the scale's signal is zero.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class PreparedMotion:
         dp, dv = np.zeros((2, *shape))
         for begin, end, signals in zip(self.edges, self.edges[1:], self.signals, strict=False):
             time = self.time_s[begin:end]
-            # by axis, offset, constant and time
+            # shape (axes, offsets, constants, times)
             position, velocity = (
                 np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
                 for signal in signals.at(time + offset_s[:, None])
@@ -172,11 +172,11 @@ class PreparedMotion:
         )
 
     def at(self, offset_s: float) -> Positions:
-        """The same at one offset, about a smooth path whose scale is the last constant."""
+        """Return positions at one time offset, relative to a smooth path, with a scale."""
         return next(self.blocks(np.array([offset_s])))
 
     def blocks(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
-        """The same at some offsets, a few at a time, with the scale as a constant or without."""
+        """Yield positions for some time offsets in batches, with or without a scale."""
         signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMA))
         batch_size = max(MIN_OFFSETS, SIGNALS_PER_BATCH // signal_count)
         for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
@@ -186,15 +186,15 @@ class PreparedMotion:
     def search(
         self, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
     ) -> tuple[float, Noises]:
-        """The most likely offset over the whole search, and SIGMA_A of some.
+        """Return the best time offset of the whole search range, and the best SIGMA_A of some.
 
         Parameters
         ----------
         noises : Noises
         factors : sequence of float
-            Of SIGMA_A.
+            Factors on SIGMA_A.
         scaled : bool
-            Whether the scale of the positions is one of the constants.
+            True if the scale of the positions is one of the constants.
         """
         offsets = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_POINTS)
         sigma = noises.sigma_z_m
@@ -219,7 +219,7 @@ def prepare_motion(
     signals: SignalCache | None = None,
     heading_sigma_rad: float = float(CONSTANT_SIGMA[2]),
 ) -> PreparedMotion | Unavailable:
-    """Cut measurements into stretches that the IMU covers without a gap.
+    """Cut measurements into stretches that IMU and attitude cover without a gap.
 
     Parameters
     ----------
@@ -227,13 +227,13 @@ def prepare_motion(
     time_s : ndarray, shape (m,)
     measurement_m : ndarray, shape (m, a)
     directions, dt_s, weight, heading_sigma_rad
-        As :class:`PreparedMotion` has them; by default all count the same.
+        See :class:`PreparedMotion`; default weight: 1.
     signals : dict, optional
-        Signals of this flight, to which new ones are added.
+        Signals of this flight to reuse; new ones are added.
 
     Returns
     -------
-    PreparedMotion, or Unavailable without IMU or attitude, or with too few measurements with them.
+    PreparedMotion, or Unavailable without IMU or attitude or with too few measurements.
     """
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable):
@@ -267,14 +267,12 @@ def prepare_motion(
     if len(used_rows) < MIN_MEASUREMENTS:
         return Unavailable(
             "clock offset",
-            (
-                f"only {len(used_rows)} measurements have IMU and attitude data (at least "
-                f"{MIN_MEASUREMENTS} are needed)"
-            ),
+            f"only {len(used_rows)} measurements have IMU and attitude data (at least "
+            f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
     edges = np.cumsum([0, *map(len, rows_by_stretch)])
-    # from the first of each stretch, whose place nothing says: numbers stay small
+    # relative to the first of each stretch, whose position is unknown anyway: numbers stay small
     measured = pd.DataFrame(measurement_m[used_rows])
     first = measured.groupby(np.repeat(np.arange(len(rows_by_stretch)), np.diff(edges))).transform(
         "first"
@@ -293,7 +291,7 @@ def prepare_motion(
 
 
 def _covered_spans(imu_time: Array, attitude_time: Array) -> list[tuple[float, float]]:
-    """Start and end of all that IMU and attitude cover; nothing where the IMU is too slow."""
+    """Return the time spans that IMU and attitude cover; none if the IMU rate is too low."""
     if len(imu_time) < 2 or np.median(np.diff(imu_time)) > MAX_IMU_INTERVAL_S:
         return []
     gaps = np.flatnonzero(imu_gaps(imu_time))
@@ -303,7 +301,7 @@ def _covered_spans(imu_time: Array, attitude_time: Array) -> list[tuple[float, f
 
 
 def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
-    """Acceleration in NED by the gyros' attitude, and what each constant adds to it."""
+    """Compute the NED acceleration from gyroscopes, and the effect of each constant on it."""
     time = imu.index.to_numpy()
     first_row, last_axis = np.searchsorted(
         time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left"
@@ -315,7 +313,7 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
     integrals_at_edges = np.column_stack([np.interp(edges, time, column) for column in integral.T])
     force, angle = integrals_at_edges[:, :3], integrals_at_edges[:, 3:]
     attitude_quaternion = _integrate_gyros(edges, angle, attitude)
-    # of each step, in its middle
+    # attitude in the middle of each step
     mean = np.diff(force, axis=0) / STEP_S
     body_to_ned = matrix(
         multiply(attitude_quaternion[:-1], from_vector(np.diff(angle, axis=0) / 2.0))
@@ -325,7 +323,7 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
     position, velocity, acceleration = np.moveaxis(table, 1, 0)
     acceleration[:, :, 0] = force_ned
     acceleration[:, 2, 0] += constants.g
-    # a small rotation θ of the attitude adds θ × f; a gyro bias b turns it by -∫ R b dt
+    # a small rotation θ of the attitude adds θ × f; a gyro bias b rotates it by -∫ R b dt
     gyro_bias_rotation = -STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
         next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3
@@ -341,7 +339,7 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
 
 
 def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Array:
-    """Attitude (body to NED, w first) from the logged one at the start and the gyros alone."""
+    """Integrate the gyroscopes to an attitude (body to NED, w first) from a logged start."""
     attitude_s = attitude.index.to_numpy()
     near_rows = slice(
         *np.clip(np.searchsorted(attitude_s, edges[0]) + np.array([-2, 3]), 0, len(attitude_s))

@@ -1,4 +1,4 @@
-"""The replay of :mod:`px4fuse.filter.kalman` in plain floats, for what is only tried out."""
+"""Replay like :mod:`px4fuse.filter.kalman` in plain floats, for re-runs."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from px4fuse.filter.steps import make_timeline
 
 
 def quick_replay(axis: Axis, settings: Settings) -> Replay:
-    """:func:`~px4fuse.filter.kalman.replay` to 1e-9, in a fraction of its time.
+    """Run KF as :func:`~px4fuse.filter.kalman.replay`, equal to 1e-9 and much faster.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ def quick_replay(axis: Axis, settings: Settings) -> Replay:
     Raises
     ------
     SettingsError
-        As of the replay.
+        See :func:`~px4fuse.filter.kalman.replay`.
     """
     line = make_timeline(axis, settings)
     measured_m, r = axis.measurement_m.tolist(), settings.sigma_z_m**2

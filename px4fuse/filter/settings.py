@@ -1,4 +1,4 @@
-"""What the user may turn: the settings of the filter, with their ranges."""
+"""Settings of KF with their valid ranges."""
 
 from dataclasses import dataclass
 from typing import get_args
@@ -8,7 +8,7 @@ from px4fuse.request import DT_S, SIGMA_A_M_S2, SIGMA_Z_M, InputName
 
 INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
-# Ranges outside which a setting is a slip of the keyboard, not a choice.
+# Ranges of the settings: values outside are typing errors
 SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
 SIGMA_Z_RANGE_M = (1e-4, 100.0)
 DT_RANGE_S = (1e-3, 1.0)
@@ -17,7 +17,7 @@ CLOCK_OFFSET_RANGE_S = (-10.0, 10.0)
 
 @dataclass(frozen=True)
 class Settings:
-    """What the user may turn.
+    """Settings of KF.
 
     Attributes
     ----------
@@ -26,11 +26,11 @@ class Settings:
     sigma_z_m : float
         Measurement noise SIGMA_Z.
     dt_s : float
-        Prediction grid DT.
+        Prediction interval DT.
     input : {"imu", "zero"}
         Acceleration measured by the IMU, or the lesson's constant-velocity case.
     clock_offset_s : float
-        Added to the position source's time stamps.
+        Added to the timestamps of the position source.
 
     Raises
     ------
@@ -61,7 +61,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class InitialState:
-    """Where the filter starts: time (s), position (m) and velocity (m/s), with the lesson's P₀."""
+    """Initial state of KF: time (s), position (m) and velocity (m/s), with the lesson's P₀."""
 
     time_s: float
     position_m: float

@@ -1,4 +1,4 @@
-"""Frames, gravity, the aisle axis and resampling: Flight → one-dimensional signals.
+"""One-dimensional signals of a flight: axes, NED acceleration, resampling.
 
 NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
@@ -19,9 +19,9 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
 
 AISLE = "aisle"
-# A track that is so many times longer than wide was flown along an aisle
+# Ratio of length to width from which a track counts as flown along an aisle
 MIN_AISLE_ELONGATION = 3.0
-# An IMU interval is a gap when it is longer than this and than five median intervals.
+# s, and number of median intervals: a longer IMU interval is a gap
 IMU_GAP_S = 0.1
 IMU_GAP_INTERVALS = 5.0
 MIN_MEASUREMENTS = 3
@@ -29,14 +29,14 @@ MIN_MEASUREMENTS = 3
 
 @dataclass(frozen=True)
 class Segment:
-    """The part of the flight that is analysed: start and end (s), and why these."""
+    """Analysed part of the flight: start and end (s), and the reason for the choice."""
 
     start_s: float
     end_s: float
     reason: str
 
     def cut(self, spans: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-        """What lies inside of some spans (s)."""
+        """Return the parts of time spans (s) that are inside the segment."""
         clipped_spans = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans)
         return tuple((start, end) for start, end in clipped_spans if end > start)
 
@@ -49,15 +49,15 @@ class Acceleration:
     ----------
     time_s : ndarray, shape (n,)
     ned_m_s2 : ndarray, shape (n, 3)
-        Gravity removed; all axes share it, as long as the flight is.
+        Without gravity, for the whole flight; shared by all axes.
     direction : ndarray, shape (3,)
         Unit vector in NED.
     integral_m_s : ndarray, shape (n,)
-        Along the axis, trapezoidal from the first sample, for averages over steps.
+        Integral along the axis (trapezoidal, from the first sample), for step averages.
     gap_time_s, gap_integral_s : ndarray, shape (k,)
-        Ends of the gaps and of all, and seconds of gap passed since the first sample.
+        Ends of the gaps and of the data, and accumulated gap time (s) at each.
     rms_m_s2 : float
-        Root mean square of the signal: how wrong the input may be inside a gap.
+        Root mean square of the signal: error of the input inside a gap.
     """
 
     time_s: Array
@@ -72,13 +72,13 @@ class Acceleration:
 
     @property
     def value_m_s2(self) -> Array:
-        """Along the axis, shape (n,)."""
+        """Acceleration along the axis, shape (n,)."""
         return np.asarray(self.ned_m_s2 @ self.direction)
 
 
 @dataclass(frozen=True)
 class Axis:
-    """The flight along one direction.
+    """Positions and acceleration of a flight along one direction.
 
     Attributes
     ----------
@@ -87,15 +87,15 @@ class Axis:
     direction : ndarray, shape (3,)
         Unit vector in NED.
     heading_deg : float or None
-        Of horizontal axes, clockwise from north.
+        Heading of a horizontal axis, clockwise from north.
     note : str
-        How the direction was found, where that is a choice; else empty.
+        Origin of the direction of the aisle; else empty.
     measurement_time_s, measurement_m : ndarray, shape (n,)
         Position measurements along the axis; n ≥ 3.
     acceleration : Acceleration or Unavailable
-        The filter's input.
+        Input of KF.
     elongation : float or None
-        How many times longer than wide the track is; None where the direction was given.
+        Ratio of the track's length to its width; None if the direction was given.
     """
 
     name: str
@@ -111,18 +111,18 @@ class Axis:
 
     @property
     def called(self) -> str:
-        """What the axis is in a sentence; an aisle is what was flown as one, or asked for."""
+        """Name in messages; "the aisle" only for an elongated track or with --heading."""
         if self.name != AISLE:
             return self.name
         flown = self.elongation is None or self.elongation >= MIN_AISLE_ELONGATION
-        return "the aisle" if flown else "the longest direction"
+        return "the aisle" if flown else "the main direction"
 
 
 def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
-    """Acceleration in NED with gravity removed, at the IMU's own times.
+    """Return the acceleration in NED without gravity, at the IMU's timestamps.
 
-    The attitude is interpolated on the sphere (slerp, Shoemake 1985), since default logs hold it
-    at a tenth of the IMU's rate. It is made once for a flight, as long as that is there.
+    The attitude is interpolated on the sphere (slerp, Shoemake 1985), since default logs contain it
+    at a tenth of the IMU's rate. The result is cached as long as the flight exists.
 
     Returns
     -------
@@ -158,14 +158,14 @@ def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
 
 
 def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
-    """Heading of the horizontal principal direction of the track.
+    """Return the heading of the main horizontal direction of the track.
 
     Returns
     -------
     heading_deg : float
         In [0, 180): an aisle has no front.
     elongation : float
-        Ratio of the standard deviations along and across it (1: no direction is distinct).
+        Ratio of the standard deviations along and across it; 1 without a distinct direction.
     """
     horizontal = within(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
     centred = horizontal - horizontal.mean(axis=0)
@@ -183,7 +183,7 @@ def make_axes(
     names: tuple[str, ...] | None = None,
     heading_deg: float | None = None,
 ) -> tuple[Axis, ...]:
-    """Project a flight on its axes.
+    """Project positions and acceleration of a flight onto its axes.
 
     Parameters
     ----------
@@ -191,14 +191,14 @@ def make_axes(
     track : PositionTrack
     segment : Segment
     names : tuple of str, optional
-        From "north", "east", "down", "aisle"; by default all that the source supports.
+        From "north", "east", "down", "aisle"; default: all that the source supports.
     heading_deg : float, optional
-        Of the aisle, clockwise from north; by default the horizontal principal direction.
+        Heading of the aisle, clockwise from north; default: main direction of the track.
 
     Raises
     ------
     MissingDataError
-        An axis was asked for that the source has no finite samples for, or none has any.
+        The source has no finite samples along a requested axis, or along any axis.
     SettingsError
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
@@ -234,16 +234,16 @@ def make_axes(
 
 
 def too_few_measurements(what: str, count: int, least: int) -> Unavailable:
-    """What stands in for an estimate from so few measurements."""
+    """Return Unavailable for an estimate from too few measurements."""
     return Unavailable(
-        f"{what}",
+        what,
         f"only {count} measurements (at least {least} are needed)",
         "Analyse a longer segment, or log the source at a higher rate.",
     )
 
 
 def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
-    """Weighted sum of columns; a column of weight zero may be NaN."""
+    """Return the weighted sum of columns; columns with weight zero may be NaN."""
     total = np.zeros(len(frame))
     for column, weight in zip(columns, weights, strict=True):
         if weight != 0.0:
@@ -260,7 +260,7 @@ def _direction(
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), "", None
     if heading_deg is None:
         heading, elongation = aisle_heading(track, segment)
-        note = f"horizontal principal direction, {elongation:.1f} times longer than wide"
+        note = f"main direction of the track, length / width {elongation:.1f}"
     else:
         heading, note = heading_deg, "given with --heading"
     angle = np.radians(heading)
@@ -270,14 +270,14 @@ def _direction(
 def project_acceleration(
     acceleration: pd.DataFrame | Unavailable, direction: Array, segment: Segment
 ) -> Acceleration | Unavailable:
-    """Acceleration along a direction, with what step averages need.
+    """Project the acceleration onto a direction, with integrals for step averages.
 
     Parameters
     ----------
     acceleration : DataFrame, shape (n, 3), m/s², NED, or Unavailable
     direction : ndarray, shape (3,)
     segment : Segment
-        Only for the root mean square.
+        Segment of the root mean square.
     """
     if isinstance(acceleration, Unavailable):
         return acceleration
@@ -306,13 +306,13 @@ def project_acceleration(
 
 
 def imu_gaps(time_s: Array) -> BoolArray:
-    """Whether each interval between IMU samples is a gap, shape (n - 1,)."""
+    """Return True for intervals between IMU samples that are gaps, shape (n - 1,)."""
     interval = np.diff(time_s)
     return interval > max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(interval)))
 
 
 def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Array]:
-    """Mean acceleration over each step, and the fraction of it that lies in an IMU gap.
+    """Return the mean acceleration over each step, and the share of the step in an IMU gap.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
     -------
     mean_m_s2 : ndarray, shape (n,)
     gap_fraction : ndarray, shape (n,)
-        1 also where the step lies outside the IMU's span, where the mean is 0.
+        1 also outside the IMU's time span, with mean 0.
     """
     edges = np.asarray(edges, dtype=np.float64)
     length = np.diff(edges)
@@ -336,5 +336,5 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
 
 
 def within(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
-    """Rows of a time-indexed frame inside a segment, both ends included."""
+    """Return the rows of a time-indexed frame inside a segment, both ends included."""
     return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]

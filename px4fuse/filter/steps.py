@@ -1,4 +1,4 @@
-"""The filter's steps: the DT grid, every measurement's own time, and the input of each step."""
+"""Prediction steps of KF: the DT grid and the measurement times, with the input of each step."""
 
 from dataclasses import dataclass
 
@@ -10,24 +10,24 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight import Unavailable
 
-# Two times closer than this are one step: stamps have a resolution of one microsecond.
+# s; closer times are one step: timestamps have a resolution of 1 µs
 SAME_TIME_S = 5e-7
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """The filter's steps: the DT grid and every measurement's own time.
+    """Prediction steps of KF: the DT grid and every measurement time.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Strictly increasing; the first is the initial state's.
+        Strictly increasing; the first is the time of the initial state.
     measurement : ndarray of int, shape (n,)
-        Index of the measurement at that time, -1 where there is none.
+        Index of the measurement at that time, -1 without one.
     acceleration_m_s2 : ndarray, shape (n - 1,)
-        Input of each step.
+        Mean acceleration over each step.
     input_variance_m2_s4 : ndarray, shape (n - 1,)
-        Added to SIGMA_A² where the IMU has a gap.
+        Added to SIGMA_A² in gaps of the IMU.
     """
 
     time_s: Array
@@ -38,7 +38,7 @@ class Timeline:
 
 
 def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
-    """Lay out the filter's steps.
+    """Lay out the prediction steps of KF along an axis.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None =
         raise SettingsError(f"axis {axis.name}: no measurement after the start at {start_s:.2f} s.")
     count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid = start_s + settings.dt_s * np.arange(count)
-    # a grid time that coincides with a measurement gives way to the measurement's own stamp
+    # a measurement's timestamp replaces a grid time that coincides with it
     nearest = measured_s[np.clip(np.searchsorted(measured_s, grid), 0, len(measured_s) - 1)]
     previous = measured_s[np.clip(np.searchsorted(measured_s, grid) - 1, 0, len(measured_s) - 1)]
     distance = np.minimum(np.abs(nearest - grid), np.abs(previous - grid))
@@ -69,8 +69,8 @@ def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None =
         raise SettingsError("`input` imu needs an acceleration", f"{axis.acceleration}")
     mean, gap = step_means(axis.acceleration, time)
     gap_s = gap * np.diff(time)
-    # Unknown acceleration persists through a gap: after T seconds it has moved the velocity by
-    # rms·T, not by the rms·√(DT·T) of white noise, so its variance is scaled by T/DT.
+    # In a gap of T seconds the unknown acceleration is constant: its velocity error is rms·T, not
+    # rms·√(DT·T) as for white noise, so its variance is scaled by T/DT.
     interval_index = np.searchsorted(np.flatnonzero(measurement >= 0), np.arange(1, len(time)))
     gap_of_interval = np.bincount(interval_index, weights=gap_s)[interval_index]
     persistence = np.maximum(gap_of_interval / settings.dt_s, 1.0)

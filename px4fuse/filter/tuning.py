@@ -1,9 +1,9 @@
-"""Maximum-likelihood SIGMA_A and SIGMA_Z, with intervals, and what speaks for and against them.
+"""Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals, and a held-out check.
 
-Noise is what is left when what is constant is taken out: where the IMU is there, its biases and
-tilt and the clock offset are fitted along (:mod:`px4fuse.filter.motion`), so that SIGMA_A is the
-noise of the acceleration and SIGMA_Z that of the source. The two-state filter has no states for
-biases; the SIGMA_A that it needs, to cover them too, is larger, and is found by itself.
+Constant errors are not noise: with IMU data, biases, tilt and time offset are fitted, too
+(:mod:`px4fuse.filter.motion`), so that SIGMA_A is the noise of the acceleration and SIGMA_Z that of
+the source. KF has no states for biases. The SIGMA_A that it needs to cover them is larger and is
+estimated separately.
 """
 
 from __future__ import annotations
@@ -42,27 +42,29 @@ from px4fuse.record import Count, NotNegative, OrUnavailable, Record
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
+# Points per side of the likelihood map
 GRID_SIZE = 40
-# The map reaches as many standard deviations to either side
+# Extent of the likelihood map on each side, in σ of the estimate
 MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
+# Initial values: factors on KF's SIGMA_A, and random walk of a drifting source (m/√s)
 SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 START_WALK_M = 0.02
-# A value this near to the end of its search lies there
+# Factor from the end of the search range within which a value counts as at the end
 SEARCH_END_RATIO = 1.001
 
 
 class Noise(Record, frozen=True):
-    """One noise parameter as the data have it.
+    """Maximum-likelihood estimate of one noise parameter.
 
     Attributes
     ----------
     value : float or None
-        Most likely value; None where the likelihood has its maximum at zero or beyond the search.
+        Estimate; None if the likelihood has its maximum at zero or beyond the search range.
     low, high : float or None
-        Ends of the 95 % profile-likelihood interval; ``low`` is None where the value may be zero,
-        ``high`` None where nothing bounds it.
+        Ends of the 95 % profile-likelihood interval; ``low`` is None if the value may be zero,
+        ``high`` None without an upper bound.
     """
 
     value: float | None
@@ -71,12 +73,12 @@ class Noise(Record, frozen=True):
 
     @classmethod
     def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """As :class:`NoiseEstimate` writes it."""
+        """Build a noise from the fields of :class:`NoiseEstimate`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
     def as_fields(self, name: str) -> dict[str, Any]:
-        """As :class:`NoiseEstimate` writes it: value and interval under a name."""
+        """Return value and interval as fields of :class:`NoiseEstimate`."""
         is_bounded = self.low is not None or self.high is not None
         interval = (self.low or 0.0, self.high) if is_bounded else None
         return {name: self.value, f"{name}_interval": interval}
@@ -84,7 +86,7 @@ class Noise(Record, frozen=True):
 
 @dataclass(frozen=True)
 class LikelihoodMap:
-    """Negative log-likelihood above its minimum, shape (n, m), over SIGMA_A × SIGMA_Z."""
+    """Drop of the log-likelihood from its maximum, shape (n, m), over SIGMA_A × SIGMA_Z."""
 
     sigma_a_m_s2: Array
     sigma_z_m: Array
@@ -94,17 +96,17 @@ class LikelihoodMap:
 
 
 class HeldOutCheck(Record, frozen=True):
-    """Settings found on the first half, scored on the second.
+    """Held-out check: noises estimated on the first half, evaluated on the second.
 
     Attributes
     ----------
     sigma_a_m_s2, sigma_z_m : float
-        Most likely on the first half.
+        Estimates from the first half.
     count : int
         Measurements of the second half.
     gain_nats : float
-        Log-likelihood per measurement of the second half above that of the chosen settings:
-        positive where tuning helps on data that it has not seen.
+        Gain of log-likelihood per measurement of the second half over the chosen settings; positive
+        if tuning improves data that were not used for it.
     """
 
     sigma_a_m_s2: NotNegative
@@ -114,30 +116,29 @@ class HeldOutCheck(Record, frozen=True):
 
 
 class NoiseEstimate(Record, frozen=True, kw_only=True):
-    """The noises of one axis, or of the horizontal axes together, with 95 % intervals.
+    """Noises of one axis, or of the horizontal axes together, with 95 % intervals.
 
-    A value is None where the likelihood has its maximum at an end of the search: then the interval
-    is the bound. Its lower end is 0 where the noise may be zero, its upper end None where nothing
-    bounds it.
+    A value is None if the likelihood has its maximum at an end of the search range; the interval is
+    then the bound. Its lower end is 0 if the noise may be zero, its upper end None without a bound.
 
     Attributes
     ----------
     sigma_a_m_s2, sigma_z_m : float or None
-        What is noise, biases and tilt taken out where the IMU tells them.
+        Noise without biases and tilt, if the IMU data are sufficient to estimate these.
     filter_sigma_a_m_s2 : float or None
-        SIGMA_A that the two-state filter needs at this SIGMA_Z, since it has no states for biases.
+        SIGMA_A that KF needs at this SIGMA_Z, since it has no states for biases.
     gain_nats : float
-        Log-likelihood per measurement of the two-state filter with ``filter_sigma_a`` and
-        ``sigma_z`` above that of the chosen settings.
+        Gain of log-likelihood per measurement of KF with ``filter_sigma_a`` and ``sigma_z`` over
+        the chosen settings.
     before, after : Consistency or Unavailable
-        Of the chosen settings and of these, outliers left out; of the first axis where there are
-        several.
+        Consistency with the chosen and the estimated settings, without outliers; along the first
+        axis of several.
     count, outliers : int
-        Measurements, and those that are more likely outliers than not.
-    held_out : HeldOut or Unavailable
+        Measurements, and those with an outlier probability above 0.5.
+    held_out : HeldOutCheck or Unavailable
     biases_fitted : bool
-        Whether biases and tilt were taken out; where the IMU is too slow for that, SIGMA_A of the
-        filter bounds the noise.
+        True if biases and tilt were fitted; if the IMU rate is too low for that, KF's SIGMA_A is an
+        upper bound of the noise.
     """
 
     sigma_a_m_s2: NotNegative | None = None
@@ -156,31 +157,31 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
 
     @property
     def sigma_a(self) -> Noise:
-        """SIGMA_A of the noise alone, m/s²."""
+        """SIGMA_A of the acceleration noise alone (m/s²)."""
         return Noise.of(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
 
     @property
     def filter_sigma_a(self) -> Noise:
-        """SIGMA_A that the filter needs, m/s²."""
+        """SIGMA_A that KF needs (m/s²)."""
         return Noise.of(self.filter_sigma_a_m_s2, self.filter_sigma_a_m_s2_interval)
 
     @property
     def sigma_z(self) -> Noise:
-        """SIGMA_Z, m."""
+        """SIGMA_Z (m)."""
         return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
 
 
 class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
-    """:class:`NoiseEstimate`, with what it was found from.
+    """:class:`NoiseEstimate` with the outliers and the likelihood map.
 
     Attributes
     ----------
     name : str
     outlier_time_s : ndarray, shape (k,)
     noises : Noises
-        The most likely ones, with the random walk of a source that may wander.
+        Maximum-likelihood noises, with the random walk of a drifting source.
     make_map : callable
-        Makes :attr:`map`, which takes as long as a fit and is seldom looked at.
+        Computes :attr:`map` on demand; it takes as long as a fit.
     """
 
     schema_type = NoiseEstimate
@@ -193,7 +194,7 @@ class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
 
     @cached_property
     def map(self) -> LikelihoodMap:
-        """Likelihood of the two-state filter around its optimum."""
+        """Likelihood of KF around its maximum."""
         return self.make_map()
 
 
@@ -206,23 +207,23 @@ def tune(
     drifts: bool = False,
     signals: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
-    """Most likely SIGMA_A and SIGMA_Z of each axis, and of north and east together.
+    """Estimate SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
     Parameters
     ----------
     axes : tuple of Axis
     settings : Settings
-        The chosen ones: ``dt_s`` and ``input`` are used, the noises compared with.
+        ``dt_s`` and ``input`` are used; the estimates are compared with the chosen noises.
     names : tuple of str, optional
-        Axis names and "horizontal"; by default all that there are.
+        Axis names and "horizontal"; default: all.
     progress : callable
-        Told the name of each axis as it starts.
+        Called with the name of each axis.
     flight : Flight, optional
-        Whose IMU tells biases and tilt from noise.
+        Its IMU data separate biases and tilt from noise.
     drifts : bool
-        Whether the source may wander by itself, as odometry does.
+        True if the source may drift, as odometry does.
     signals : dict, optional
-        As :func:`px4fuse.filter.motion.motion` has it.
+        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
 
     Returns
     -------
@@ -252,7 +253,7 @@ def tune_axes(
     drifts: bool = False,
     signals: SignalCache | None = None,
 ) -> AxisTuning | Unavailable:
-    """Most likely noises that several axes share.
+    """Estimate the noises that several axes share.
 
     Parameters
     ----------
@@ -260,13 +261,13 @@ def tune_axes(
     axes : tuple of Axis
         With the same measurement times.
     settings : Settings
-        The chosen ones: ``dt_s`` and ``input`` are used, the noises compared with.
+        ``dt_s`` and ``input`` are used; the estimates are compared with the chosen noises.
     flight : Flight, optional
-        Whose IMU tells biases and tilt from noise.
+        Its IMU data separate biases and tilt from noise.
     drifts : bool
-        Whether the source may wander by itself, as odometry does.
+        True if the source may drift, as odometry does.
     signals : dict, optional
-        As :func:`px4fuse.filter.motion.motion` has it.
+        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
     """
     intervals = [preintegrate(axis, settings) for axis in axes]
     count = len(intervals[0].measurement_m)
@@ -275,10 +276,10 @@ def tune_axes(
     axis_positions = [filter_positions(interval_input) for interval_input in intervals]
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     two_state_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(count))
-    motion_fit = None  # with the IMU's constants and the clock offset taken out
+    motion_fit = None  # with the IMU's constants and the time offset
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # the filter starts at the first measurement, which it does not weigh
+        # KF starts at the first measurement, which has no weight in its fit
         weight = np.concatenate([np.ones(len(measured_m) - count), two_state_fit.weight])
         axis_directions = np.array([axis.direction for axis in axes])
         time_s, dt_s = axes[0].measurement_time_s, settings.dt_s
@@ -293,7 +294,7 @@ def tune_axes(
         )
         if not isinstance(prepared_motion, Unavailable):
             start_noises = replace(two_state_fit.noises, walk_m=START_WALK_M if drifts else 0.0)
-            # the clock offset is a nuisance here: a rough one is enough
+            # a coarse time offset is enough: its fine value hardly changes the noises
             offset_s, start_noises = prepared_motion.search(
                 start_noises, SIGMA_A_FACTORS, scaled=False
             )
@@ -305,11 +306,9 @@ def tune_axes(
     if np.mean(skip) > MAX_OUTLIER_SHARE:
         return Unavailable(
             f"tuning, {name}",
-            (
-                f"{np.mean(skip):.0%} of the measurements are outliers. Remove the outliers "
-                "at the source first"
-            ),
-            "The noise cannot be estimated with this many.",
+            f"{100 * np.mean(skip):.0f} % of the measurements are outliers, too many to estimate "
+            "the noise",
+            "Remove the outliers at the source first.",
         )
     sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noises.sigma_z_m
@@ -317,7 +316,7 @@ def tune_axes(
         sigma_a if motion_fit is None else _two_state_sigma_a(two_state_fit, final_sigma_z_m)
     )
     if motion_fit is None and flight is not None and settings.input == "imu":
-        # the noise alone is not told; with what else the filter has to cover it is this
+        # the noise alone cannot be estimated; KF's SIGMA_A is an upper bound
         sigma_a = Noise(None, None, two_state_sigma_a.high)
     after = Noises(
         two_state_sigma_a.value or two_state_sigma_a.high or two_state_fit.noises.sigma_a_m_s2,
@@ -345,7 +344,7 @@ def tune_axes(
 
 
 def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
-    """Value and 95 % interval of SIGMA_A (0) or SIGMA_Z (1), the other one maximised out."""
+    """Estimate SIGMA_A (0) or SIGMA_Z (1) with a 95 % interval, the other maximised out."""
     values = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
@@ -361,7 +360,7 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
 
 
 def _two_state_sigma_a(fit: NoiseFit, sigma_z: float) -> Noise:
-    """SIGMA_A of the two-state filter at a SIGMA_Z, with its 95 % interval."""
+    """Estimate KF's SIGMA_A for a given SIGMA_Z, with a 95 % interval."""
 
     def score(log_a: float, _: float = 0.0) -> float:
         return fit.score(Noises(float(np.exp(log_a)), sigma_z))
@@ -377,7 +376,7 @@ def _noise_with_interval(
     search: tuple[float, float],
     widening: float = 1.0,
 ) -> Noise:
-    """A noise with its interval; without a value where that has its best at an end."""
+    """Return a noise with its interval; without a value if the maximum is at an end."""
     value = float(np.exp(best_logs[0]))
     low, high = profile_ends(score, best_logs, search, widening)
     is_inside = search[0] * SEARCH_END_RATIO < value < search[1] / SEARCH_END_RATIO
@@ -392,7 +391,7 @@ def _make_map(
     sigma_z: Noise,
     best_noises: Noises,
 ) -> LikelihoodMap:
-    """Likelihood of the two-state filter all around its optimum."""
+    """Compute the likelihood of KF around its maximum."""
     grids = []
     for noise, best_value, (low, high) in (
         (sigma_a, best_noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
@@ -420,21 +419,19 @@ def _assess_innovations(
 def _hold_out(
     name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
-    """Tune on the first half, score on the second."""
+    """Estimate the noises on the first half and evaluate them on the second."""
     half = len(fit.weight) // 2
     if half < MIN_MEASUREMENTS:
         return Unavailable(
             f"held-out check, {name}",
-            (
-                f"half of the segment contains {half} measurements (at least "
-                f"{MIN_MEASUREMENTS} are needed)"
-            ),
+            f"half of the segment contains only {half} measurements (at least "
+            f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
     first_half = [filter_positions(interval_input.first(half)) for interval_input in intervals]
     first = maximise_likelihood(first_half, fit.noises, fit.weight[:half], outliers=False)
     tuned_noises = first.noises
-    # of the second half given the first
+    # likelihood of the second half given the first
     scores = [fit.score(noises) - first.score(noises) for noises in (chosen_noises, tuned_noises)]
     count = len(fit.weight) - half
     return HeldOutCheck(
