@@ -198,12 +198,12 @@ def _step_reasons(
         ways.ATTITUDE: (
             "EKF2 corrects its attitude with the positions; KF uses the logged attitude"
         ),
-        ways.FIELD: (
+        ways.FIELD_STEP: (
             "EKF2 estimates heading with the magnetometer; KF uses EKF2's published heading"
         ),
-        ways.SPEED: "EKF2 also fuses GNSS velocity; KF only GNSS position",
-        ways.FLOWING: "EKF2 also fuses optical flow; KF only positions",
-        ways.VISION: "EKF2 fuses external vision and GNSS; KF only one of them",
+        ways.VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF only GNSS position",
+        ways.FLOW_STEP: "EKF2 also fuses optical flow; KF only positions",
+        ways.VISION_STEP: "EKF2 fuses external vision and GNSS; KF only one of them",
         ways.GATE: (
             f"EKF2 rejects {100 * model.agreement.rejected_share_logged:.1f} % of the samples; "
             "KF has no gate"
