@@ -170,7 +170,7 @@ def test_it_is_chosen_by_itself_where_ekf2_fused_it_and_nothing_else_is_there(tm
     flight = flight_of(outdoors(), tmp_path)
     track, reason = choose_source(flight)
     assert track.name == "vehicle_gps_position"
-    assert reason == "what EKF2 fused; no other position is in the log"
+    assert reason == "fused by EKF2; the only position in the log"
     prepared = prepare(flight)
     assert [line.name for line in prepared.lines] == ["aisle", "north", "east"]
     # nothing of external vision is missed

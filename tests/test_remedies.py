@@ -64,7 +64,7 @@ def test_no_remedy_increases_the_error_to_the_truth(settings, mistakes) -> None:
     comparison, model = analysis, analysis.ekf2_model
     followed = 0
     for remedy in (finding.remedy for finding in find(analysis)):
-        if "Leave it" in remedy or "no remedy" in remedy:
+        if "No change advised" in remedy or "does not help" in remedy:
             continue
         if ours := typed(remedy):
             segment = {each: getattr(analysis.segment, each) for each in ("start_s", "end_s")}
@@ -101,7 +101,7 @@ def test_on_a_loop_of_vio_the_truth_is_told_first_and_no_noise_is_lowered(seed, 
 def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> None:
     comparison = flown(AISLE, Settings())
     worse = remedies.format_kf_remedy(comparison, {"sigma_z_m": 3.0})
-    assert worse.startswith("Leave it: --sigma-z 3 fits")
+    assert worse.startswith("No change advised: --sigma-z 3 fits")
     truth = Unavailable("ground truth", "none", "")
     axes = {}
     for name, axis in comparison.axes.items():
@@ -179,10 +179,10 @@ def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
     sure = flown_with(sample, EKF2_EVP_NOISE=0.03)
     said = words(sure, EKF2_EVP_NOISE=0.1)
     assert said.startswith("Because: set EKF2_EVP_NOISE to 0.1 m: rejected ")
-    assert "→ 0%, mean NIS" in said
-    assert said.endswith("m (replayed).")
+    assert "→ 0 %, mean NIS" in said
+    assert said.endswith("m (re-run).")
     said = words(sample, EKF2_EVP_NOISE=0.5)  # what was flown is right
-    assert said.startswith("Look elsewhere: EKF2_EVP_NOISE 0.5 is no remedy: mean NIS 0.9 → 0.041")
+    assert said.startswith("Look elsewhere: EKF2_EVP_NOISE 0.5 does not help: mean NIS 0.9 → 0.041")
     blind = replace(sample, ekf2_model=Unavailable("EKF2 replay", "no IMU", "Record it."))
     said = words(blind, EKF2_EVP_NOISE=0.2)
     assert said == "Because: set EKF2_EVP_NOISE to 0.2 m. Not replayed: no IMU."
@@ -252,4 +252,4 @@ def test_a_delay_that_the_replay_confirms_is(sample: Analysis) -> None:
     late = replace(late, flight=wrong)
     remedy = only("ekf2_ev_delay_wrong", late).remedy
     assert remedy.startswith("Set EKF2_EV_DELAY to 0 ms: mean NIS")
-    assert remedy.endswith("(replayed).")
+    assert remedy.endswith("(re-run).")
