@@ -170,7 +170,7 @@ def test_choose_source_only_fused_gnss_is_selected(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     track, reason = choose_source(flight)
     assert track.name == "vehicle_gps_position"
-    assert reason == "what EKF2 fused; no other position is in the log"
+    assert reason == "fused by EKF2; the only position in the log"
     prepared = prepare(flight)
     assert [line.name for line in prepared.lines] == ["aisle", "north", "east"]
     # external vision is not reported as missing

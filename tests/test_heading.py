@@ -90,7 +90,7 @@ def test_heading_insufficient_data_gives_reason():
         ({"imu": Unavailable("IMU", "not logged", "")}, "not logged"),
         ({"imu": flight.imu.iloc[::10]}, "the IMU rate is too low"),
         ({"attitude": flight.attitude.iloc[::25]}, "the attitude rate is too low"),
-        ({"positions": few}, "only 40 measurements"),
+        ({"positions": few}, "only 10 measurements"),
     ):
         found = estimate(replace(flight, **changed))
         assert isinstance(found, Unavailable)

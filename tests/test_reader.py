@@ -414,7 +414,7 @@ def test_sources_stand_in_order_of_preference(read):
     log.add(odometry("estimator_visual_odometry_aligned", 10.0, 12))
     flight = read(log)
     assert [(track.name, track.origin) for track in flight.positions] == PREFERRED
-    assert choose_source(flight)[1] == "the best source: logged as it arrived"
+    assert choose_source(flight)[1] == "most direct source: as received by PX4"
     for name, _ in PREFERRED:
         track, reason = choose_source(flight, name)
         assert track.name == name

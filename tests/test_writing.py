@@ -336,7 +336,7 @@ def test_clock_offset_auto_not_significant_adds_nothing(sample_log) -> None:
     found = run_comparison(request)
     assert found.settings.clock_offset_s == 0.0
     (said,) = (note for note in found.notes if note.startswith("--clock-offset auto: "))
-    assert said.endswith("holds zero: nothing was added to the stamps")
+    assert said.endswith("is not significant; no offset was applied")
 
 
 @pytest.mark.reallogs
