@@ -14,7 +14,7 @@ from px4fuse.report.words import verdict_notes, write_errors
 
 MAX_FINDINGS = 4
 ERROR_LEGEND = (
-    "KF - EKF2: RMS difference of position and velocity. RMSE: against ground truth. Consistent: "
+    "KF-EKF2: RMS difference of position and velocity. RMSE: against ground truth. Consistent: "
     "mean NIS within its 95 % band."
 )
 # Facts of the cover that the terminal prints

@@ -102,7 +102,7 @@ def write_errors(page: Page, analysis: Analysis) -> None:
         statistics += [one.truth] if has_truth else []
         return [_format_rms(statistic, field) for statistic in statistics for field in RMSE_FIELDS]
 
-    head = [*VERDICT_HEAD, *(["KF - EKF2,\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
+    head = [*VERDICT_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
     page.table(head, verdict_rows(axes, rms_cells), right=(2, 3, 5, 6, 7, 8))
 
@@ -132,14 +132,14 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "not with the true position. Check the error with ground truth or a loop."
         )
     small_deviations = [
-        f"{filter_name} {axis} {format_verdict(statement)}"
+        f"{filter_name} {axis} ({format_factor(statement.sigma_error_factor)}×)"
         for axis, filter_name, statement in statements
         if statement.verdict != "consistent" and statement.sigma_error_factor < SIGMA_FACTOR_FINDING
     ]
     if small_deviations:
         notes.append(
             f"Significant, but below the limit of {SIGMA_FACTOR_FINDING:g}× for a finding: "
-            f"{'; '.join(small_deviations)}."
+            f"{', '.join(small_deviations)}."
         )
     correlated = [
         f"{filter_name} {axis}, lag-1 autocorrelation {statement.lag1_autocorrelation:+.2f}"
