@@ -1,6 +1,6 @@
-"""Flights with hidden mistakes to practise on, as one page: look, prove it by a knob, choose, see.
+"""Practice page: simulated flights with hidden mistakes that the student identifies.
 
-For practice, not an exam: the answers are in the page, packed so that nobody reads them by chance.
+It is not an exam: the page contains the answers, compressed so they are not read by accident.
 """
 
 import base64
@@ -24,13 +24,14 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# Of two mistakes: that of the motion and one of single samples; a noise would hide another
+# Choices that can occur together: one acts on the motion, the other on single samples. A wrong
+# noise would hide another mistake
 COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
 HARDEST_LEVEL = 3
 MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
-# Short of a minute, with two turns. A quiet IMU, which SIGMA_A fits: else its own errors would look
-# like those of clock and frame
+# Less than a minute, with two turns. The IMU errors are small, because large ones would look like a
+# time offset or a misaligned frame
 SCENARIO_VALUES: dict[str, Any] = {
     "passes": 3,
     "speed_m_s": 1.5,
@@ -40,84 +41,85 @@ SCENARIO_VALUES: dict[str, Any] = {
     "tilt_error_deg": 0.02,
     "yaw_error_deg": 0.2,
 }
-LENGTH_M = (8.0, 12.0)
-# Of a mistake that has its moment, the finding that says when
-MOMENTS = {"nlos": "source_outliers", "jump": "source_jumps", "dropout": "source_gap"}
-NOISY_UWB = "noisy-uwb"  # not a mistake of the log: the filter's SIGMA_Z does not fit
+LENGTH_M = (8.0, 12.0)  # m; range of the aisle length
+# Finding that contains the time of a mistake
+FINDING_WITH_TIME = {"nlos": "source_outliers", "jump": "source_jumps", "dropout": "source_gap"}
+NOISY_UWB = "noisy-uwb"  # the log is correct, but SIGMA_Z of KF is too small
 
 
 class HiddenMistake(Record, frozen=True):
-    """A mistake that may be hidden in a flight.
+    """Mistake of a practice flight.
 
     Attributes
     ----------
     choice : str
-        What it has to be called.
+        Correct answer, a key of :data:`CHOICES`.
     mistake : str
         Name in :data:`px4fuse.simulation.mistakes.MISTAKES`, or :data:`NOISY_UWB`.
     sizes : tuple of str
-        As typed, for each level.
+        Size for each level, as on the command line.
     view : str
-        What of the page shows it.
-    what : str
-        What was done to the flight, with its size.
-    tell_tale : str
-        How it shows, and which knob proves it.
+        View of the page that shows it.
+    description : str
+        Text of the mistake, with its size.
+    symptom : str
+        Effect on the plots, and the setting that confirms the mistake.
     either_sign : bool
+        The size may also be negative.
     """
 
     choice: str
     mistake: str
     sizes: tuple[str, str, str]
     view: str
-    what: str
-    tell_tale: str
+    description: str
+    symptom: str
     either_sign: bool = False
 
 
 class MistakeTable(Record, frozen=True):
-    """What may be chosen, with what it stands for, and what may be hidden."""
+    """Tables of ``practice.toml``: answers with their texts, and mistakes."""
 
     choices: dict[str, str]
-    tricks: tuple[HiddenMistake, ...]
+    mistakes: tuple[HiddenMistake, ...]
 
 
 _TABLES = table(__file__, "practice.toml", MistakeTable)
-CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.tricks
+CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.mistakes
 
 
 @dataclass(frozen=True)
 class PracticeFlight:
-    """One flight of a set.
+    """Flight of a practice set.
 
     Attributes
     ----------
     scenario : Scenario
-    tricks : tuple of Trick
-        None, one or two, of different choices.
-    typed : tuple of str
-        Their sizes, in the same order.
+    mistakes : tuple of HiddenMistake
+        Zero to two, with different choices.
+    sizes : tuple of str
+        Sizes of the mistakes, as on the command line.
     """
 
     scenario: Scenario
-    tricks: tuple[HiddenMistake, ...]
-    typed: tuple[str, ...]
+    mistakes: tuple[HiddenMistake, ...]
+    sizes: tuple[str, ...]
 
     @property
     def right(self) -> list[str]:
-        """What has to be chosen."""
-        return sorted({trick.choice for trick in self.tricks}) or ["nothing"]
+        """Correct answers, sorted."""
+        return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
 
 def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
-    """Draw the flights of a set: every choice in turn, in an order by chance.
+    """Draw a random set of flights in which all choices occur equally often.
 
     Parameters
     ----------
     seed : int
-        The same seed, level and count give the same set.
+        Seed, level and count determine the set.
     level : {1, 2, 3}
-        1: one mistake, large; 2: smaller; 3: small, and two of them in every second flight.
+        1: one large mistake; 2: smaller; 3: small, two mistakes in some of the flights.
     count : int
     """
     rng = np.random.default_rng([seed, level, count])
@@ -128,19 +130,19 @@ def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ..
 
 
 def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeFlight:
-    tricks = [one for one in HIDDEN_MISTAKES if one.choice == choice]
-    tricks = [tricks[rng.integers(len(tricks))]] if tricks else []
-    if level == HARDEST_LEVEL and tricks and rng.random() < 0.5:
+    mistakes = [one for one in HIDDEN_MISTAKES if one.choice == choice]
+    mistakes = [mistakes[rng.integers(len(mistakes))]] if mistakes else []
+    if level == HARDEST_LEVEL and mistakes and rng.random() < 0.5:
         second_mistakes = [
             one for one in HIDDEN_MISTAKES if {one.choice, choice} in COMBINABLE_GROUPS
         ]
-        tricks += [second_mistakes[rng.integers(len(second_mistakes))]] if second_mistakes else []
-    typed = []
-    for trick in tricks:
-        sign = "-" if trick.either_sign and rng.random() < 0.5 else ""
-        typed.append(f"{sign}{trick.sizes[level - 1]}")
+        mistakes += [second_mistakes[rng.integers(len(second_mistakes))]] if second_mistakes else []
+    sizes = []
+    for mistake in mistakes:
+        sign = "-" if mistake.either_sign and rng.random() < 0.5 else ""
+        sizes.append(f"{sign}{mistake.sizes[level - 1]}")
     noise_m = next(
-        (float(t) for one, t in zip(tricks, typed, strict=True) if one.mistake == NOISY_UWB),
+        (float(s) for one, s in zip(mistakes, sizes, strict=True) if one.mistake == NOISY_UWB),
         SIGMA_Z_M,
     )
     scenario = Scenario(
@@ -150,7 +152,7 @@ def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeF
         sigma_uwb_m=noise_m,
         seed=int(rng.integers(MAX_SEED)),
     )
-    return PracticeFlight(scenario, tuple(tricks), tuple(typed))
+    return PracticeFlight(scenario, tuple(mistakes), tuple(sizes))
 
 
 def practice_text(
@@ -159,19 +161,19 @@ def practice_text(
     count: int = 10,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> str:
-    """Simulate a set of flights and lay out the page that asks about them.
+    """Simulate a set of flights and make the practice page.
 
     Parameters
     ----------
     seed, level, count : int
         See :func:`draw`.
     progress : callable
-        Told what is being done, how many flights are done, and of how many.
+        Called with a text, the number of finished flights and their total.
 
     Returns
     -------
     str
-        One page that needs no network; write it as UTF-8.
+        HTML page that loads nothing from a network; write it as UTF-8.
     """
     rounds, scripts = draw(seed, level, count), []
     data: dict[str, Any] = {}
@@ -183,7 +185,7 @@ def practice_text(
         "\n".join(scripts),
         data,
         command="practice",
-        heading="What is wrong with this flight?",
+        heading="Find the mistakes in this flight",
         title=f"seed {seed}, level {level}",
         rounds=count,
         choices=CHOICES,
@@ -191,11 +193,11 @@ def practice_text(
 
 
 def _flight_data(one: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
-    """One flight's data without what gives it away, and its elements with the packed answer."""
+    """Return the data of a flight without its findings, and its elements with the answer."""
     mistakes = [
-        f"{trick.mistake}={size}"
-        for trick, size in zip(one.tricks, one.typed, strict=True)
-        if trick.mistake != NOISY_UWB
+        f"{mistake.mistake}={size}"
+        for mistake, size in zip(one.mistakes, one.sizes, strict=True)
+        if mistake.mistake != NOISY_UWB
     ]
     simulation = flights.simulate(one.scenario, parse(mistakes))
     flight = flights.to_flight(simulation, f"flight {number + 1}")
@@ -205,9 +207,9 @@ def _flight_data(one: PracticeFlight, number: int) -> tuple[dict[str, Any], str]
     data = flight_data(analysis, packer)
     key = {
         "right": one.right,
-        "made": [
-            _describe_mistake(trick, size, findings)
-            for trick, size in zip(one.tricks, one.typed, strict=True)
+        "mistakes": [
+            _describe_mistake(mistake, size, findings)
+            for mistake, size in zip(one.mistakes, one.sizes, strict=True)
         ],
         "story": list(story(analysis, findings)),
         "findings": data["findings"],
@@ -219,15 +221,15 @@ def _flight_data(one: PracticeFlight, number: int) -> tuple[dict[str, Any], str]
 
 
 def _describe_mistake(
-    trick: HiddenMistake, size: str, findings: tuple[Finding, ...]
+    mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    """What was done to the flight, in words, and where and when it shows."""
-    what = trick.what.format(size=size)
-    moments = [one.spans_s[0] for one in findings if one.id == MOMENTS.get(trick.mistake)]
+    """Return description, symptom, view and time span (s) of a mistake for the page."""
+    finding_id = FINDING_WITH_TIME.get(mistake.mistake)
+    spans = [one.spans_s[0] for one in findings if one.id == finding_id]
     return {
-        "choice": trick.choice,
-        "what": what,
-        "tell": trick.tell_tale,
-        "view": trick.view,
-        "span": list(moments[0]) if moments else None,
+        "choice": mistake.choice,
+        "description": mistake.description.format(size=size),
+        "symptom": mistake.symptom,
+        "view": mistake.view,
+        "span": list(spans[0]) if spans else None,
     }

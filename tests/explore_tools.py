@@ -1,4 +1,4 @@
-"""A page of explore in a browser, and its engine on settings of Python's."""
+"""Helpers for tests of the explore page in a browser."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from px4fuse.request import ComparisonRequest
 
 @pytest.fixture(scope="session")
 def explored(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Analysis]:
-    """The page of the sample flight."""
-    from px4fuse.explore.page import html_text  # Bokeh takes long, and few tests need it
+    """Explore page and analysis of the sample flight."""
+    from px4fuse.explore.page import html_text  # imported here, because Bokeh is slow to import
 
     request = ComparisonRequest(log=str(sample_log))
-    analysis = px4fuse.analysis.run(request)  # as it is then
+    # looked up at run time, because a fixture replaces it
+    analysis = px4fuse.analysis.run(request)
     file = tmp_path_factory.mktemp("explore") / "sample.html"
     file.write_bytes(html_text(analysis).encode())
     return file, analysis
@@ -49,26 +50,26 @@ def show(browser: Browser, file: Path, at: str = "", width: int = 1400) -> Brows
 
 
 def axe() -> str:
-    """axe-core, to be run in a page."""
+    """Return the script of axe-core, an accessibility checker."""
     return files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8") + ";1"
 
 
 def serious(browser: Browser) -> list[Any]:
-    """What axe-core, which is in the page, finds that shuts somebody out."""
-    found = ask(
+    """Return the serious and critical violations that axe-core reports for the page."""
+    violations = ask(
         browser, "axe.run().then((r) => r.violations.map((v) => [v.impact, v.id, v.nodes[0].html]))"
     )
-    return [one for one in found if one[0] in ("serious", "critical")]
+    return [one for one in violations if one[0] in ("serious", "critical")]
 
 
 def open_view(browser: Browser, name: str) -> None:
-    """Show a tab of the page."""
+    """Open a view of the page."""
     ask(browser, f"Explore.then((e) => {{ e.open({json.dumps(name)}); }})")
     settle(browser)
 
 
 def settle(browser: Browser) -> None:
-    """Until what is under way is drawn, what follows the end of a drag too."""
+    """Wait until the page is drawn, including the redraw after a drag."""
     ask(
         browser,
         "new Promise((r) => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(r)),"
@@ -77,12 +78,12 @@ def settle(browser: Browser) -> None:
 
 
 def ask(browser: Browser, script: str) -> Any:
-    """What a script with ``await`` gives."""
+    """Run a script that returns a promise, and return its result."""
     return browser.ask_later(script)
 
 
 def mouse(page: Browser, places: list[tuple[float, float]]) -> None:
-    """Drag from the first place to the last."""
+    """Drag the mouse along positions (pixels)."""
     kinds = ["mousePressed", *["mouseMoved"] * (len(places) - 1), "mouseReleased"]
     for kind, (x, y) in zip(kinds, [*places, places[-1]], strict=True):
         page.call(
@@ -93,7 +94,7 @@ def mouse(page: Browser, places: list[tuple[float, float]]) -> None:
 
 
 def box(page: Browser, name: str) -> tuple[float, float, float, float]:
-    """Where an element is once it is scrolled to: x, y, width and height."""
+    """Scroll to an element and return x, y, width and height (pixels)."""
     x, y, width, height = page.ask(
         f"(() => {{ const node = document.getElementById({json.dumps(name)});"
         "node.scrollIntoView({block: 'center'}); const box = node.getBoundingClientRect();"

@@ -1,4 +1,4 @@
-"""What a report shows, as text that can be read and compared line by line."""
+"""Reports and results as text that can be compared line by line with golden files."""
 
 from __future__ import annotations
 
@@ -25,19 +25,18 @@ from matplotlib.text import Text
 from px4fuse.report.page import Block
 
 GOLDEN = Path(__file__).with_name("golden")
-# What is in results because of the machine, the file or the command
+# Fields of the results that depend on computer, file or command
 NOT_KEPT = ("schema", "request", "provenance", "log", "command", "report_sha256")
-# Numbers of which only the spread is kept
-MANY = 12
+MANY = 12  # longer lists are summarised by their statistics
 
 
 NUMBER = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
-# What hangs on the last digits of a processor: where an iteration ends, and the file with them
+# Iteration counts and hashes, which depend on the rounding of the processor
 LAST_DIGITS = re.compile(r"\b[0-9a-f]{64}\b|\b[0-9a-f]{12,32}…|(?<=iterations )\d+")
 
 
 def agrees(name: str, lines: list[str], paragraph: int | None = None) -> None:
-    """Compare with what is kept, numbers with a fraction to one in their last digit."""
+    """Compare lines with a golden file; decimal numbers may differ by one in the last digit."""
     path, kept, found = GOLDEN / f"{name}.txt", [""], "\n".join(lines)
     if paragraph is not None:
         kept = path.read_text(encoding="utf-8").rstrip().split("\n\n")
@@ -55,9 +54,9 @@ def agrees(name: str, lines: list[str], paragraph: int | None = None) -> None:
 
 
 def is_alike(one: str, other: str) -> bool:
-    """Whether two lines say the same, their numbers as near as another processor has them.
+    """Return True if two lines agree within the rounding differences between processors.
 
-    A locator chooses its ticks by how many fit, which the last digit of a width decides.
+    Tick lines always agree: the last digit of a width can change the number of ticks.
     """
     if one == other or (one.lstrip().startswith("x [") and other.lstrip().startswith("x [")):
         return True
@@ -72,18 +71,18 @@ def is_alike(one: str, other: str) -> bool:
 
 
 def rounded(text: str) -> str:
-    """Numbers with a fraction in four digits."""
+    """Round the decimal numbers of a text to four digits."""
     return re.sub(r"-?\d+\.\d+(?:e[-+]?\d+)?", lambda found: value(float(found[0])), text)
 
 
 def written(path: Path) -> Iterator[str]:
-    """The numbers of results."""
+    """Yield the values of a results file."""
     results = json.loads(path.read_text(encoding="utf-8"))
     yield from of_values({name: results[name] for name in results if name not in NOT_KEPT})
 
 
 def value(part: Any, digits: int = 4) -> str:
-    """A value in few digits, so that the last ones of another machine do not show."""
+    """Format a value with few digits, so that rounding differences do not appear."""
     if isinstance(part, bool) or part is None or isinstance(part, str):
         return str(part)
     if isinstance(part, float | int | np.floating | np.integer):
@@ -98,7 +97,7 @@ def value(part: Any, digits: int = 4) -> str:
 
 
 def numbers(some: Any) -> str:
-    """How many numbers there are, and how they are spread: first, last, mean, deviation."""
+    """Summarise numbers: count, first, last, mean and standard deviation."""
     known = np.ma.filled(np.ma.asarray(some, dtype=float), np.nan).ravel()
     known = known[np.isfinite(known)]
     if not len(known):
@@ -107,7 +106,7 @@ def numbers(some: Any) -> str:
 
 
 def colour(given: Any) -> str:
-    """Colours as red, green, blue and opacity."""
+    """Format colours as hexadecimal red, green, blue and opacity."""
     try:
         return str(to_hex(given, keep_alpha=True))
     except (TypeError, ValueError):
@@ -115,7 +114,7 @@ def colour(given: Any) -> str:
 
 
 def of_artist(artist: Any) -> Iterator[str]:
-    """One line about something drawn."""
+    """Describe an artist in one line."""
     label = str(artist.get_label())
     name = f"{type(artist).__name__} {'' if label.startswith('_') else label!r}"
     looks = f"z {value(artist.get_zorder())} alpha {value(artist.get_alpha())}"
@@ -154,7 +153,7 @@ def of_artist(artist: Any) -> Iterator[str]:
 
 
 def ticks(axis: Axis) -> str:
-    """The labels of the ticks in view, and how many small ticks there are."""
+    """Describe the visible ticks: positions, labels and number of minor ticks."""
     low, high = sorted(axis.get_view_interval())
     places = [float(place) for place in axis.get_majorticklocs() if low <= place <= high]
     labels = axis.get_major_formatter().format_ticks(places)
@@ -164,7 +163,7 @@ def ticks(axis: Axis) -> str:
 
 
 def of_axes(axes: Axes) -> Iterator[str]:
-    """Where axes are, what they span, and what is drawn in them."""
+    """Describe axes: position, limits, labels, ticks and artists."""
     spans = value([*axes.get_xlim(), *axes.get_ylim()])
     scales = f"{axes.get_xscale()} {axes.get_yscale()} {'' if axes.axison else 'bare'}"
     yield f"axes {value(axes.get_position().bounds)} spans {spans} {scales}".rstrip()
@@ -178,7 +177,7 @@ def of_axes(axes: Axes) -> Iterator[str]:
 
 
 def of_figure(figure: Figure) -> Iterator[str]:
-    """All that a figure draws."""
+    """Describe a figure with its axes."""
     yield f"figure {value(figure.get_size_inches())}"
     for artist in [*figure.texts, *figure.lines, *figure.legends]:
         yield from of_artist(artist)
@@ -187,7 +186,7 @@ def of_figure(figure: Figure) -> Iterator[str]:
 
 
 def of_blocks(blocks: Sequence[Block]) -> Iterator[str]:
-    """What stands on pages, a line for each word, table row and artist."""
+    """Describe the blocks of pages, one line per block, table row and artist."""
     for block in blocks:
         inner = ("figure", "axes", "columns", "blocks", "rows")
         plain = {name: part for name, part in block.items() if name not in inner}
@@ -201,7 +200,7 @@ def of_blocks(blocks: Sequence[Block]) -> Iterator[str]:
 
 
 def of_values(part: Any, path: str = "") -> Iterator[str]:
-    """Every value of some results by its path."""
+    """Yield each value of nested data with its path."""
     if isinstance(part, Mapping):
         for name, below in part.items():
             yield from of_values(below, f"{path}.{name}" if path else str(name))

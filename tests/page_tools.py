@@ -1,4 +1,4 @@
-"""What a page of a report says and draws, taken out of its blocks."""
+"""Texts and axes of report pages, extracted from their blocks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from px4fuse.report.pdf import compile_pdf
 
 
 def every(blocks: Sequence[Block]) -> Iterator[Block]:
-    """Blocks with those within them, in order."""
+    """Yield blocks and nested blocks in order."""
     for block in blocks:
         yield block
         for inner in (*block.get("columns", ()), block.get("blocks", ())):
@@ -22,7 +22,7 @@ def every(blocks: Sequence[Block]) -> Iterator[Block]:
 
 
 def texts(*pages: Page) -> list[str]:
-    """Every text, in order: titles, sentences, cells, sentences of panels."""
+    """Return all texts in order: titles, paragraphs, captions and table cells."""
     found = []
     for page in pages:
         for block in every(page.blocks):
@@ -35,12 +35,12 @@ def texts(*pages: Page) -> list[str]:
 
 
 def words(*pages: Page) -> str:
-    """All that they say."""
+    """Return all texts as one string."""
     return " ".join(texts(*pages))
 
 
 def axes_of(*pages: Page) -> list[Axes]:
-    """Every axes that they draw."""
+    """Return all axes of the pages."""
     return [
         axes
         for page in pages
@@ -51,7 +51,7 @@ def axes_of(*pages: Page) -> list[Axes]:
 
 
 def set_by_typst(*pages: Page) -> list[str]:
-    """Text of each sheet of a PDF of these pages."""
+    """Set the pages as PDF and return the text of each sheet."""
     blocks = data([block for page in pages for block in page.blocks])
     report = {
         "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,

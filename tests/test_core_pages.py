@@ -1,4 +1,4 @@
-"""The core pages and the other axes: what they show, where, and what they say instead."""
+"""Cover, flight and other-axes pages: marks, map, findings, and texts for missing data."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def drawn(draw, of: tuple[Analysis, ComparisonResults]) -> list[Page]:
 
 @pytest.fixture(scope="module")
 def eventful() -> Analysis:
-    """A flight on which everything happens that is marked."""
+    """Analysis of a flight with every kind of event."""
     made = aisle_flight(
         duration_s=100.0,
         uwb=Uwb(gap_s=(60.0, 65.0), outlier_share=0.03),
@@ -55,11 +55,11 @@ def eventful() -> Analysis:
     return with_noises(comparison)
 
 
-def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Analysis) -> None:
-    said = [artist.get_label() for artist in marks.legend_entries(eventful)]
-    assert said == [
-        "flight modes, in turn", "on the ground", "source silent", "log dropout", "EKF2 rejected",
-        "outlier", "EKF2 reset", "take-off", "landing",
+def test_draw_marks_draws_each_kind_with_its_label(eventful: Analysis) -> None:
+    labels = [artist.get_label() for artist in marks.legend_entries(eventful)]
+    assert labels == [
+        "flight modes (alternating)", "on the ground", "gap in position source", "log dropout",
+        "EKF2 rejected", "outlier", "EKF2 reset", "take-off", "landing",
     ]  # fmt: skip
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.plot([6.0, 94.0], [2.0, 3.0])
@@ -79,14 +79,14 @@ def test_every_kind_of_mark_is_drawn_once_with_its_name(eventful: Analysis) -> N
     assert set(axes.lines[1].get_xdata()) <= set(marks.outlier_times(eventful))
 
 
-def test_marks_of_a_long_flight_do_not_pile_up() -> None:
+def test_marks_of_long_flight_do_not_overlap() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
-    kept = marks._visible_times(time_s, 3600.0 * marks.MIN_MARK_DISTANCE)
-    assert len(kept) <= 1.0 / marks.MIN_MARK_DISTANCE + 1.0
-    assert set(kept) <= set(time_s)
+    visible = marks._visible_times(time_s, 3600.0 * marks.MIN_MARK_DISTANCE)
+    assert len(visible) <= 1.0 / marks.MIN_MARK_DISTANCE + 1.0
+    assert set(visible) <= set(time_s)
 
 
-def test_the_zoom_is_where_the_filter_is_updated() -> None:
+def test_zoom_window_avoids_source_gap() -> None:
     made = aisle_flight(duration_s=120.0, uwb=Uwb(gap_s=(50.0, 70.0)))
     comparison = compare(made)
     start, end = flight.zoom_window(comparison.main, comparison.segment)
@@ -94,11 +94,13 @@ def test_the_zoom_is_where_the_filter_is_updated() -> None:
     assert ((updates >= start) & (updates <= end)).sum() == flight.ZOOM_UPDATES + 1
     assert end - start < 4.0  # beside the gap in the middle, not across it
     assert abs((start + end) / 2.0 - 60.0) < 12.5
-    assert "In the 20." in panels.sigma_sentence(unexplained(comparison), comparison.main)
+    sentence = panels.sigma_sentence(unexplained(comparison), comparison.main)
+    assert sentence.startswith("In the 20.")
+    assert "σ grew to" in sentence
 
 
 @pytest.mark.parametrize("count", [3, 40])
-def test_the_map_stays_and_every_finding_stands_once(count: int) -> None:
+def test_cover_keeps_map_and_prints_each_finding_once(count: int) -> None:
     findings = tuple(
         Finding(f"f{i}", "warning", f"Finding number {i}. " * 6, "Do it.", spans_s=((1.0, 2.0),))
         for i in range(count)
@@ -107,34 +109,36 @@ def test_the_map_stays_and_every_finding_stands_once(count: int) -> None:
     (page,) = drawn(cover.draw, of)
     (axes,) = axes_of(page)
     assert axes.get_aspect() == 1.0
-    said = texts(page)
-    told = [sum(f"Finding number {i}." in text for text in said) for i in range(count)]
-    assert told == [1] * count
-    assert said.count("1.0 s to 2.0 s") == count
+    page_texts = texts(page)
+    counts = [sum(f"Finding number {i}." in text for text in page_texts) for i in range(count)]
+    assert counts == [1] * count
+    assert page_texts.count("1.0 s to 2.0 s") == count
+    assert all(f"F{i} [f{i}]" in page_texts for i in range(count))
     sheets = set_by_typst(page)
-    assert "From above" in sheets[0]
+    assert "Map" in sheets[0]
     assert (f"Finding number {count - 1}." in sheets[0]) == (count == 3)
 
 
-def test_the_map_lies_along_the_aisle() -> None:
+def test_map_is_aligned_with_aisle() -> None:
     (axes,) = axes_of(*drawn(cover.draw, document(compare(aisle_flight(), heading_deg=200.0))))
-    assert axes.get_xlabel() == "along 20° from north (m)"
+    assert axes.get_xlabel() == "along heading 20° (m)"
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "expected"),
     [
-        ({"ekf2": None}, "There is no EKF2 to compare with"),
-        ({"truth": False}, "The log has no truth"),
-        ({"ekf2": Estimator(innovations_logged=False, variance_logged=False)}, "not available"),
-        ({"ekf2": None, "truth": False}, "No error is drawn"),
+        ({"ekf2": None}, "No EKF2 in the log"),
+        ({"truth": False}, "No ground truth in the log"),
+        ({"ekf2": Estimator(innovations_logged=False, variance_logged=False)}, "not logged"),
+        ({"ekf2": None, "truth": False}, "No error plot"),
     ],
+    ids=["no EKF2", "no truth", "no innovations", "no reference"],
 )
-def test_what_is_absent_leaves_a_line_and_no_empty_panel(changes, says: str) -> None:
+def test_pages_missing_data_have_note_and_no_empty_panel(changes, expected: str) -> None:
     of = document(compare(aisle_flight(**changes)))
     draws = cover.draw, flight.draw, flight.draw_innovations, flight.draw_other_axes
     pages = [page for draw in draws for page in drawn(draw, of)]
-    assert says in words(*pages)
+    assert expected in words(*pages)
     assert len(pages) == 4
     for axes in axes_of(*pages):
         assert axes.axison

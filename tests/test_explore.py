@@ -1,4 +1,4 @@
-"""The page of explore in a real browser, its numbers against Python; the command."""
+"""Explore page in a browser: numbers against Python, interaction, security; the command."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ VALUES = "[...document.querySelectorAll('.knob input[type=number]')].map((node) 
 
 
 def bare(flight: Flight) -> Analysis:
-    """Without what takes long and the page can do without."""
+    """Make an analysis without the slow explanations, which the page does not need."""
     asked = ComparisonRequest(log=flight.log.name)
     return replace(unexplained(compare(flight)), request=asked)
 
@@ -53,7 +53,7 @@ def page_of(analysis: Analysis, file: Path) -> Path:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_the_policy_allows_the_scripts_that_are_there_and_no_network(
+def test_policy_allows_only_included_scripts(
     explored: tuple[Path, Analysis],
 ) -> None:
     text = explored[0].read_text(encoding="utf-8")
@@ -73,7 +73,7 @@ def test_the_policy_allows_the_scripts_that_are_there_and_no_network(
         assert attributes.get("href") in (None, "data:,")
 
 
-def test_it_is_small_and_says_nothing_of_the_machine(
+def test_page_is_small_and_contains_no_paths(
     explored: tuple[Path, Analysis], tmp_path: Path
 ) -> None:
     text = explored[0].read_text(encoding="utf-8")
@@ -82,7 +82,7 @@ def test_it_is_small_and_says_nothing_of_the_machine(
     assert str(explored[0].parent) not in own
     assert "/home/" not in own
     assert "/tmp/" not in own
-    # ten minutes at full rate
+    # ten minutes of IMU data at the full rate
     analysis = bare(aisle_flight(duration_s=600.0, imu=Imu(rate_hz=250.0)))
     assert page_of(analysis, tmp_path / "long.html").stat().st_size < 6e6
 
@@ -91,18 +91,18 @@ def test_it_is_small_and_says_nothing_of_the_machine(
 
 
 def drag(page: Browser, knob: str, share: float) -> None:
-    """With the mouse, from where the slider stands."""
+    """Drag a slider with the mouse to a share of its range."""
     x, y, width, height = box(page, knob)
     now = page.ask(
         f"(({{value, max}}) => value / max)(document.getElementById({json.dumps(knob)}))"
     )
-    # the middle of the thumb never reaches the ends
+    # the centre of the thumb does not reach the ends of the slider
     places = [x + 8 + (width - 16) * at for at in np.linspace(now, share, 6)]
     mouse(page, [(at, y + height / 2) for at in places])
 
 
 def of_command(page: Browser, sample_log: Path) -> ComparisonRequest:
-    """The request that the page's own command line makes."""
+    """Parse the command on the page into a request."""
     words = shlex.split(page.ask("document.querySelector('#command').textContent"))
     assert words[:2] == ["px4fuse", "compare"]
     with compare_command.make_context("compare", words[2:]) as context:
@@ -123,23 +123,21 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
             str(found.count),
         ]  # fmt: skip
 
-    names = ["Mean NIS (1 is consistent)", "95 % band of it", "Outside ±2√S (5 % is right)",
-             "Lag-1 correlation of ν", "Measurements"]  # fmt: skip
+    names = ["Mean NIS (expected 1)", "95 % band", "Outside ±2√S (expected 5 %)",
+             "Lag-1 autocorrelation of ν", "Measurements"]  # fmt: skip
     both = zip(*(statement(result.filters[name]) for name in FILTERS), strict=True)
-    told = {name: list(pair) for name, pair in zip(names, both, strict=True)}
+    expected = {name: list(pair) for name, pair in zip(names, both, strict=True)}
     difference: Any = result.difference
-    ours, theirs = (result.filters[name].truth for name in FILTERS)
-    told["Position: RMS to EKF2"] = [f"{difference.position_rmse_m:.3f} m", "–"]
-    told["Velocity: RMS to EKF2"] = [f"{difference.velocity_rmse_m_s:.3f} m/s", "–"]
+    errors = [result.filters[name].truth for name in FILTERS]
+    expected["Position: KF - EKF2, RMS"] = [f"{difference.position_rmse_m:.3f} m", "–"]
+    expected["Velocity: KF - EKF2, RMS"] = [f"{difference.velocity_rmse_m_s:.3f} m/s", "–"]
     for name, unit in (("Position", "m"), ("Velocity", "m/s")):
         field = "position_rmse_m" if unit == "m" else "velocity_rmse_m_s"
-        told[f"{name}: RMS to truth"] = [
-            f"{getattr(one, field):.3f} {unit}" for one in (ours, theirs)
-        ]
-    return told
+        expected[f"{name} RMSE"] = [f"{getattr(one, field):.3f} {unit}" for one in errors]
+    return expected
 
 
-def test_dragging_gives_what_the_command_on_the_page_gives(
+def test_dragged_sliders_match_command_on_page(
     page: Browser, explored: tuple[Path, Analysis], sample_log: Path
 ) -> None:
     before = page.ask(TABLE)
@@ -156,7 +154,7 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
     assert request.sigma_z_m < 0.05
     assert request.dt_s < 0.05
     assert 0.03 < request.clock_offset_s < 0.09
-    # what the stamps decide otherwise is held where it is
+    # the command states segment and aisle, which the timestamps would change
     segment = explored[1].segment
     assert (request.start_s, request.end_s) == pytest.approx((segment.start_s, segment.end_s))
     assert request.heading_deg == pytest.approx(explored[1].main.axis.heading_deg)
@@ -164,12 +162,14 @@ def test_dragging_gives_what_the_command_on_the_page_gives(
     north = next(result for result in comparison.axes.values() if result.axis.name == "north")
     shown = page.ask(TABLE)
     assert shown != before
-    told = cells(north)
-    assert {name: shown[name] for name in told} == told
-    assert re.fullmatch(r"understated [\d,]+(\.\d+)?× in σ", shown["Verdict"][0])
+    expected = cells(north)
+    assert {name: shown[name] for name in expected} == expected
+    assert re.fullmatch(r"overconfident, σ [\d,]+(\.\d+)?× too small", shown["Verdict"][0])
 
 
-def test_buttons(page: Browser, explored: tuple[Path, Analysis]) -> None:
+def test_buttons_set_estimated_ekf2_and_lesson_values(
+    page: Browser, explored: tuple[Path, Analysis]
+) -> None:
     tuned = explored[1].tuning["horizontal"]
     page.click("#likely")
     settle(page)
@@ -187,23 +187,25 @@ def test_buttons(page: Browser, explored: tuple[Path, Analysis]) -> None:
     assert page.ask("document.querySelector('#command').textContent").endswith("aisle_uwb.ulg")
 
 
-def test_a_bad_address_or_number_is_refused_in_words(page: Browser) -> None:
+def test_invalid_address_or_number_prints_message(page: Browser) -> None:
     page.ask("location.hash = '#sigma-a=-1&sigma-z=0.2&dt=abc&axis=<b>&input=gps&view=nowhere'")
     settle(page)
-    said = "document.getElementById('said').textContent"
-    assert page.ask(said) == (
-        "The address has no usable sigma-a, dt, axis, input, view: left as it was."
+    message = "document.getElementById('message').textContent"
+    assert page.ask(message) == (
+        "Invalid values in the address are ignored: sigma-a, dt, axis, input, view."
     )
     page.ask(
         "(() => { const n = document.getElementById('sigma-z-value'); n.value = '500';"
         "n.dispatchEvent(new Event('change')); })()"
     )
     settle(page)
-    assert "give 0.0001 to 100 m" in page.ask(said)
+    assert "enter 0.0001 to 100 m" in page.ask(message)
     assert page.ask(VALUES)[:3] == ["0.5", "0.2", "0.1"]
 
 
-def test_steps_through_measurements(page: Browser, explored: tuple[Path, Analysis]) -> None:
+def test_step_view_shows_numbers_of_each_measurement(
+    page: Browser, explored: tuple[Path, Analysis]
+) -> None:
     result = explored[1].main
     updates, steps = result.replay.updates, result.replay.steps
     open_view(page, "step")
@@ -221,7 +223,7 @@ def test_steps_through_measurements(page: Browser, explored: tuple[Path, Analysi
         f"S = HP⁻Hᵀ + R = {row['innovation_variance_m2']:.5f} m²",
         f"K = P⁻Hᵀ/S = [{row['gain_position']:.4f}, {row['gain_velocity']:.4f} 1/s]",
         f"x⁺ = x⁻ + Kν = [{after['position_m']:.4f} m, {after['velocity_m_s']:.4f} m/s]",
-        f"σ_p shrinks: {np.sqrt(row['prior_position_variance_m2']):.4f} to "
+        f"σ_p decreases: {np.sqrt(row['prior_position_variance_m2']):.4f} to "
         f"{np.sqrt(after['position_variance_m2']):.4f} m",
     ):
         assert part in text
@@ -232,7 +234,7 @@ def test_steps_through_measurements(page: Browser, explored: tuple[Path, Analysi
     assert page.ask("document.getElementById('now').textContent").startswith("Measurement 3 ")
 
 
-def test_findings_and_buttons_move_all_plots(page: Browser) -> None:
+def test_findings_and_buttons_set_time_of_all_plots(page: Browser) -> None:
     span = "document.getElementById('span').textContent"
     whole = page.ask(span)
     open_view(page, "recorded")
@@ -255,22 +257,22 @@ def test_findings_and_buttons_move_all_plots(page: Browser) -> None:
     assert page.ask(span) != whole
 
 
-def test_the_pointer_tells_values_and_the_dark_has_its_colours(page: Browser) -> None:
+def test_tooltips_show_values_and_dark_mode_has_colours(page: Browser) -> None:
     open_view(page, "track")
     x, y, width, height = box(page, "position")
     for step in range(3):
         at = {"x": x + width / 2 + step, "y": y + height / 2}
         page.call("Input.dispatchMouseEvent", type="mouseMoved", **at)
         settle(page)
-    # tips stand in the shadow roots of the plots
-    told = page.ask(
+    # tooltips are in the shadow roots of the plots
+    tooltips = page.ask(
         "(() => { const all = (root) => [...root.querySelectorAll('*')].flatMap((node) =>"
         "node.shadowRoot ? [...node.shadowRoot.children].map((one) => one.textContent)"
         ".concat(all(node.shadowRoot)) : []);"
         "return all(document.body).join(' '); })()"
     )
-    assert re.search(r"ours: *-?[\d.]+ m", told)
-    assert re.search(r"EKF2: *-?[\d.]+ m", told)
+    assert re.search(r"KF: *-?[\d.]+ m", tooltips.replace("EKF2", ""))
+    assert re.search(r"EKF2: *-?[\d.]+ m", tooltips)
     back = "Explore.then((e) => e.model('position').background_fill_color)"
     light = ask(page, back)
     page.scheme("dark")
@@ -281,22 +283,22 @@ def test_the_pointer_tells_values_and_the_dark_has_its_colours(page: Browser) ->
     assert ask(page, back) == light
 
 
-def test_a_box_on_the_track_is_a_time(page: Browser) -> None:
+def test_box_on_map_selects_time(page: Browser) -> None:
     span = "document.getElementById('span').textContent"
     whole = page.ask(span)
     open_view(page, "step")
     x, y, width, height = box(page, "plan")
-    # the first half of the drawing, from above: the track's far end is left once and reached thrice
+    # a box over one end of the track, which the vehicle leaves and reaches several times
     corners = ((0.25, 0.05), (0.5, 0.2), (0.95, 0.35))
     mouse(page, [(x + across * width, y + down * height) for across, down in corners])
     low, high = (float(word) for word in re.findall(r"[\d.]+", page.ask(span)))
     assert page.ask(span) != whole
-    # it is there from 22 s to 106 s, see the picture of the position
+    # the vehicle is in the box from 22 s to 106 s
     assert 15.0 < low < 30.0
     assert 95.0 < high < 112.0
 
 
-def test_text_from_a_log_is_text(browser: Browser, tmp_path: Path) -> None:
+def test_markup_in_log_name_is_shown_as_text(browser: Browser, tmp_path: Path) -> None:
     flight = aisle_flight(duration_s=20.0)
     flight = replace(flight, log=replace(flight.log, name=f"{MARKUP}.ulg"))
     show(browser, page_of(bare(flight), tmp_path / "hostile.html"))
@@ -307,13 +309,13 @@ def test_text_from_a_log_is_text(browser: Browser, tmp_path: Path) -> None:
     assert browser.complaints() == []
 
 
-def test_without_ekf2_truth_and_imu(browser: Browser, tmp_path: Path) -> None:
+def test_page_without_ekf2_truth_imu_shows_kf_only(browser: Browser, tmp_path: Path) -> None:
     flight = aisle_flight(duration_s=20.0, ekf2=None, truth=False, imu=None)
     show(browser, page_of(bare(flight), tmp_path / "bare.html"))
     table = browser.ask(TABLE)
     assert {pair[1] for name, pair in table.items() if name != "Verdict"} == {"–"}
-    assert table["Verdict"][1] == "not known"
-    assert "Truth: " in browser.ask("document.getElementById('why').textContent")
+    assert table["Verdict"][1] == "unknown"
+    assert "Ground truth: " in browser.ask("document.getElementById('why').textContent")
     assert browser.ask("document.querySelector('[value=imu]').disabled")
     assert browser.ask("document.getElementById('likely').disabled")
     assert browser.complaints() == []
@@ -324,12 +326,12 @@ def test_without_ekf2_truth_and_imu(browser: Browser, tmp_path: Path) -> None:
 
 @pytest.fixture
 def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests of where it goes."""
+    """Replace the page by an empty one, for tests of the output path."""
     monkeypatch.setattr(pages, "html_text", lambda _: "")
 
 
 @pytest.mark.usefixtures("no_page")
-def test_without_a_log_it_is_the_sample_flight(
+def test_explore_without_log_uses_sample_flight(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -345,7 +347,7 @@ def test_without_a_log_it_is_the_sample_flight(
 
 
 @pytest.mark.usefixtures("no_drawing", "no_page")
-def test_open_opens_what_is_looked_at(
+def test_open_option_opens_written_file(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[str] = []

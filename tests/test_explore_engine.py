@@ -1,4 +1,4 @@
-"""The engine of the page in a real browser, against px4fuse.replay."""
+"""KF of the explore page in a browser, compared with px4fuse.replay."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from px4fuse.readers import read_log
 
 TRIES = 50
 TOLERANCE = 1e-9
-# What the engine makes of one flight, all settings in one go
+# Runs the engine on one flight with all settings
 SCRIPT = """(async () => {
   const arrays = await Engine.unpack(%(text)s, %(specs)s);
   const flight = %(flight)s;
@@ -49,7 +49,7 @@ SCRIPT = """(async () => {
 })()"""
 
 
-# What the page calls the columns of a replay
+# Columns of a replay: name in the page, name in Python
 COLUMNS = {
     "steps": {
         "time": "time", "p": "position_m", "v": "velocity_m_s", "p00": "position_variance_m2",
@@ -77,23 +77,24 @@ def in_browser(
 ) -> list[dict[str, dict[str, list[float]]]]:
     packer = Packer()
     flight = replay_signals(comparison, packer)
-    asked = [
+    tries_for_page = [
         (at, {"sigmaA": one.sigma_a_m_s2, "sigmaZ": one.sigma_z_m, "dt": one.dt_s,
               "input": one.input, "offset": one.clock_offset_s})
         for at, one in tries
     ]  # fmt: skip
-    words = {"text": packer.text(), "specs": packer.specs, "flight": flight, "tries": asked}
-    made = ask(engine, SCRIPT % {name: json.dumps(value) for name, value in words.items()})
-    return list(made)
+    values = {
+        "text": packer.text(), "specs": packer.specs, "flight": flight, "tries": tries_for_page
+    }  # fmt: skip
+    return list(ask(engine, SCRIPT % {name: json.dumps(one) for name, one in values.items()}))
 
 
 def in_python(comparison: Comparison, at: int, settings: Settings) -> Replay:
-    """As ``compare`` would with the segment and the aisle held."""
+    """Run KF in Python with the segment and the aisle of the comparison."""
     track = shift_clock(raw_source(comparison), settings.clock_offset_s)
-    held = list(comparison.axes.values())[at].axis
+    original = list(comparison.axes.values())[at].axis
     axis = make_axes(
-        comparison.flight, track, comparison.segment, names=(held.name,),
-        heading_deg=held.heading_deg if held.name == "aisle" else None,
+        comparison.flight, track, comparison.segment, names=(original.name,),
+        heading_deg=original.heading_deg if original.name == "aisle" else None,
     )[0]  # fmt: skip
     return replay(axis, settings)
 
@@ -101,7 +102,7 @@ def in_python(comparison: Comparison, at: int, settings: Settings) -> Replay:
 def some_settings(rng: np.random.Generator, imu: bool) -> Settings:
     a, z, dt = np.exp(rng.uniform(np.log([1e-3, 1e-3, 0.02]), np.log([50.0, 5.0, 1.0]))).tolist()
     offset = 0.0 if rng.random() < 0.2 else float(rng.uniform(-1.0, 1.0)) * OFFSET_REACH_S
-    if rng.random() < 0.3:  # a grid that measurements fall on
+    if rng.random() < 0.3:  # a grid that contains the measurement times
         dt, offset = float(rng.choice([0.1, 0.2, 0.05])), round(offset, 1)
     return Settings(a, z, dt, "imu" if imu and rng.random() < 0.8 else "zero", offset)
 
@@ -114,66 +115,66 @@ def flights(name: str, sample_log: Path) -> Comparison:
         return compare(log, start_s=30.0, end_s=45.0)
     if name == "IMU with a gap":
         flight = aisle_flight(duration_s=30.0, imu=Imu(gap_s=(9.0, 11.5)))
-        # and ends before the source does
+        # the IMU also ends before the position source
         return compare(replace(flight, imu=flight.imu.loc[:27.0]))
     return compare(aisle_flight(duration_s=30.0, imu=None, uwb=Uwb(gap_s=(12.0, 16.0))))
 
 
-@pytest.mark.parametrize("name", ["sample", "odometry", "IMU with a gap", "no IMU, silent source"])
-def test_the_page_replays_as_python_does(engine: Browser, sample_log: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["sample", "odometry", "IMU with a gap", "no IMU, source gap"])
+def test_engine_matches_python_replay(engine: Browser, sample_log: Path, name: str) -> None:
     comparison = flights(name, sample_log)
     rng = np.random.default_rng(len(name))
     imu = comparison.settings.input == "imu"
     axes = len(comparison.axes)
     tries = [(int(rng.integers(axes)), some_settings(rng, imu)) for _ in range(TRIES)]
     gaps = 0
-    for (at, settings), made in zip(tries, in_browser(engine, comparison, tries), strict=True):
+    for (at, settings), page in zip(tries, in_browser(engine, comparison, tries), strict=True):
         run = in_python(comparison, at, settings)
         gaps += run.input_gap_s > 0.0
         for part, columns in COLUMNS.items():
             frame = getattr(run, part).rename_axis("time").reset_index()
-            for column, ours in columns.items():
-                close(made[part][column], frame[ours], column, settings)
-        times = np.array(made["between"]["time"])
+            for column, python_column in columns.items():
+                close(page[part][column], frame[python_column], column, settings)
+        times = np.array(page["between"]["time"])
         for column, values in zip(("p", "v"), state_at(run, times), strict=True):
-            # JSON has null where there is no state
-            found = np.array(made["between"][column], dtype=float)
+            # null in JSON means no state
+            found = np.array(page["between"][column], dtype=float)
             close(list(found), values, column, settings)
     assert (gaps > 0) == (name == "IMU with a gap")
 
 
-def close(made: list[float], expected: Any, column: str, settings: Settings) -> None:
-    assert len(made) == len(expected), (column, asdict(settings))
-    # variances after a gap are of the order of 1e4: of those its share
-    share = 0.0 if column in ("nu", "p", "v", "z", "time") else TOLERANCE
+def close(page: list[float], expected: Any, column: str, settings: Settings) -> None:
+    """Check a column of the page; variances, up to 1e4 after a gap, relative to their size."""
+    assert len(page) == len(expected), (column, asdict(settings))
+    relative = 0.0 if column in ("nu", "p", "v", "z", "time") else TOLERANCE
     np.testing.assert_allclose(
-        made, np.asarray(expected), rtol=share, atol=TOLERANCE, err_msg=f"{column} {settings}"
+        page, np.asarray(expected), rtol=relative, atol=TOLERANCE, err_msg=f"{column} {settings}"
     )
 
 
-def test_arrays_come_back_as_they_went(engine: Browser) -> None:
+def test_unpack_returns_packed_arrays(engine: Browser) -> None:
     rng = np.random.default_rng(2)
     packer = Packer()
-    given = [
+    arrays = [
         rng.normal(0.0, 100.0, 500), np.empty(0), np.array([-1e9, 1e9, 0.0]),
         np.arange(1000) / 250.0, np.zeros(5),
     ]  # fmt: skip
-    for values in given:
+    for values in arrays:
         packer.add(values)
     packer.add_times(np.array([0.1, 0.2, 123.456789]))
-    made = ask(
+    unpacked = ask(
         engine,
         f"Engine.unpack({json.dumps(packer.text())}, {json.dumps(packer.specs)})"
         ".then((all) => all.map((one) => Array.from(one)))",
     )
-    for back, values in zip(made, given, strict=False):
-        # half a step, of which very large numbers have fewer
+    for back, values in zip(unpacked, arrays, strict=False):
+        # very large numbers have larger steps
         step = 1.0 / FINE_SCALE if np.max(np.abs(values), initial=0.0) < 1e5 else 1e-6
         np.testing.assert_allclose(back, values, rtol=0.0, atol=step)
-    assert made[-1] == [0.1, 0.2, 123.456789]
+    assert unpacked[-1] == [0.1, 0.2, 123.456789]
 
 
-def test_too_few_measurements_give_no_replay(engine: Browser) -> None:
+def test_engine_too_few_measurements_returns_null(engine: Browser) -> None:
     comparison = compare(aisle_flight(duration_s=30.0))
     packer = Packer()
     flight = replay_signals(comparison, packer)

@@ -1,4 +1,4 @@
-"""What a user sees and does on the page: one screen, words that follow, steps, tour, everybody."""
+"""Explore page as a user sees it: layout, sentences, steps, tour, keyboard, accessibility."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from px4fuse.explore.page import html_text
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.story import story
-from px4fuse.plain import format_length, format_number
+from px4fuse.plain import format_number
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
@@ -30,19 +29,25 @@ IN_VIEW = """(...names) => names.filter((name) => {
   return node.checkVisibility() && box.height > 0 && box.top >= 0 && box.bottom <= innerHeight
     && node.contains(document.elementFromPoint(x, y));
 })"""
-KNOBS = ("#sigma-a", "#sigma-z", "#dt", "#clock-offset")
-STATIONS = ["Q forgotten", "R too small", "The ratio is the track", "Size is the claim", "Clocks",
-            "Outliers", "EKF2 beside you"]  # fmt: skip
+SLIDERS = ("#sigma-a", "#sigma-z", "#dt", "#clock-offset")
+STATIONS = ["Q almost zero", "R too small", "The ratio determines the track",
+            "The scale determines σ", "Time offset", "Outliers",
+            "Comparison with EKF2"]  # fmt: skip
 
 
 def nis_with(analysis: Analysis, settings: Settings) -> float:
-    """Mean NIS of our filter along the axis of the lab with other settings."""
+    """Return the mean NIS of KF along the main axis with other settings."""
     updates = replay(analysis.main.axis, settings).updates
     return float(np.mean(updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]))
 
 
+def format_metres(metres: float) -> str:
+    """Format a length as on the page: two decimals, three below 0.1 m."""
+    return f"{metres:.{3 if metres < 0.0995 else 2}f} m"
+
+
 def put(page: Browser, **values: float) -> None:
-    """Knobs, by their names in the page."""
+    """Set settings by their names in the page's script."""
     ask(page, f"Explore.then((e) => {{ e.set({json.dumps(values)}); }})")
     settle(page)
 
@@ -59,13 +64,13 @@ def key(page: Browser, name: str) -> None:
 # ------------------------------------------------------------------ one screen
 
 
-def test_knobs_innovations_sigmas_and_needle_are_in_view_at_once(page: Browser) -> None:
-    wanted = [*KNOBS, "#innovation", "#sigma_p", "#sigma_v", "#needle", "#live"]
+def test_desktop_settings_plots_and_gauge_are_visible(page: Browser) -> None:
+    wanted = [*SLIDERS, "#innovation", "#sigma_p", "#sigma_v", "#needle", "#live"]
     assert page.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_on_a_phone_knobs_and_a_plot_stay(
+def test_phone_settings_and_one_plot_stay_visible(
     browser: Browser, explored: tuple[Path, Analysis], share: float
 ) -> None:
     show(browser, explored[0], width=390)
@@ -75,18 +80,18 @@ def test_on_a_phone_knobs_and_a_plot_stay(
     assert height <= 3 * 844
     browser.ask(f"scrollTo(0, {share * height})")
     settle(browser)
-    wanted = [*KNOBS, "#innovation"]
+    wanted = [*SLIDERS, "#innovation"]
     assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
-    # the tabs choose which one
+    # the tabs select the plot
     browser.ask("document.getElementById('tab-sigma_v').click()")
     settle(browser)
-    wanted = [*KNOBS, "#sigma_v"]
+    wanted = [*SLIDERS, "#sigma_v"]
     assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
     assert not browser.ask("document.querySelector('#innovation').checkVisibility()")
     assert browser.complaints() == []
 
 
-def test_what_leaves_an_axis_is_marked_at_its_edge(page: Browser) -> None:
+def test_innovations_outside_plot_are_marked_at_edge(page: Browser) -> None:
     put(page, sigmaA=0.002)
 
     def drawn(name: str, *columns: str) -> list[Any]:
@@ -102,51 +107,49 @@ def test_what_leaves_an_axis_is_marked_at_its_edge(page: Browser) -> None:
     at, y, turn = drawn("beyond", "t", "y", "turn")
     np.testing.assert_array_equal(at, t[out])
     assert ((y > low) & (y < high)).all()
-    np.testing.assert_array_equal(turn > 0.0, nu[out] < low)  # those below point down
+    np.testing.assert_array_equal(turn > 0.0, nu[out] < low)  # arrows at the lower edge point down
 
 
-# ------------------------------------------------------------------ everything follows
+# ------------------------------------------------------------------ changed settings
 
 
-def test_the_words_follow_the_knobs_and_their_cure_was_replayed(
+def test_sentences_follow_settings_and_name_re_run(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]
-    told = text(page, "live")
-    ours = analysis.main.filters["kf"]
-    assert told.startswith(
-        f"Along the aisle our filter is {format_length(ours.truth.position_rmse_m)} from the truth "
-        "(RMS) and 9 % too modest; EKF2 is 6 cm from the truth and is honest about it."
-    )
-    assert told.split("; EKF2")[0].split("our filter is ")[1] == (
-        story(analysis, ())[0].split("our filter was ")[1].rstrip(".")
+    sentence = text(page, "live")
+    kf, ekf2 = (analysis.main.filters[name] for name in ("kf", "ekf2"))
+    assert sentence.startswith(
+        "Along the aisle KF has a position RMSE of "
+        f"{format_metres(kf.truth.position_rmse_m)} and is underconfident: σ is "
+        f"{format_number(kf.nis_mean**-0.5)} times too large. EKF2 has a position RMSE of "
+        f"{format_metres(ekf2.truth.position_rmse_m)} and is consistent."
     )
     put(page, sigmaA=0.002, sigmaZ=0.05)
-    told = text(page, "live")
-    now = Settings(sigma_a_m_s2=0.002, sigma_z_m=0.05)
-    nis = nis_with(analysis, now)
-    assert f"{format_number(nis**0.5, 2)} times too sure of itself" in told
-    cure = re.search(r"nearest comes SIGMA_A ([\d.]+) \(mean NIS ([\d,]+) → ([\d.]+)\)", told)
-    assert cure[2] == format_number(nis, 2)
-    cured = nis_with(analysis, Settings(sigma_a_m_s2=float(cure[1]), sigma_z_m=0.05))
-    assert cure[3] == format_number(cured, 2)
-    assert f"ours {format_number(nis, 2)} (understated" in text(page, "read")
-    hand = page.ask("document.querySelector('#needle .hand.ours').style.left")
+    sentence = text(page, "live")
+    nis = nis_with(analysis, Settings(sigma_a_m_s2=0.002, sigma_z_m=0.05))
+    assert f"overconfident: σ is {format_number(nis**0.5, 2)} times too small" in sentence
+    best = re.search(r"Best: SIGMA_A ([\d.]+) \(mean NIS ([\d,]+) → ([\d.]+)\)", sentence)
+    assert best[2] == format_number(nis, 2)
+    after = nis_with(analysis, Settings(sigma_a_m_s2=float(best[1]), sigma_z_m=0.05))
+    assert best[3] == format_number(after, 2)
+    assert f"KF {format_number(nis, 2)} (overconfident" in text(page, "read")
+    hand = page.ask("document.querySelector('#needle .hand.kf').style.left")
     assert hand == "100%"
 
 
-def test_an_error_that_innovations_hide_is_told_by_what_the_filter_claims(
+def test_sentence_error_beyond_sigma_states_reported_sigma(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     put(page, offset=0.3)
     shifted = _shifted(explored[1], 0.3)
     hidden = error_beyond_reported_sigma(shifted.axes["aisle"].filters["kf"])
     assert hidden is not None
-    error, claimed = format_length(hidden.rmse_m), format_length(hidden.reported_sigma_m)
-    assert f"our filter is {error} from the truth (RMS) and claims {claimed};" in text(page, "live")
+    rmse, sigma = format_metres(hidden.rmse_m), format_metres(hidden.reported_sigma_m)
+    assert f"KF has a position RMSE of {rmse}, but reports σ {sigma}." in text(page, "live")
 
 
-def test_findings_of_the_settings_follow_and_the_others_stay(
+def test_changed_settings_mark_dependent_findings(
     browser: Browser, sample_log: Path, tmp_path: Path
 ) -> None:
     analysis = run(ComparisonRequest(log=str(sample_log), sigma_z_m=1.0))
@@ -155,15 +158,15 @@ def test_findings_of_the_settings_follow_and_the_others_stay(
     file.write_bytes(html_text(analysis).encode())
     show(browser, file)
     open_view(browser, "recorded")
-    said = "[...document.querySelectorAll('.now-said')].map((one) => one.textContent)"
-    before = browser.ask(said)
+    notes = "[...document.querySelectorAll('.changed-note')].map((one) => one.textContent)"
+    before = browser.ask(notes)
     assert len(before) >= 1
     assert set(before) == {""}
-    assert "SIGMA_Z 1," in text(browser, "found")
+    assert "SIGMA_Z 1 m," in text(browser, "found")
     put(browser, sigmaZ=0.1)
-    after = browser.ask(said)
-    assert all(one.startswith("The knobs stand elsewhere now: Along the aisle") for one in after)
-    stale = browser.ask(said.replace(".now-said", ".stale") + ".join(' ')")
+    after = browser.ask(notes)
+    assert all(one.startswith("Settings changed since the report: Along the ais") for one in after)
+    stale = browser.ask(notes.replace(".changed-note", ".stale") + ".join(' ')")
     assert "SIGMA_Z" in stale
     assert "reset its height" not in stale
     assert browser.complaints() == []
@@ -190,7 +193,7 @@ def test_ekf2_curves_equal_the_log(page: Browser, explored: tuple[Path, Analysis
     assert count == (result.ekf2_innovations["rejected"] > 0).sum()
 
 
-def test_the_address_restores_every_knob(page: Browser, explored: tuple[Path, Analysis]) -> None:
+def test_address_restores_all_settings(page: Browser, explored: tuple[Path, Analysis]) -> None:
     wanted = (
         "#axis=east&input=zero&sigma-a=0.7&sigma-z=0.07&dt=0.05&clock-offset=-0.1"
         "&view=step&measurement=17"
@@ -198,7 +201,7 @@ def test_the_address_restores_every_knob(page: Browser, explored: tuple[Path, An
     page.ask(f"location.hash = {json.dumps(wanted)}")
     settle(page)
     address = page.ask("location.hash")
-    show(page, explored[0])  # anew
+    show(page, explored[0])  # reload
     page.ask(f"location.hash = {json.dumps(address)}")
     settle(page)
     assert page.ask("location.hash") == address
@@ -211,7 +214,7 @@ def test_the_address_restores_every_knob(page: Browser, explored: tuple[Path, An
 # ------------------------------------------------------------------ the step
 
 
-def test_the_ellipse_is_the_replays_p_at_every_step(
+def test_ellipse_equals_covariance_in_each_step(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     open_view(page, "step")
@@ -229,7 +232,7 @@ def test_the_ellipse_is_the_replays_p_at_every_step(
     assert len(shown) == len(steps) + len(updates)
     place = {time: i for i, time in enumerate(updates.index)}
     for i, u, updated, mean, p, v in shown:
-        # of points even around 2σ, the mean square is twice the covariance
+        # the mean square of points on the 2σ ellipse is twice the covariance
         x = np.array([p[:-1], v[:-1]]) - np.array(mean)[:, None]
         (a, b), (_, d) = x @ x.T / x.shape[1] / 2.0
         if u >= 0 and not updated:
@@ -241,7 +244,7 @@ def test_the_ellipse_is_the_replays_p_at_every_step(
             assert mean[0] == pytest.approx(steps["position_m"].iloc[i], abs=1e-9)
 
 
-def test_space_plays_and_pauses(page: Browser) -> None:
+def test_space_key_starts_and_pauses_steps(page: Browser) -> None:
     page.ask("document.activeElement.blur()")
     steps = "Explore.then((e) => e.stepper.at())"
     page.call("Input.dispatchKeyEvent", type="keyDown", key=" ", text=" ")
@@ -260,41 +263,42 @@ def test_space_plays_and_pauses(page: Browser) -> None:
 # ------------------------------------------------------------------ the tour
 
 
-def test_the_tour_from_end_to_end(page: Browser, explored: tuple[Path, Analysis]) -> None:
+def test_tour_shows_numbers_of_flight_in_each_station(
+    page: Browser, explored: tuple[Path, Analysis]
+) -> None:
     analysis = explored[1]
     put(page, sigmaA=0.8, sigmaZ=0.2)
     before = page.ask("location.hash")
     page.click("#tour-start")
     settle(page)
     assert page.ask("document.getElementById('tour-back').disabled")
-    seen = []
-    knobs = "Explore.then((e) => [e.settings.sigmaA, e.settings.sigmaZ, e.settings.offset])"
+    shown = []
+    settings = "Explore.then((e) => [e.settings.sigmaA, e.settings.sigmaZ, e.settings.offset])"
     for _ in STATIONS:
         settle(page)
-        a, z, offset = ask(page, knobs)
+        a, z, offset = ask(page, settings)
         assert page.ask(f"({IN_VIEW})('#sigma-a', '#needle').length") == 2
-        seen.append((text(page, "tour-title"), text(page, "tour-sentence"), a, z, offset))
-        assert text(page, "tour-task").startswith("Do: ")
-        assert text(page, "tour-see").startswith("See: ")
+        shown.append((text(page, "tour-title"), text(page, "tour-sentence"), a, z, offset))
+        assert text(page, "tour-task").startswith("Task: ")
+        assert text(page, "tour-see").startswith("Result: ")
         page.click("#tour-next")
     settle(page)
-    assert [title for title, *_ in seen] == [f"{n + 1} of 7: {t}" for n, t in enumerate(STATIONS)]
+    assert [title for title, *_ in shown] == [f"{n + 1} of 7: {t}" for n, t in enumerate(STATIONS)]
     assert page.ask("document.getElementById('tour').hidden")
     assert page.ask("location.hash") == before
-    # the numbers are this flight's
-    _, forgotten, a, z, _ = seen[0]
+    # the sentences contain the numbers of this flight
+    _, no_process_noise, a, z, offset = shown[0]
     assert a == 0.002
-    told = re.search(r"mean NIS goes from ([\d.]+) to ([\d.,]+)\.", forgotten)
-    with_clock = _shifted(analysis, seen[0][4])
-    assert told[2] == format_number(nis_with(with_clock, Settings(a, z)), 2)
-    _, _, a, z, _ = seen[3]
-    size = re.search(r"NIS from ([\d.]+) to ([\d.]+), a ninth", seen[3][1])
-    assert float(size[2]) == pytest.approx(float(size[1]) / 9.0, rel=0.1)
-    assert seen[6][1].startswith("EKF2's mean NIS is 0.86, ours ")
+    change = re.search(r"mean NIS changes from ([\d.]+) to ([\d.,]+)\.", no_process_noise)
+    with_clock = _shifted(analysis, offset)
+    assert change[2] == format_number(nis_with(with_clock, Settings(a, z)), 2)
+    scale = re.search(r"NIS from ([\d.]+) to ([\d.]+) \(one ninth\)", shown[3][1])
+    assert float(scale[2]) == pytest.approx(float(scale[1]) / 9.0, rel=0.1)
+    assert shown[6][1].startswith("Mean NIS: EKF2 0.86, KF ")
 
 
 def _shifted(analysis: Analysis, offset_s: float) -> Any:
-    """The same flight with its stamps corrected."""
+    """Compare the flight with corrected timestamps."""
     request = ComparisonRequest(
         log=str(Path("sample_logs") / analysis.flight.log.name), clock_offset_s=offset_s,
         start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
@@ -303,10 +307,10 @@ def _shifted(analysis: Analysis, offset_s: float) -> Any:
     return run_comparison(request, flight=analysis.flight)
 
 
-# ------------------------------------------------------------------ everybody
+# ------------------------------------------------------------------ accessibility
 
 
-def test_by_keyboard_alone(page: Browser) -> None:
+def test_tabs_and_sliders_work_with_keyboard(page: Browser) -> None:
     page.ask("document.getElementById('tab-filter').focus()")
     key(page, "ArrowRight")
     settle(page)
@@ -316,7 +320,7 @@ def test_by_keyboard_alone(page: Browser) -> None:
     key(page, "End")
     settle(page)
     assert page.ask("document.querySelector('#view-recorded').checkVisibility()")
-    key(page, "ArrowRight")  # around
+    key(page, "ArrowRight")  # from the last tab to the first one
     settle(page)
     assert page.ask("document.activeElement.ariaSelected") == "true"
     assert page.ask("document.activeElement.id") == "tab-filter"
@@ -330,7 +334,7 @@ def test_by_keyboard_alone(page: Browser) -> None:
 
 
 @pytest.mark.parametrize(("width", "height", "scheme"), [(1400, 900, "dark"), (390, 844, "light")])
-def test_axe_finds_nothing_serious(
+def test_explore_page_has_no_serious_axe_violations(
     browser: Browser, explored: tuple[Path, Analysis], width: int, height: int, scheme: str
 ) -> None:
     show(browser, explored[0], width=width)

@@ -1,11 +1,11 @@
-"""What commands print, draw and write stays as it was looked at.
+"""Output, pages and results of commands, compared with golden files.
 
-Each file in ``tests/golden`` holds what one command prints, every block of its pages with what is
-drawn, and the numbers of its results in four digits. After a change that is meant::
+Each file in ``tests/golden`` contains the terminal output of a command, the blocks and artists of
+its pages, and the values of its results with four digits. After an intended change::
 
     PX4FUSE_GOLDEN=write python -m pytest -n 0 tests/test_golden.py tests/test_findings.py
 
-writes them anew; look at the difference, and at the pages, before it is committed.
+writes them again. Review the differences and the pages before committing.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from px4fuse.simulation.scenario import KINDS, make_scenario
 
 NOTES = """# What I saw
 
-1. The *stamps* are late.
+1. The *timestamps* are late.
 2. `EKF2_EV_DELAY` is 0.
 
 | a | b |
@@ -48,7 +48,7 @@ NOTES = """# What I saw
 | 1 | 2 |
 """
 LATE = "simulate --mistake clock-offset=0.2 --mistake nlos --passes 2 --seed 5 -o late.ulg"
-# The last command's output is kept; those before make its files
+# The output of the last command is compared; the commands before it write its input files
 COMMANDS = {
     "compare": ("compare sample_logs/aisle_uwb.ulg --student Ana --id 7 --notes notes.md",),
     "compare_mistakes": (LATE, "compare late.ulg --sigma-z 0.3"),
@@ -103,33 +103,33 @@ COMMANDS = {
 }
 
 
-# A log that is not the report's, and settings for which a verdict is worse
-ENDS_WITH = {"verify_other": 1, "diff": 1}
+# Exit codes: a log that does not belong to the report, and a report with a worse verdict
+EXIT_CODES = {"verify_other": 1, "diff": 1}
 
 
 def shifted(path: Path) -> str:
-    """A SLAM trajectory with a clock 0.35 s early, turned, moved, and wavering by centimetres."""
+    """Return a SLAM trajectory 0.35 s early, rotated, translated and with errors of 3 cm."""
     poses = np.array([line.split() for line in path.read_text().splitlines() if line[0] != "#"])
     poses = poses.astype(float)[40:-25:2]
-    time, position, turned = poses[:, 0], poses[:, 1:4], Rotation.from_quat(poses[:, 4:])
+    time, position, rotation = poses[:, 0], poses[:, 1:4], Rotation.from_quat(poses[:, 4:])
     turn = Rotation.from_euler("z", 25.0, degrees=True)
-    waver = 0.03 * np.sin(np.outer(time, [0.7, 1.1, 0.9]))
-    moved = np.add(turn.apply(position + waver), [1.0, -2.0, 0.3])
-    columns = np.column_stack((time - 0.35, moved, (turn * turned).as_quat()))
+    error = 0.03 * np.sin(np.outer(time, [0.7, 1.1, 0.9]))
+    moved = np.add(turn.apply(position + error), [1.0, -2.0, 0.3])
+    columns = np.column_stack((time - 0.35, moved, (turn * rotation).as_quat()))
     return "".join(" ".join(f"{one:.6f}" for one in row) + "\n" for row in columns)
 
 
 @pytest.fixture
 def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The blocks of what is reported, instead of a PDF."""
+    """Collect the blocks of the report instead of setting a PDF."""
     blocks: list[Any] = []
-    if "verify" in request.node.name:  # which compares the PDF
+    if "verify" in request.node.name:  # verify needs the PDF
         in_this_process(monkeypatch)
         request.getfixturevalue("drawn_once")
         return blocks
 
-    def keep(made: list[Any]) -> list[Any]:
-        blocks.extend(made)  # page by page
+    def keep(page_blocks: list[Any]) -> list[Any]:
+        blocks.extend(page_blocks)
         return []
 
     monkeypatch.setattr(pdf, "data", keep)
@@ -139,7 +139,7 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.usefixtures("analysed_once")
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_shows_what_it_showed(
+def test_command_output_matches_golden_file(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept_pages: list[Any]
 ) -> None:
     shutil.copytree(REPOSITORY / "sample_logs", tmp_path / "sample_logs")
@@ -151,20 +151,20 @@ def test_a_command_shows_what_it_showed(
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}
         kept_pages.clear()
         result = run(*command.split())
-        code = ENDS_WITH.get(name, 0) if command == COMMANDS[name][-1] else 0
+        code = EXIT_CODES.get(name, 0) if command == COMMANDS[name][-1] else 0
         assert result.exit_code == code, (command, result.output)
     output = re.sub(r"px4fuse \d\S*", "px4fuse VERSION", result.output)
     lines = [f"$ px4fuse {command}", *output.splitlines(), "", *of_blocks(kept_pages), ""]
     for path in sorted(tmp_path.rglob("*.json")):
         if path.stat().st_mtime_ns != before.get(path):
             lines += [path.name, *written(path)]
-    # byte for byte where the report was made, to the last digits elsewhere
+    # the file is identical only on a computer with the same rounding as where it was made
     again = r"the log gives (the same file again, byte for byte|all \d+ values again \(.*?\))"
     agrees(name, [re.sub(again, "the log gives it again", line) for line in lines])
 
 
 def spread(kind: str, *mistakes: str) -> list[str]:
-    """How the fields of a simulated flight's topics are spread, and what its answer holds."""
+    """Summarise the fields of a simulated flight's topics, and its answer key."""
     size = {} if kind == "outdoor" else {"length_m": 6.0}
     made = simulate(make_scenario(kind, passes=1, seed=3, **size), parse(mistakes))
     return [
@@ -175,19 +175,19 @@ def spread(kind: str, *mistakes: str) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_simulated_flight_is_as_it_was(kind: str) -> None:
-    """One without mistakes; and with each, the lines that differ."""
+def test_simulated_flight_matches_golden_file(kind: str) -> None:
+    """Flight without mistakes, then the lines that differ with each mistake."""
     clean = spread(kind)
     lines = [*clean]
     for name, mistake in MISTAKES.items():
         if kind in mistake.kinds:
-            # of GNSS EKF2 takes no noise below the receiver's accuracy
+            # EKF2 ignores a GNSS noise below the receiver's accuracy
             typed = f"{name}=2" if (kind, name) == ("outdoor", "ekf2-noise") else name
             lines += ["", name, *(line for line in spread(kind, typed) if line not in clean)]
     agrees(f"simulated_{kind}", lines)
 
 
-def test_help_says_what_it_said() -> None:
+def test_help_matches_golden_file() -> None:
     lines = []
     for command in ("", *CLI_COMMANDS, "lesson kalman"):
         lines += [
@@ -197,7 +197,7 @@ def test_help_says_what_it_said() -> None:
     agrees("help", lines)
 
 
-def test_a_flight_on_gnss_shows_its_aids(tmp_path: Path, kept_pages: list[Any]) -> None:
+def test_gnss_flight_report_contains_aids(tmp_path: Path, kept_pages: list[Any]) -> None:
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     result = run("compare", log, "-o", tmp_path / "a.pdf")
     assert result.exit_code == 0, result.output
@@ -205,7 +205,7 @@ def test_a_flight_on_gnss_shows_its_aids(tmp_path: Path, kept_pages: list[Any]) 
     agrees("aids", [*output, "", *of_blocks(kept_pages), *written(tmp_path / "a.json")])
 
 
-def test_the_page_of_a_fleet_holds_what_it_held() -> None:
+def test_batch_page_matches_golden_file() -> None:
     text = html_text(made_up(12), "Bench", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
     drawn = [rounded(line) for line in above.splitlines() if line.strip()]
@@ -213,14 +213,14 @@ def test_the_page_of_a_fleet_holds_what_it_held() -> None:
 
 
 @pytest.mark.usefixtures("analysed_once")
-def test_the_plots_to_explore_are_what_they_were(sample_log: Path) -> None:
+def test_explore_plots_match_golden_file(sample_log: Path) -> None:
     analysis = px4fuse.compare(str(sample_log))
     data = flight_data(analysis, Packer())
     document, _ = document_json(data, analysis.tuning)
     ids: dict[str, str] = {}
 
     def named(found: re.Match[str]) -> str:
-        """Bokeh counts what a process makes."""
+        """Number Bokeh's ids, which count the models of the process, from 0."""
         return ids.setdefault(found[0], f"id{len(ids)}")
 
     lines = [re.sub(r"\bp\d{4,}\b", named, line) for line in of_values(document["roots"])]

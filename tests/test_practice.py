@@ -1,4 +1,4 @@
-"""Practice: what is drawn, what the page asks and tells, and that every tell-tale is true."""
+"""Practice page: random sets, symptoms of each mistake, questions, answers and score."""
 
 from __future__ import annotations
 
@@ -31,42 +31,42 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# Nothing, the source, the frame
+# A set without a mistake, with one of the source, and with one of the frame
 SEED, COUNT = 5, 3
 
 
-# ------------------------------------------------------------------ what is drawn
+# ------------------------------------------------------------------ random sets
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 20))
-def test_a_set_has_every_choice_in_turn(seed: int, level: int, count: int) -> None:
+def test_draw_uses_all_choices_equally_often(seed: int, level: int, count: int) -> None:
     rounds = draw(seed, level, count)
     assert draw(seed, level, count) == rounds
     assert len(rounds) == count
-    first = Counter(one.tricks[0].choice if one.tricks else "nothing" for one in rounds)
+    first = Counter(one.mistakes[0].choice if one.mistakes else "nothing" for one in rounds)
     assert max(first.values()) - min(first[name] for name in CHOICES) <= 1
     for one in rounds:
         assert set(one.right) <= set(CHOICES)
-        assert len(one.right) == max(len(one.tricks), 1)
-        assert len(one.tricks) <= (2 if level == 3 else 1)
-        for trick, size in zip(one.tricks, one.typed, strict=True):
-            assert size.removeprefix("-") == trick.sizes[level - 1]
-            assert trick.either_sign or not size.startswith("-")
+        assert len(one.right) == max(len(one.mistakes), 1)
+        assert len(one.mistakes) <= (2 if level == 3 else 1)
+        for mistake, size in zip(one.mistakes, one.sizes, strict=True):
+            assert size.removeprefix("-") == mistake.sizes[level - 1]
+            assert mistake.either_sign or not size.startswith("-")
 
 
-def test_the_hardest_level_has_two_mistakes_at_times() -> None:
+def test_draw_level_3_has_two_mistakes_in_some_flights() -> None:
     rounds = [one for seed in range(5) for one in draw(seed, 3, 12)]
-    two = sum(len(one.tricks) == 2 for one in rounds)
+    two = sum(len(one.mistakes) == 2 for one in rounds)
     assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
 
 
-# ------------------------------------------------------------------ the tell-tales
+# ------------------------------------------------------------------ symptoms
 
 
-def flown(trick: HiddenMistake | None, level: int, seed: int) -> Flight:
-    """With one mistake of a level, or without."""
-    size = "" if trick is None else trick.sizes[level - 1]
-    noisy = trick is not None and trick.mistake == NOISY_UWB
+def flown(mistake: HiddenMistake | None, level: int, seed: int) -> Flight:
+    """Simulate a practice flight with one mistake of a level, or without a mistake."""
+    size = "" if mistake is None else mistake.sizes[level - 1]
+    noisy = mistake is not None and mistake.mistake == NOISY_UWB
     scenario = Scenario(
         **practice.SCENARIO_VALUES,
         length_m=9.0 + 0.7 * seed,
@@ -74,106 +74,107 @@ def flown(trick: HiddenMistake | None, level: int, seed: int) -> Flight:
         seed=seed,
         sigma_uwb_m=float(size) if noisy else 0.1,
     )
-    named = [] if trick is None or noisy else [f"{trick.mistake}={size}"]
-    return simulate_flight(scenario, parse(named))
+    options = [] if mistake is None or noisy else [f"{mistake.mistake}={size}"]
+    return simulate_flight(scenario, parse(options))
 
 
-def judged(flight: Flight, **settings: float) -> Comparison:
+def compared(flight: Flight, **settings: float) -> Comparison:
     return compare(flight, Settings(**({"sigma_a_m_s2": practice.SIGMA_A_M_S2} | settings)))
 
 
-def ours(flight: Flight, **settings: float) -> Any:
-    """What is said of our filter along the aisle."""
-    return judged(flight, **settings).main.filters["kf"]
+def kf_statistics(flight: Flight, **settings: float) -> Any:
+    """Return the consistency statistics of KF along the main axis."""
+    return compared(flight, **settings).main.filters["kf"]
 
 
 LEVELS_AND_SEEDS = [(1, 1), (3, 3)]
 
 
-def trick(mistake: str) -> HiddenMistake:
-    return next(one for one in practice.HIDDEN_MISTAKES if one.mistake == mistake)
+def hidden(name: str) -> HiddenMistake:
+    """Return the mistake with this name in px4fuse simulate."""
+    return next(one for one in practice.HIDDEN_MISTAKES if one.mistake == name)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_nothing_wrong_is_honest(seed: int) -> None:
-    found = judged(flown(None, 1, seed))
+def test_flight_without_mistake_is_consistent(seed: int) -> None:
+    found = compared(flown(None, 1, seed))
     assert {one.verdict for one in found.main.filters.values()} == {"consistent"}
     assert 0.01 < np.mean(_sigmas(found.main) > 2.0) < 0.09
 
 
 def _sigmas(result: AxisComparison) -> Any:
+    """Return |ν|/√S of KF."""
     rows = result.replay.updates
     return np.abs(rows["innovation_m"]) / np.sqrt(rows["innovation_variance_m2"])
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_outliers_lie_far_outside_while_the_rest_fits(level: int, seed: int) -> None:
-    found = judged(flown(trick("nlos"), level, seed))
+def test_source_mistakes_have_their_symptoms(level: int, seed: int) -> None:
+    found = compared(flown(hidden("nlos"), level, seed))
     far = [np.mean(_sigmas(found.axes[name]) > 4.0) for name in ("north", "east")]
     assert 0.01 < max(far) < 0.2
     assert all(np.median(_sigmas(found.axes[name])) < 1.0 for name in ("north", "east"))
-    jumped = judged(flown(trick("jump"), level, seed)).main
+    jumped = compared(flown(hidden("jump"), level, seed)).main
     rows = jumped.replay.updates
     far = np.flatnonzero(_sigmas(jumped) > 4.0)
     assert len(far) >= 1
     assert far[-1] - far[0] < 25  # one burst
     assert len(set(np.sign(rows["innovation_m"].iloc[far[:2]]))) == 1
-    silent = judged(flown(trick("dropout"), level, seed)).main
-    apart = np.diff(silent.replay.updates.index)
-    assert apart.max() > 4.0
-    steps = silent.replay.steps
-    start = silent.replay.updates.index[apart.argmax()]
-    sigma = np.sqrt(steps["position_variance_m2"])
-    assert sigma.loc[start : start + apart.max() - 0.01].max() > 2.0 * sigma.median()
+    with_gap = compared(flown(hidden("dropout"), level, seed)).main
+    intervals_s = np.diff(with_gap.replay.updates.index)
+    assert intervals_s.max() > 4.0
+    start = with_gap.replay.updates.index[intervals_s.argmax()]
+    sigma = np.sqrt(with_gap.replay.steps["position_variance_m2"])
+    assert sigma.loc[start : start + intervals_s.max() - 0.01].max() > 2.0 * sigma.median()
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_the_clock_knob_undoes_a_clock(level: int, seed: int) -> None:
-    one = trick("clock-offset")
+def test_clock_offset_corrects_late_timestamps(level: int, seed: int) -> None:
+    one = hidden("clock-offset")
     flight = flown(one, level, seed)
     late_s = float(one.sizes[level - 1].removesuffix("ms")) / 1e3
-    wrong, right = ours(flight), ours(flight, clock_offset_s=-late_s)
+    wrong, right = kf_statistics(flight), kf_statistics(flight, clock_offset_s=-late_s)
     assert wrong.nis_mean > 1.25 * right.nis_mean
     assert (wrong.verdict, right.verdict) == ("variance understated", "consistent")
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_no_clock_knob_undoes_a_turned_frame(level: int, seed: int) -> None:
-    flight = flown(trick("yaw"), level, seed)
+def test_clock_offset_does_not_correct_misaligned_frame(level: int, seed: int) -> None:
+    flight = flown(hidden("yaw"), level, seed)
     for offset_s in (-0.4, -0.2, 0.0, 0.2, 0.4):
-        found = judged(flight, clock_offset_s=offset_s)
+        found = compared(flight, clock_offset_s=offset_s)
         assert max(found.axes[name].filters["kf"].nis_mean for name in ("north", "east")) > 1.5
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_each_noise_is_cured_by_its_own_knob(level: int, seed: int) -> None:
-    noisy = flown(trick(NOISY_UWB), level, seed)
-    assert ours(noisy).nis_mean > 2.0
-    size = float(trick(NOISY_UWB).sizes[level - 1])
-    assert ours(noisy, sigma_z_m=size).verdict == "consistent"
-    shaken = flown(trick("vibration"), level, seed)
-    before = ours(shaken)
+def test_each_noise_mistake_is_corrected_by_its_setting(level: int, seed: int) -> None:
+    noisy = flown(hidden(NOISY_UWB), level, seed)
+    assert kf_statistics(noisy).nis_mean > 2.0
+    size = float(hidden(NOISY_UWB).sizes[level - 1])
+    assert kf_statistics(noisy, sigma_z_m=size).verdict == "consistent"
+    vibrating = flown(hidden("vibration"), level, seed)
+    before = kf_statistics(vibrating)
     assert before.nis_mean > 1.5
-    assert before.lag1_autocorrelation > 0.2  # they follow each other
-    size = float(trick("vibration").sizes[level - 1])
-    assert ours(shaken, sigma_a_m_s2=size).verdict == "consistent"
-    wrong = ours(shaken, sigma_z_m=0.1 * np.sqrt(before.nis_mean))
-    assert wrong.lag1_autocorrelation > 0.2  # a larger SIGMA_Z leaves their order
-    filters = judged(flown(trick("ekf2-noise"), level, seed)).main.filters
+    assert before.lag1_autocorrelation > 0.2  # time-correlated
+    size = float(hidden("vibration").sizes[level - 1])
+    assert kf_statistics(vibrating, sigma_a_m_s2=size).verdict == "consistent"
+    wrong = kf_statistics(vibrating, sigma_z_m=0.1 * np.sqrt(before.nis_mean))
+    assert wrong.lag1_autocorrelation > 0.2  # a larger SIGMA_Z does not change the correlation
+    filters = compared(flown(hidden("ekf2-noise"), level, seed)).main.filters
     assert filters["kf"].verdict == "consistent"
     assert filters["ekf2"].nis_mean > 2.0
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_a_small_gate_rejects_what_fits_ours(level: int, seed: int) -> None:
-    found = judged(flown(trick("ekf2-gate"), level, seed)).main
+def test_small_gate_rejects_innovations_that_fit_kf(level: int, seed: int) -> None:
+    found = compared(flown(hidden("ekf2-gate"), level, seed)).main
     rows = found.ekf2_innovations
     assert (rows["rejected"] > 0).mean() > 0.15
     assert found.filters["kf"].verdict == "consistent"
     assert np.mean(_sigmas(found) > 2.0) < 0.1
 
 
-# ------------------------------------------------------------------ the page
+# ------------------------------------------------------------------ page
 
 
 @pytest.fixture(scope="module")
@@ -188,20 +189,20 @@ def keys(file: Path) -> list[dict[str, Any]]:
     return [json.loads(zlib.decompress(base64.b64decode(text))) for text in packed]
 
 
-def test_nobody_reads_the_answers_by_chance(quiz: Path) -> None:
+def test_page_source_does_not_show_answers(quiz: Path) -> None:
     source = quiz.read_text(encoding="utf-8")
-    told = keys(quiz)
-    assert [one["right"] for one in told] == [one.right for one in draw(SEED, 1, COUNT)]
+    answers = keys(quiz)
+    assert [one["right"] for one in answers] == [one.right for one in draw(SEED, 1, COUNT)]
     for content in re.findall(r'id="content-\d+">([^<]+)<', source):
         flight = json.loads(content)["flight"]
         assert flight["findings"] == flight["story"] == []
         assert "mistake" not in content
         assert "px4fuse compare 'flight" in flight["command"]["bare"]
-    for one in told:
+    for one in answers:
         assert one["story"]
-        for made in one["made"]:
-            assert made["what"] not in source
-            assert made["tell"] not in source
+        for mistake in one["mistakes"]:
+            assert mistake["description"] not in source
+            assert mistake["symptom"] not in source
 
 
 def choose(page: Browser, *names: str) -> None:
@@ -211,12 +212,12 @@ def choose(page: Browser, *names: str) -> None:
 
 
 def renewed(page: Browser, button: str) -> None:
-    """On what loads the page anew; until that is there."""
+    """Click a button that reloads the page, and wait for the new page."""
     page.ask("window.before = true")
     page.click(button)
     end = time.monotonic() + 30.0
     while time.monotonic() < end:
-        with contextlib.suppress(AssertionError):  # in between there is no page
+        with contextlib.suppress(AssertionError):  # no page while it reloads
             if page.ask(
                 "window.before === undefined && document.querySelector('#table tbody tr') !== null"
                 " && document.getElementById('quiz-title').textContent !== ''"
@@ -227,54 +228,58 @@ def renewed(page: Browser, button: str) -> None:
     settle(page)
 
 
-def said(page: Browser, name: str) -> str:
+def element_text(page: Browser, name: str) -> str:
     return str(page.ask(f"document.getElementById({json.dumps(name)}).textContent"))
 
 
-def test_flights_with_right_and_wrong_answers(browser: Browser, quiz: Path) -> None:
-    page, told = show(browser, quiz), keys(quiz)
+def test_quiz_scores_right_and_wrong_answers(browser: Browser, quiz: Path) -> None:
+    page, answers = show(browser, quiz), keys(quiz)
     points = 0
-    for number, key in enumerate(told):
-        assert said(page, "quiz-title") == f"Flight {number + 1} of {COUNT}"
-        assert "truth" not in said(page, "live")
-        assert said(page, "found") == "Not told yet."
-        assert page.ask("document.getElementById('quiz-told').textContent") == ""
+    for number, key in enumerate(answers):
+        assert element_text(page, "quiz-title") == f"Flight {number + 1} of {COUNT}"
+        assert "RMSE" not in element_text(page, "live")
+        assert element_text(page, "found") == "Hidden until you answer."
+        assert element_text(page, "quiz-solution") == ""
         if number == 0:
             page.click("#quiz-check")
-            assert said(page, "quiz-said") == "Choose at least one."
+            assert element_text(page, "quiz-result") == "Select at least one."
         right = number % 3 != 1
         wrong = next(name for name in CHOICES if name not in key["right"])
         choose(page, *(key["right"] if right else [wrong]))
         points += right
         answer = " and ".join(key["right"])
-        assert said(page, "quiz-said") == ("Right." if right else f"Not so. It was: {answer}.")
-        for made in key["made"]:
-            assert (made["span"] is not None) == (key["right"] == ["source"])
-            assert made["what"] in said(page, "quiz-told")
-            assert made["tell"] in said(page, "quiz-told")
-        assert f"{points} of {number + 1} right" in said(page, "quiz-score")
-        for made in key["made"]:
-            page.click("#quiz-told button")
+        assert element_text(page, "quiz-result") == (
+            "Correct." if right else f"Wrong. Correct answer: {answer}."
+        )
+        for mistake in key["mistakes"]:
+            assert (mistake["span"] is not None) == (key["right"] == ["source"])
+            assert mistake["description"] in element_text(page, "quiz-solution")
+            assert mistake["symptom"] in element_text(page, "quiz-solution")
+        assert f"{points} of {number + 1} correct" in element_text(page, "quiz-score")
+        for mistake in key["mistakes"]:
+            page.click("#quiz-solution button")
             settle(page)
             low, high = ask(page, "Explore.then((e) => [e.timeRange.start, e.timeRange.end])")
-            if made["span"] is not None:
-                assert low < made["span"][0] < high < low + 25.0
-        # now the truth stands beside the filter
-        assert "from the truth" in said(page, "live")
-        assert key["story"][0] in said(page, "found")
+            if mistake["span"] is not None:
+                assert low < mistake["span"][0] < high < low + 25.0
+        # after the answer the page shows ground truth
+        assert "position RMSE" in element_text(page, "live")
+        assert key["story"][0] in element_text(page, "found")
         assert page.ask("[...document.querySelectorAll('[name=choice]')].every((b) => b.disabled)")
         if number < COUNT - 1:
             renewed(page, "#quiz-next")
-    assert said(page, "quiz-score") == f"{points} of {COUNT} right: the set is done"
+    assert element_text(page, "quiz-score") == f"{points} of {COUNT} correct, set finished"
     assert page.ask("document.getElementById('quiz-next').hidden")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data", "blob"}
     renewed(page, "#quiz-again")
-    assert said(page, "quiz-title") == f"Flight 1 of {COUNT}"
-    assert said(page, "quiz-score") == ""
+    assert element_text(page, "quiz-title") == f"Flight 1 of {COUNT}"
+    assert element_text(page, "quiz-score") == ""
 
 
-def test_half_of_two_is_half_and_nothing_excludes_the_rest(browser: Browser, quiz: Path) -> None:
+def test_quiz_half_answer_scores_half_and_nothing_is_exclusive(
+    browser: Browser, quiz: Path
+) -> None:
     page = show(browser, quiz)
     for name in ("gate", "clock", "nothing"):
         page.click(f"[name=choice][value={name}]")
@@ -289,7 +294,7 @@ def test_half_of_two_is_half_and_nothing_excludes_the_rest(browser: Browser, qui
     assert points == [0.5, 1, 0, 0.5]
 
 
-def test_axe_finds_nothing_serious_in_the_quiz(browser: Browser, quiz: Path) -> None:
+def test_quiz_has_no_serious_axe_violations(browser: Browser, quiz: Path) -> None:
     page = show(browser, quiz, width=390)
     assert page.ask("document.documentElement.scrollWidth") <= 390
     page.ask(axe())
@@ -299,19 +304,19 @@ def test_axe_finds_nothing_serious_in_the_quiz(browser: Browser, quiz: Path) -> 
     assert serious(page) == []
 
 
-# ------------------------------------------------------------------ the command
+# ------------------------------------------------------------------ command
 
 
-def test_the_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_practice_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(click, "launch", opened.append)
-    # what it holds is tested above, and the lab's own command makes one
+    # the content of the page is tested above
     monkeypatch.setattr("px4fuse.practice.practice_text", lambda *given: repr(given[:3]))
     done("practice", "--seed", "3", "--flights", "1")
     page = tmp_path / "reports" / "practice_3.html"
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [page]
     assert page.read_text(encoding="utf-8") == "(3, 1, 1)"
-    assert opened == []  # nobody sits there
+    assert opened == []  # without --open and without a terminal
     done("practice", "--seed", "3", "--flights", "1", "--open", "-o", "a.html")
     assert opened == [str(tmp_path / "a.html")]

@@ -1,4 +1,4 @@
-"""Words on pages: names in every script, Markdown notes, numbers; and when the clock has a page."""
+"""Texts on pages: fonts for any script, Markdown notes, time offset page, sensitivity table."""
 
 from __future__ import annotations
 
@@ -41,20 +41,20 @@ def written(markdown: str) -> list[Block]:
 
 @pytest.fixture
 def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Fonts are looked up anew, before and after."""
+    """Clear the cached fonts before and after the test."""
 
-    def forget() -> None:
+    def clear_caches() -> None:
         for cached in (fonts.font_of, fonts._other_fonts):
             cached.cache_clear()
 
-    forget()
+    clear_caches()
     yield
     monkeypatch.undo()
-    forget()
+    clear_caches()
 
 
 def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> None:
-    """A machine with one more font, which has these characters."""
+    """Pretend that one more font with these characters is installed."""
     monkeypatch.setattr(fonts, "_other_fonts", lambda: ((name, "path"),))
     own = fonts._characters
     with_one_more = {"path": frozenset(map(ord, characters))}
@@ -62,7 +62,7 @@ def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> No
 
 
 @pytest.mark.usefixtures("_fresh")
-def test_a_font_of_the_machine_is_taken_for_what_dejavu_lacks(monkeypatch) -> None:
+def test_fonts_missing_in_dejavu_uses_installed_font(monkeypatch) -> None:
     with_font(monkeypatch, "Some Thai", THAI)
     assert fonts.missing_characters(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
     assert fonts.font_names(f"Ångström {ARABIC}") == [fonts.FONT]
@@ -71,17 +71,19 @@ def test_a_font_of_the_machine_is_taken_for_what_dejavu_lacks(monkeypatch) -> No
 
 
 @pytest.mark.usefixtures("_fresh")
-def test_what_no_font_has_is_a_square_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_characters_without_font_become_squares_with_advice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
     assert fonts.font_names(THAI + HAN) == [fonts.FONT]
     assert replace_unprintable(f"a {HAN}\x1b b") == "a □□□ b"
-    said = fonts.font_advice(THAI + HAN)
-    assert "characters สมชาย王小明:" in said
-    assert "fonts.google.com" in said
+    advice = fonts.font_advice(THAI + HAN)
+    assert "characters สมชาย王小明;" in advice
+    assert "fonts.google.com" in advice
 
 
 @pytest.mark.usefixtures("_fresh")
-def test_a_font_that_has_a_box_for_everything_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fonts_with_box_glyphs_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     own = font_manager.findfont(fonts.FONT)
     entries = [
         SimpleNamespace(name=name, style="normal", weight=400, fname=str(own), index=0)
@@ -97,7 +99,7 @@ def test_a_font_that_has_a_box_for_everything_is_none(monkeypatch: pytest.Monkey
     ]
 
 
-def test_lists_keep_their_marks_and_depth() -> None:
+def test_notes_lists_keep_marks_and_indent() -> None:
     blocks = written("- a\n  - b\n\n    c\n- d\n\n7. e\n8. f\n\n- - g\n")
     assert [(b["mark"], b["text"], b["indent"] / notes.INDENT) for b in blocks] == [
         ("•", "a", 1), ("•", "b", 2), ("", "c", 2), ("•", "d", 1),
@@ -105,7 +107,7 @@ def test_lists_keep_their_marks_and_depth() -> None:
     ]  # fmt: skip
 
 
-def test_code_keeps_its_spaces_and_dollars() -> None:
+def test_notes_code_keeps_spaces_and_dollar_signs() -> None:
     assert replace_unprintable("\N{NO-BREAK SPACE}x\n") == "\N{NO-BREAK SPACE}x\n"
     (code,) = written("```\nif x:\n    $y$ <b>\n```")
     assert code["text"].replace("\N{NO-BREAK SPACE}", " ") == "if x:\n    $y$ <b>"
@@ -118,47 +120,47 @@ def test_code_keeps_its_spaces_and_dollars() -> None:
         ("a  \nb", ["a\nb"]),
         ("[x](https://y.z) <https://y.z>", ["x (https://y.z) https://y.z"]),
         ("SIGMA_A and SIGMA_Z, 2 * 3 * 4", ["SIGMA_A and SIGMA_Z, 2 * 3 * 4"]),
-        # mathematics becomes letters, and prices stay
+        # mathematics becomes Unicode text, prices are unchanged
         (r"$\sigma_z^2 \le \frac{a}{b+1}$", ["σ_z^2 ≤ (a)/(b+1)"]),
         (r"$$\sqrt{S} \cdot \hat{x}_{k|k-1}$$", ["√(S) · (x)_(k|k-1)"]),
         (r"$\Delta t$ and $\lambda \degree \unknown{x}$", ["Δ t and λ ° unknown(x)"]),
         ("costs $5 and $10", ["costs $5 and $10"]),
         (r"\$5 and `$x$`", ["$5 and $x$"]),
-        # pictures and HTML are not printed raw
+        # pictures become descriptions, HTML tags are removed
         ("![a map](m.png) ![](m.png)", ["[picture: a map] [picture]"]),
         ("a <b>c</b> d &amp; e", ["a c d & e"]),
         ("<div><p>a</p></div>\n\n<!-- no -->\n\nyes", ["a", "yes"]),
     ],
 )
-def test_markdown_is_read_as_text(markdown: str, read_as: list[str]) -> None:
+def test_notes_markdown_becomes_plain_text(markdown: str, read_as: list[str]) -> None:
     assert [block["text"] for block in written(markdown) if block["text"]] == read_as
 
 
 @given(st.text(st.sampled_from("#*-_`$|<>[]()!\\ \n1.ab{}^&;~="), max_size=80))
-def test_any_markdown_is_read(text: str) -> None:
+def test_notes_any_markdown_is_accepted(text: str) -> None:
     assert all(block["kind"] in ("text", "table") for block in written(text))
 
 
 def pages_of(student: Student) -> Iterator[Page]:
-    nothing = object.__new__(Analysis)  # of a comparison, which they do not look into
-    return notes.draw(nothing, SimpleNamespace(student=student))  # type: ignore[arg-type]
+    empty = object.__new__(Analysis)  # the page uses only its type
+    return notes.draw(empty, SimpleNamespace(student=student))  # type: ignore[arg-type]
 
 
-def test_long_notes_run_over_pages_and_lose_nothing() -> None:
+def test_notes_long_text_continues_on_next_pages() -> None:
     words = [f"word{number}" for number in range(1500)]
     table = "| a | b |\n|---|---|\n" + "".join(f"| r{i} | {'cell ' * 30} |\n" for i in range(40))
     student = Student("", "", " ".join(words) + "\n\n" + table)
     sheets = set_by_typst(*pages_of(student))
     assert len(sheets) > 2
-    assert sheets[0].strip().startswith("Appendix: what the student found")
+    assert sheets[0].strip().startswith("Appendix: student notes")
     text = " ".join(sheets).split()
     assert [word for word in text if word.startswith("word")] == words
     assert sum(word == "cell" for word in text) == 1200
     assert not list(pages_of(Student("", "", " \n <!-- nothing --> \n")))
 
 
-def test_words_without_end_are_broken() -> None:
-    """PDF/A takes no string of 32,768 characters, and a page no line of them."""
+def test_notes_words_without_spaces_are_split() -> None:
+    """PDF/A limits strings to 32,767 characters."""
     endless = "a" * 33_000
     code = '{"x": 1, ' * 4_000
     student = Student("", "", f"{endless}\n\n| {endless} |\n|---|\n\n```\n{code}\n```\n")
@@ -167,7 +169,7 @@ def test_words_without_end_are_broken() -> None:
     assert text.count("{") == 4_000
 
 
-def test_what_a_student_writes_is_never_evaluated() -> None:
+def test_typst_code_in_notes_is_printed_as_text() -> None:
     hostile = '#read("/etc/passwd") #sys.inputs $x$ = y *b* @ref <label> // c'
     page = Page("Notes")
     page.write(hostile)
@@ -178,14 +180,14 @@ def test_what_a_student_writes_is_never_evaluated() -> None:
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "code",
     ['read("/etc/passwd")', 'read("../../../etc/passwd")', 'image("/etc/hostname")',
      'image(bytes("<svg xmlns=\'http://www.w3.org/2000/svg\'><image href=\'/etc/hostname\' '
      'width=\'1\' height=\'1\'/></svg>"), format: "svg")'],
 )  # fmt: skip
-def test_a_template_reaches_no_file(asked: str) -> None:
+def test_template_cannot_read_files(code: str) -> None:
     with pytest.raises(typst.TypstError):
-        compile_pdf({"fonts": [fonts.FONT]}, f"#{asked}")
+        compile_pdf({"fonts": [fonts.FONT]}, f"#{code}")
 
 
 def offset(**changes: Any) -> ClockOffset:
@@ -209,47 +211,52 @@ def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     return SimpleNamespace(clock=found, settings=settings, flight=flight, source=source())
 
 
-def test_the_clock_has_its_page_when_there_is_something_to_say() -> None:
+def test_clock_page_exists_only_with_result_to_report() -> None:
     whole = offset(parts=())
     fine, unknown = with_clock(whole), replace(whole, determinable=False, reason="no motion")
-    named = [
+    with_finding = [
         SimpleNamespace(findings=[Finding(name, "error", "", "")]) for name in clock.CLOCK_FINDINGS
     ]
     nothing: Any = SimpleNamespace(findings=[])
-    assert "the stamps are right" in clock.summary_line(fine, [])
+    assert "No significant time offset" in clock.summary_line(fine, [])
     assert not list(clock.draw(fine, nothing))
-    for made, results in ((with_clock(unknown), nothing), *((fine, each) for each in named)):
-        assert clock.summary_line(made, results.findings) == "see its page"
-        assert len(list(clock.draw(made, results))) == 1
+    for analysis, results in (
+        (with_clock(unknown), nothing), *((fine, each) for each in with_finding)
+    ):  # fmt: skip
+        line = clock.summary_line(analysis, results.findings)
+        assert line == "see the appendix on the time offset"
+        assert len(list(clock.draw(analysis, results))) == 1
     none = with_clock(Unavailable("clock offset", "no IMU", "Give the ULog."))
-    assert clock.summary_line(none, []) == "not determinable: no IMU. Give the ULog."
+    assert clock.summary_line(none, []) == "Cannot be estimated: no IMU. Give the ULog."
     assert not list(clock.draw(none, nothing))
 
 
 @pytest.mark.parametrize(
-    ("changes", "delay_ms", "said"),
+    ("changes", "delay_ms", "expected"),
     [
-        ({}, 0.0, {"Reading": "the stamps are right", "PX4": "0 ms fits"}),
-        ({}, 175.0, {"PX4": "EKF2_EV_DELAY is 175 ms, the data ask for 0 ms (0 to 20)"}),
+        ({}, 0.0, {"Result": "No significant time offset", "PX4": "0 ms is within"}),
+        ({}, 175.0, {"PX4": "Set EKF2_EV_DELAY to 0 ms (now 175 ms; 95 % 0 to 20 ms)"}),
         ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 250.0,
-         {"Reading": "late by 0.250 s", "Re-run": "--clock-offset -0.250", "PX4": "fits"}),
+         {"Result": "0.250 s late", "Re-run": "--clock-offset -0.250", "PX4": "is within"}),
         ({"offset_s": 0.25, "interval_s": (0.22, 0.28)}, 0.0,
-         {"Reading": "early by 0.250 s", "PX4": "cannot be negative"}),
-        ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0, {"Reading": "are right"}),
+         {"Result": "0.250 s early", "PX4": "cannot be negative"}),
+        ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0, {"Result": "No significant"}),
         ({"change_p": 0.001}, 0.0, {"Changes": "+0.00 s from 10 s"}),
-        ({"drift_ppm": 1000.0}, 0.0, {"Drift": "+1000 ± 588 ppm"}),
+        ({"drift_ppm": 1000.0}, 0.0, {"Drift": "+1000 ± 588 ppm (95 %)."}),
+        ({"drift_ppm": 100.0}, 0.0, {"Drift": "not significant"}),
     ],
+    ids=["fits", "other delay", "late", "early", "negligible", "changes", "drift", "no drift"],
 )  # fmt: skip
-def test_what_follows_from_the_clock(
-    changes: dict[str, Any], delay_ms: float, said: dict[str, str]
+def test_clock_advice_states_result_and_action(
+    changes: dict[str, Any], delay_ms: float, expected: dict[str, str]
 ) -> None:
     analysis = with_clock(offset(**changes), delay_ms)
     advice = clock.clock_advice(analysis, analysis.clock)
-    assert all(words in advice[label] for label, words in said.items()), advice
+    assert all(text in advice[label] for label, text in expected.items()), advice
 
 
-def test_only_the_ratio_moves_the_gain_and_the_track() -> None:
-    """What the page of the knobs says: the tracks coincide, σ and NIS scale."""
+def test_settings_with_same_ratio_have_same_gain_and_track() -> None:
+    """Statement of the sensitivity page: the tracks coincide, σ and NIS scale."""
     rng = np.random.default_rng(3)
     axis = random_walk(rng, count=600, interval_s=0.2, sigma_a=0.5, sigma_z=0.1)
     factors = np.array([(a, z) for _, a, z in SETTINGS]).T

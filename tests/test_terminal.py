@@ -1,4 +1,4 @@
-"""What a student reads and pastes: whole words, commands that run, files that are not lost."""
+"""Terminal output: wrapping, commands ready to paste, default output files, progress bar."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ WIDTH = 80
 
 
 def commands(text: str) -> list[str]:
-    """The commands that are printed, as whoever copies them does."""
+    """Return the printed commands."""
     return re.findall(r"^.{9}(px4fuse .*)$", text, re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
 def flown() -> bytes:
-    """A short flight whose stamps are late."""
+    """Log of a short flight with late timestamps."""
     scenario = Scenario(passes=2, truth=False, seed=3)
     return flights.to_ulog(flights.simulate(scenario, parse(("clock-offset=250ms",))))
 
 
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flown: bytes) -> Path:
-    """A folder whose name a shell would take apart, with a log; the commands run there."""
+    """Working folder with blanks, a quote and & in its name, and a log in it."""
     folder = tmp_path / "Ana's flights & more"
     folder.mkdir()
     (folder / "l.ulg").write_bytes(flown)
@@ -59,19 +59,19 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flown: bytes) -> Path:
     return folder
 
 
-# --- words wrap, nothing is cut ---
+# --- wrapping ---
 
 
 @pytest.fixture(scope="module")
 def document(sample_log: Path) -> tuple[Analysis, ComparisonResults]:
-    """The sample with a setting that gives a finding."""
+    """Analysis and results of the sample flight with a setting that causes a finding."""
     request = ComparisonRequest(log=str(sample_log), sigma_z_m=0.3)
     analysis = analyse(request)
     return analysis, results(request, analysis)
 
 
-def test_nothing_is_cut_and_words_are_whole(document, monkeypatch) -> None:
-    summaries: dict[int | None, str] = {}  # on a screen, on a narrow one, and in a pipe
+def test_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
+    summaries: dict[int | None, str] = {}  # by terminal width; None is a pipe
     for width in (WIDTH, 60, None):
         monkeypatch.delenv("COLUMNS", raising=False)
         if width is not None:
@@ -86,33 +86,33 @@ def test_nothing_is_cut_and_words_are_whole(document, monkeypatch) -> None:
         assert "--sigma-z" in summaries[width]
     assert summaries[WIDTH].split() == whole.split()
     long = [line for line in summaries[WIDTH].splitlines() if len(line) > WIDTH]
-    assert all(map(commands, long))  # to be copied
+    assert all(map(commands, long))  # only commands are longer, so they can be copied
     assert "\x1b" not in whole
-    # in a pipe a paragraph is one line; the first ones are the story, and the rest is not it again
+    # in a pipe a paragraph is one line; the summary comes first and is not repeated
     lines = whole.splitlines()
     story = document[1].story
     assert lines[: len(story) + 1] == [*story, ""]
-    assert len(re.findall("(?:Most|The largest part) of what ours and EKF2", whole)) == 1
+    assert all(whole.count(sentence) == 1 for sentence in story)
 
 
-def test_a_paragraph_hangs_beside_its_label(capsys) -> None:
+def test_paragraph_has_hanging_indent(capsys) -> None:
     console = Console(width=30, highlight=False)
     print_paragraph(console, "one two three four five six seven", "Label", 9)
     lines = ["Label    one two three four", "         five six seven"]
     assert capsys.readouterr().out.splitlines() == lines
 
 
-def test_words_alone_import_no_pictures() -> None:
-    """Matplotlib costs a third of a second, which `sync` and `loop` need not wait for."""
-    rooms = ", ".join(f"px4fuse.report.{n}" for n in ("terminal", "loop", "whatif", "evaluation"))
-    code = f"import sys, {rooms}; sys.exit('matplotlib' in sys.modules)"
+def test_text_modules_do_not_import_matplotlib() -> None:
+    """Importing matplotlib takes 0.3 s, which text-only commands such as `sync` save."""
+    modules = ", ".join(f"px4fuse.report.{n}" for n in ("terminal", "loop", "whatif", "evaluation"))
+    code = f"import sys, {modules}; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-# --- commands run when pasted ---
+# --- commands ready to paste ---
 
 
-def test_commands_are_written_with_what_was_typed() -> None:
+def test_expand_commands_adds_typed_files_and_options() -> None:
     request = ComparisonRequest(
         log="my flights/a'b.ulg", mavlink="-t.tlog", position=PositionFile(path="u w/b.csv"),
         start_s=12.5, sigma_z_m=0.3,
@@ -131,7 +131,7 @@ def test_commands_are_written_with_what_was_typed() -> None:
         "--start", "12.5", "--clock-offset", "-0.125", "--position", "u w/b.csv",
     ]  # fmt: skip
     assert shlex.split(loops) == ["px4fuse", "loop", "my flights/a'b.ulg", "--from", "12.5"]
-    # a log that looks like an option is none
+    # a file name that begins with - is not an option
     typed = command_line(ComparisonRequest(log="-a.ulg"), "tune", typed=True)
     assert typed == "px4fuse tune ./-a.ulg"
 
@@ -142,8 +142,8 @@ def test_commands_are_written_with_what_was_typed() -> None:
     ["compare {log} --sigma-z 0.5", "tune {log} --axis north --start 8", "sync {log} --dt 0.05",
      "info {log}"],
 )  # fmt: skip
-def test_what_is_printed_runs_when_pasted(desk, monkeypatch, typed) -> None:
-    monkeypatch.chdir(desk.parent)  # so that the path as typed has blanks and a quote in it
+def test_printed_commands_run_when_pasted(desk, monkeypatch, typed) -> None:
+    monkeypatch.chdir(desk.parent)  # the typed path then contains blanks and a quote
     words = shlex.split(typed.format(log=shlex.quote(f"{desk.name}/l.ulg")))
     printed = commands(done(*words).stdout)
     assert printed
@@ -155,7 +155,7 @@ def test_what_is_printed_runs_when_pasted(desk, monkeypatch, typed) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_the_command_of_a_finding_removes_it(desk) -> None:
+def test_command_of_finding_removes_finding(desk) -> None:
     first = done("compare", "l.ulg", "--sigma-z", "0.12", "--json", "a.json")
     assert "reports/l_sigma-z-0.12.pdf" in first.stdout.replace(os.sep, "/")
     command = next(command for command in commands(first.stdout) if "--clock-offset" in command)
@@ -175,21 +175,21 @@ def files(folder: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("command", ["compare", "tune", "sync", "whatif", "loop", "info"])
-def test_results_on_standard_output_write_no_file(command, desk) -> None:
+def test_json_to_standard_output_writes_no_file(command, desk) -> None:
     assert json.loads(done(command, "l.ulg", "--json", "-").stdout)
     assert files(desk) == {"l.ulg"}
 
 
 @pytest.fixture
 def made(document, sample_log: Path, tmp_path, monkeypatch) -> ComparisonResults:
-    """Results of a run in an empty folder."""
+    """Results of the sample flight; the working folder is empty."""
     monkeypatch.chdir(tmp_path)
     request = ComparisonRequest(log=str(sample_log))
     return results(request, document[0])
 
 
 def reported(made: ComparisonResults, **changes: object) -> str:
-    """Write a report without pages where it goes by default."""
+    """Write a report without pages to its default path and return the file name."""
     student = Student(name=str(changes.pop("student", "")))
     request = replace(made.request, **changes)
     changed = replace(made, request=request.without_paths(), student=student)
@@ -203,7 +203,7 @@ def reported(made: ComparisonResults, **changes: object) -> str:
 def test_default_report_of_same_run_is_replaced(made) -> None:
     assert reported(made) == reported(made) == "aisle_uwb.pdf"
     assert reported(made, sigma_z_m=0.05) == "aisle_uwb_sigma-z-0.05.pdf"
-    # a name is added to a report without one
+    # a report without a student may be replaced by one with a student
     assert reported(made, student="Ana") == reported(made, student="Ana") == "aisle_uwb.pdf"
 
 
@@ -245,7 +245,7 @@ def test_same_name_in_two_folders_keeps_first_report(desk, sample_log) -> None:
     done("compare", "l.ulg")
 
 
-def test_names_of_reports_are_names_of_files() -> None:
+def test_settings_name_is_valid_in_file_names() -> None:
     request = ComparisonRequest(
         log="a.ulg", axes=("north", "east"), clock_offset_s=-0.12, heading_deg=30.0,
         position=PositionFile(path="/home/x/u wb.csv", columns=("t", "x/y", "*")),
@@ -256,10 +256,10 @@ def test_names_of_reports_are_names_of_files() -> None:
     assert settings_name(ComparisonRequest(log="a.ulg")) == ""
 
 
-# --- how far it is ---
+# --- progress bar ---
 
 
-def test_the_bar_shows_what_is_done_on_a_terminal_only(monkeypatch, capsys) -> None:
+def test_progress_bar_appears_on_terminal_only(monkeypatch, capsys) -> None:
     with progress() as step:
         step("reading x")
     assert capsys.readouterr().err == ""
@@ -276,10 +276,10 @@ def test_the_bar_shows_what_is_done_on_a_terminal_only(monkeypatch, capsys) -> N
     assert capsys.readouterr().err == ""
 
 
-# --- why ---
+# --- styles ---
 
 
-def test_what_is_bold_on_a_page_is_bold_on_a_terminal() -> None:
+def test_bold_text_of_page_is_bold_on_terminal() -> None:
     for weight, bold in (("bold", True), ("regular", False)):
         block = {"text": "so", "colour": "black", "weight": weight}
         assert ("bold" in str(screen._styled_text(block).style)) is bold  # type: ignore[arg-type]

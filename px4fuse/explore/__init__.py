@@ -1,1 +1,1 @@
-"""One HTML page on which a flight's filter is turned and watched: Analysis → page."""
+"""Interactive HTML page of one flight: KF re-runs in the browser with other settings."""

@@ -1,6 +1,6 @@
-"""What the page holds of a flight: the signals that the filter runs on, EKF2, truth and marks.
+"""Data of one flight for the page: input signals of KF, EKF2, ground truth, events and findings.
 
-Python projects, integrates and judges EKF2; the page only replays our filter.
+Python projects and integrates the signals and evaluates EKF2; the page only runs KF.
 """
 
 from typing import Any
@@ -26,30 +26,30 @@ from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings import Finding, by_root, find
+from px4fuse.findings import Finding, by_root, find, finding_title
 from px4fuse.findings.causes import NOISES
 from px4fuse.findings.story import story
 from px4fuse.flight import Columns, PositionTrack, Unavailable
+from px4fuse.plain import capitalise_first
 from px4fuse.request import ComparisonRequest, command_line
 
-# How far the stamps can be moved on the page; --clock-offset takes more
+# s; range of the clock offset slider on each side (the option --clock-offset has a larger range)
 OFFSET_REACH_S = 0.6
-# Innovations that the running mean of NIS is taken over
-RUNNING_MEAN_COUNT = 30
-# The track on the plan is drawn with at most so many points
-MAX_PLAN_POINTS = 2000
-# Findings that other settings would take away or bring
-KNOB_FINDINGS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
+RUNNING_MEAN_COUNT = 30  # innovations in the running mean NIS
+MAX_PLAN_POINTS = 2000  # drawn points of the map
+# Ids of findings that depend on the settings of the page
+SETTING_FINDINGS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
 
 def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
-    """Everything about one flight, as JSON can hold it; arrays are places in the packer.
+    """Return all data of one flight for JSON; arrays are replaced by their index in the packer.
 
     Parameters
     ----------
     analysis : Analysis
-        Made from a request.
+        Must have a request.
     packer : Packer
+        Collects the arrays.
     """
     signals = replay_signals(analysis, packer)
     events, findings, request = analysis.events, find(analysis), analysis.request
@@ -57,7 +57,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
     return {
         "log": analysis.flight.log.name,
         "source": analysis.source.name,
-        # what innovations ask for then is no noise
+        # estimates from the innovations of a drifting source are not its noise
         "drifts": analysis.source.origin.may_drift,
         "story": list(story(analysis, findings)),
         "settings": _settings_data(analysis.settings),
@@ -70,7 +70,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
         "maps": _map_data(analysis),
         "plan": _plan_data(analysis, packer),
         "events": {
-            "silent": list(events.gaps),
+            "gap": list(events.gaps),
             "dropout": list(events.dropouts),
             "ground": list(events.ground),
             "modes": [[mode.start_s, mode.end_s, mode.name] for mode in events.modes],
@@ -86,7 +86,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
 
 
 def replay_signals(comparison: Comparison, packer: Packer) -> dict[str, Any]:
-    """What the page's engine replays: measurements, IMU integrals, segment and start."""
+    """Return the inputs of the page's KF: measurements, IMU integrals, segment, covariance."""
     raw = raw_source(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
@@ -97,7 +97,7 @@ def replay_signals(comparison: Comparison, packer: Packer) -> dict[str, Any]:
 
 
 def ranges() -> dict[str, Any]:
-    """What the settings may be, as the command line takes them, and the lesson's values."""
+    """Return the limits of the settings (as on the command line) and the lesson's values."""
     return {
         "sigma-a": list(allowed.SIGMA_A_RANGE_M_S2),
         "sigma-z": list(allowed.SIGMA_Z_RANGE_M),
@@ -110,7 +110,7 @@ def ranges() -> dict[str, Any]:
 
 
 def raw_source(comparison: Comparison) -> PositionTrack:
-    """The comparison's source with the stamps that it came with."""
+    """Return the position source with its original timestamps."""
     return choose_source(comparison.flight, comparison.source.name)[0]
 
 
@@ -125,9 +125,9 @@ def _settings_data(settings: Settings) -> dict[str, Any]:
 
 
 def _offset_data(request: ComparisonRequest, analysis: Analysis) -> dict[str, Any]:
-    """How far the stamps can be moved, and why not where they cannot; what fits best."""
+    """Return the range of the clock offset with its estimate, or the reason why it is fixed."""
     if request.position is not None:
-        return {"why": "the clock offset of a position file is spent on placing it"}
+        return {"why": "the clock offset of a position file is used to align the file"}
     centre, clock = analysis.settings.clock_offset_s, analysis.clock
     likely = None
     if isinstance(clock, ClockOffset) and clock.determinable:
@@ -136,7 +136,7 @@ def _offset_data(request: ComparisonRequest, analysis: Analysis) -> dict[str, An
 
 
 def _imu_data(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
-    """Times, gaps and span of the acceleration; why not where there is none."""
+    """Return times, gaps and span of the acceleration, or the reason why it is missing."""
     acceleration = comparison.lines[0].acceleration
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
@@ -153,7 +153,7 @@ def _imu_data(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
 
 
 def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
-    """The samples that steps inside the segment can need, one beyond either end."""
+    """Return the slice of IMU samples for the segment, with one more at each end."""
     segment, time = comparison.segment, acceleration.time_s
     low = int(np.searchsorted(time, segment.start_s, side="right")) - 1
     high = int(np.searchsorted(time, segment.end_s)) + 1
@@ -163,7 +163,7 @@ def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
 def _axis_signals(
     comparison: Comparison, axis: Axis, raw: PositionTrack, packer: Packer
 ) -> dict[str, Any]:
-    """One axis: measurements as they were stamped, also beyond the segment, and acceleration."""
+    """Return measurements (also near the segment) and integrated acceleration of one axis."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
     value = along(raw.samples, Columns.POSITION, axis.direction)
@@ -187,7 +187,7 @@ def _axis_signals(
 
 
 def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
-    """What stands beside our filter along one axis."""
+    """Return the axis description, NIS bands, EKF2 and ground truth of one axis."""
     name = result.axis.name
     return {
         "called": result.axis.called,
@@ -195,7 +195,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
-        # the joint likelihood map of the horizontal axes where there is one, or its own
+        # horizontal axes share their likelihood map if it exists
         "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
         "ekf2": _ekf2_data(analysis, result, packer),
         "truth": _truth_data(result, packer),
@@ -203,9 +203,9 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
 
 
 def _nis_bands(count: int, packer: Packer) -> list[int]:
-    """Bands of the mean NIS for every number of innovations: places of both ends.
+    """Pack both ends of the 95 % band of the mean NIS for each number of innovations.
 
-    Another clock offset moves measurements into the segment and out of it.
+    The number changes with the clock offset, which moves measurements across the segment's ends.
     """
     freedom = np.arange(1, 2 * count + 1)
     ends = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
@@ -215,7 +215,7 @@ def _nis_bands(count: int, packer: Packer) -> list[int]:
 
 
 def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
-    """What EKF2 did, which no setting of ours changes; why not where there is none."""
+    """Return EKF2's states, σ, innovations and statistics, or the reason why they are missing."""
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
@@ -259,7 +259,7 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
 
 
 def _summary(statement: Consistency | Unavailable) -> dict[str, Any]:
-    """Return EKF2's column of the page's table; the reason where there are too few innovations."""
+    """Return EKF2's column of the table of numbers, or the reason why it is missing."""
     if isinstance(statement, Unavailable):
         return {"why": statement.reason}
     return {
@@ -284,13 +284,13 @@ def _truth_data(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
 
 
 def _pack_frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]:
-    """Places of the times and of some columns."""
+    """Pack the times and some columns of a frame; return their indices."""
     values = [packer.add(frame[column].to_numpy(), COARSE_SCALE) for column in columns]
     return [packer.add_times(frame.index.to_numpy()), *values]
 
 
 def _map_data(analysis: Analysis) -> dict[str, Any]:
-    """What the map of each axis shows; why not where there is none."""
+    """Return limits and estimate of each likelihood map, or the reason why it is missing."""
     return {
         name: {
             "sigmaA": tuned.map.sigma_a_m_s2[[0, -1]].tolist(),
@@ -305,7 +305,7 @@ def _map_data(analysis: Analysis) -> dict[str, Any]:
 
 
 def _plan_data(comparison: Comparison, packer: Packer) -> list[int] | str:
-    """The source's track seen from above: places of time, north and east."""
+    """Pack time, north and east of the source's track, or return why it is missing."""
     samples = within(comparison.source.samples, comparison.segment)
     track = samples[Columns.POSITION[:2]].dropna()
     if not len(track):
@@ -319,17 +319,19 @@ def _finding_data(finding: Finding) -> dict[str, Any]:
         "severity": finding.severity,
         "message": finding.message,
         "remedy": finding.remedy,
-        "knobs": finding.id in KNOB_FINDINGS,
+        "id": finding.id,
+        "title": capitalise_first(finding_title(finding.id)),
+        "depends_on_settings": finding.id in SETTING_FINDINGS,
         "spans": [list(span) for span in finding.spans_s[:20]],
         "more": [],
     }
 
 
 def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[str, Any]:
-    """The command without what the page sets, and what holds the analysed part where it is.
+    """Return the command without the page's settings, and one with a fixed segment and aisle.
 
-    The segment and the aisle are found from the stamps, so that another clock offset would move
-    them: then they are said.
+    Segment and aisle are derived from the timestamps, so another clock offset would change them;
+    then the command states them.
     """
     offset_s = None if request.position is None else request.clock_offset_s
     base_request = msgspec.structs.replace(

@@ -1,4 +1,4 @@
-/* What every part of the page uses. Text from the log goes into the page as text only. */
+/* Helpers for DOM nodes. Text from the log becomes text nodes only, never HTML. */
 "use strict";
 const $ = (id) => document.getElementById(id);
 const make = (tag, text, properties) => {

@@ -1,5 +1,5 @@
-/* The two-state filter of px4fuse.filter.kalman, step by step as px4fuse.replay runs it: the same
-   grid of DT and measurements, the same step means of the IMU, the same Joseph update. */
+/* KF of px4fuse.filter.kalman in JavaScript, with the same results as px4fuse.replay: the same time
+   steps, the same mean acceleration per step, the same Joseph update. */
 "use strict";
 const Engine = (() => {
   const SAME_TIME_S = 5e-7; // kalman.SAME_TIME_S
@@ -7,7 +7,7 @@ const Engine = (() => {
   const MIN_COMMON_SAMPLES = 3; // projection.MIN_COMMON_SAMPLES
   const MIN_INNOVATIONS = 10; // consistency.MIN_INNOVATIONS
 
-  /* numpy.interp for x in rising order; outside is what stands at the ends, or NaN */
+  /* numpy.interp for ascending x; `outside` replaces the end values beyond the range of xp */
   function interp(x, xp, fp, outside) {
     const n = xp.length, out = new Float64Array(x.length);
     let j = 0;
@@ -21,7 +21,7 @@ const Engine = (() => {
     return out;
   }
 
-  /* Mean acceleration of each step, and the share of it that lies in a gap (signals.step_means) */
+  /* Mean acceleration of each step, and the fraction of the step within a gap (signals.step_means) */
   function stepMeans(imu, axis, edges) {
     const velocity = interp(edges, imu.time, axis.integral);
     const gap = interp(edges, imu.gapEdges, imu.gapSum);
@@ -37,7 +37,7 @@ const Engine = (() => {
     return { mean, share };
   }
 
-  /* The measurements inside the segment once their stamps are corrected */
+  /* Measurements within the segment after the time offset correction */
   function measured(axis, segment, offset) {
     const time = [], z = [];
     for (let i = 0; i < axis.time.length; i++) {
@@ -47,7 +47,7 @@ const Engine = (() => {
     return { time, z };
   }
 
-  /* The filter's steps (kalman.timeline) */
+  /* Time steps of the filter: grid of DT and measurement times (kalman.timeline) */
   function timeline(flight, axis, settings) {
     const { time: all, z } = measured(axis, flight.segment, settings.offset);
     if (all.length < MIN_MEASUREMENTS) return null;
@@ -74,7 +74,7 @@ const Engine = (() => {
     return { time: time.subarray(0, n), at: at.subarray(0, n), z, updates: m };
   }
 
-  /* What the acceleration is over each step, and what gaps add to its variance */
+  /* Mean acceleration of each step, and the additional variance in IMU gaps */
   function inputs(flight, axis, settings, line) {
     const n = line.time.length - 1;
     if (settings.input === "zero") {
@@ -82,7 +82,7 @@ const Engine = (() => {
     }
     const { mean, share } = stepMeans(flight.imu, axis, line.time);
     const extra = new Float64Array(n);
-    for (let from = 0; from < n;) { // leg by leg: unknown acceleration persists through a gap
+    for (let from = 0; from < n;) { // between measurements: unknown acceleration persists through a gap
       let to = from, gap = 0;
       do gap += share[to] * (line.time[to + 1] - line.time[to]); while (line.at[++to] < 0 && to < n);
       const persistence = Math.max(gap / settings.dt, 1);
@@ -92,7 +92,7 @@ const Engine = (() => {
     return { mean, extra };
   }
 
-  /* px4fuse.replay: settings are sigmaA, sigmaZ, dt, input and offset */
+  /* Run the filter (px4fuse.replay); settings: sigmaA, sigmaZ, dt, input, offset */
   function replay(flight, axis, settings) {
     const line = timeline(flight, axis, settings);
     if (line === null) return null;
@@ -145,7 +145,7 @@ const Engine = (() => {
     return { steps, updates, settings };
   }
 
-  /* Position and velocity at other times in rising order, NaN outside (kalman.state_at) */
+  /* Position and velocity at other ascending times, NaN outside the run (kalman.state_at) */
   function stateAt(run, times) {
     const { time, p, v, acceleration } = run.steps, n = time.length;
     const position = new Float64Array(times.length), velocity = new Float64Array(times.length);
@@ -161,7 +161,7 @@ const Engine = (() => {
     return { p: position, v: velocity };
   }
 
-  /* What the table says of innovations (consistency.assess); null for fewer than ten */
+  /* Statistics of innovations (consistency.assess); null for fewer than MIN_INNOVATIONS */
   function assess(nu, s) {
     let square = 0, outside = 0, product = 0, before = 0;
     const n = nu.length;
@@ -176,16 +176,17 @@ const Engine = (() => {
     return { count: n, nis: square / n, outside: outside / n, lag1: product / square };
   }
 
-  function rmse(ours, theirs) {
+  /* Root mean square difference of two series, null for fewer than MIN_COMMON_SAMPLES */
+  function rmse(values, reference) {
     let square = 0, n = 0;
-    for (let i = 0; i < ours.length; i++) {
-      const e = ours[i] - theirs[i];
+    for (let i = 0; i < values.length; i++) {
+      const e = values[i] - reference[i];
       if (Number.isFinite(e)) { square += e * e; n++; }
     }
     return n < MIN_COMMON_SAMPLES ? null : Math.sqrt(square / n);
   }
 
-  /* Arrays as px4fuse.explore.packing wrote them */
+  /* Decode the arrays of px4fuse.explore.packing */
   async function unpack(text, specs) {
     const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));

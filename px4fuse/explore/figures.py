@@ -1,4 +1,4 @@
-"""The page's plots, empty: the page fills them with what its settings give."""
+"""Empty Bokeh plots of the page, which the page's script fills with data."""
 
 from typing import Any, Literal
 
@@ -23,8 +23,8 @@ from px4fuse.record import Record, table
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MEASUREMENT_COLOUR, TRUTH_COLOUR
 
 PLOT_HEIGHT, TALL_HEIGHT = 150, 210
-# Ours is dark, solid and round; EKF2 is lighter, dashed and square, as in the report
-KF_LINE: dict[str, Any] = {"line_color": KF_COLOUR, "line_width": 1.6, "name": "ours"}
+# KF is dark, solid and round, EKF2 lighter, dashed and square, as in the report
+KF_LINE: dict[str, Any] = {"line_color": KF_COLOUR, "line_width": 1.6, "name": "kf"}
 EKF2_LINE: dict[str, Any] = {
     "line_color": EKF2_COLOUR,
     "line_width": 1.6,
@@ -43,14 +43,15 @@ NIS_BAND: dict[str, Any] = {
     "fill_color": "#4a8f5a",
     "line_color": "#4a8f5a",
 }
-LEFT_BORDER = 96
+LEFT_BORDER = 96  # pixels
 STYLES = {
-    "ours": KF_LINE,
+    "kf": KF_LINE,
     "dotted": KF_LINE | {"line_dash": [2, 2]},
     "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
 }
-# √(2 · drop of log-likelihood): as far as so many standard deviations
+# Range of the colours of the likelihood map: √(2 · drop of the log-likelihood), in standard
+# deviations
 MAP_SIGMAS = 6.0
 
 
@@ -60,7 +61,7 @@ class Plot(Record, frozen=True):
     Attributes
     ----------
     lines : tuple of (source, column, style, name)
-        Of :data:`STYLES`; the name at the pointer, where it has one.
+        Style of :data:`STYLES`; the name appears in the tooltip, "" for none.
     """
 
     label: str
@@ -71,7 +72,7 @@ class Plot(Record, frozen=True):
 
 
 class Figures(Record, frozen=True):
-    """The tables of ``figures.toml``."""
+    """Tables of ``figures.toml``."""
 
     strip: list[str]
     map_colours: list[str]
@@ -84,14 +85,14 @@ FIGURES = table(__file__, "figures.toml", Figures)
 
 
 def document_json(data: dict[str, Any], tuning: Tuning) -> tuple[Any, dict[str, str]]:
-    """Bokeh's document, and of each root the id of the element that it goes into.
+    """Return Bokeh's document, and the element id of each root.
 
     Parameters
     ----------
     data : dict
         From :func:`px4fuse.explore.data.flight_data`.
     tuning : mapping
-        For the likelihood maps.
+        Contains the likelihood maps.
     """
     document = Document()
     time_range = _page_range("time")
@@ -102,14 +103,14 @@ def document_json(data: dict[str, Any], tuning: Tuning) -> tuple[Any, dict[str, 
         "plan": _plan_plot(),
         "step": _phase_plot(),
     }
-    with document.models.freeze():  # what belongs to the roots is looked for once
+    with document.models.freeze():  # collect the models of all roots once
         for plot in plots.values():
             document.add_root(plot)
     return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
 
 
 def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
-    """Every plot against time, by its name."""
+    """Return the plots over time by name."""
     missing_kinds = {
         kind
         for kind in ("ekf2", "truth")
@@ -155,7 +156,7 @@ def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
 
 
 class _Sources(dict[str, ColumnDataSource]):
-    """The sources of one plot, each made when it is first asked for."""
+    """Data sources of one plot, created on first use."""
 
     def __init__(self, plot: str) -> None:
         self.plot = plot
@@ -166,7 +167,7 @@ class _Sources(dict[str, ColumnDataSource]):
 
 
 def _draw_arrows(fig: Any, source: ColumnDataSource, colour: str, name: str) -> None:
-    """Arrow heads at the edge that hides something, turned upside down at the lower one."""
+    """Draw arrow heads at the upper or lower edge for values outside the plot."""
     fig.scatter(
         "t",
         "y",
@@ -181,7 +182,7 @@ def _draw_arrows(fig: Any, source: ColumnDataSource, colour: str, name: str) -> 
 
 
 def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
-    """Innovations of both filters as dots, and our ±2√S as a band."""
+    """Draw the innovations of KF and EKF2 as dots, and ±2√S of KF as a band."""
     updates = sources["updates"]
     fig.varea(
         "t",
@@ -190,7 +191,7 @@ def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ek
         source=updates,
         fill_color=KF_COLOUR,
         fill_alpha=0.15,
-        name="ours_band",
+        name="kf_band",
     )
     if with_ekf2:
         square: dict[str, Any] = {"marker": "square", "name": "ekf2"}
@@ -200,31 +201,32 @@ def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ek
         _add_hover(fig, rejected, ("EKF2 rejected", "@nu{0.000} m"))
         _draw_arrows(fig, sources["beyond_ekf2"], EKF2_COLOUR, "ekf2")
     kf_dots = fig.scatter(
-        "t", "nu", source=updates, size=4, fill_color=KF_COLOUR, line_color=None, name="ours"
+        "t", "nu", source=updates, size=4, fill_color=KF_COLOUR, line_color=None, name="kf"
     )
-    _add_hover(fig, kf_dots, ("ours", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
-    _draw_arrows(fig, sources["beyond"], KF_COLOUR, "ours")
+    _add_hover(fig, kf_dots, ("KF", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
+    _draw_arrows(fig, sources["beyond"], KF_COLOUR, "kf")
 
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     tips = [("time", "@t{0.00} s"), *rows]
-    side: Any = {"EKF2": "right", "truth": "above"}.get(rows[0][0], "left")  # none hides another
+    # different sides, so that tooltips do not overlap
+    side: Any = {"EKF2": "right", "ground truth": "above"}.get(rows[0][0], "left")
     fig.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
 
 
 def _page_range(name: str | None = None) -> Range1d:
-    """For the page to set."""
+    """Return a range that the page sets."""
     return Range1d(start=0.1, end=1.0, name=name)
 
 
 def _empty_source(name: str, columns: str) -> ColumnDataSource:
-    """Empty, for the page to fill."""
+    """Return an empty source that the page fills."""
     empty: dict[str, Any] = {column: [] for column in columns.split()}
     return ColumnDataSource(empty, name=f"{name}-source")
 
 
 def _event_bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
-    """Shading behind every plot against time: modes in turn, ground, silence, dropouts."""
+    """Return the shaded spans behind the plots: modes (alternating), ground, gaps, dropouts."""
     grey: dict[str, Any] = {"fill_color": "#888888", "line_color": None}
     hatched: dict[str, Any] = {
         "hatch_pattern": "/",
@@ -237,13 +239,13 @@ def _event_bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any
     return [
         *((low, high, sand) for low, high, _ in events["modes"][1::2]),
         *((low, high, grey | {"fill_alpha": 0.18}) for low, high in events["ground"]),
-        *((low, high, grey | hatched) for low, high in events["silent"]),
+        *((low, high, grey | hatched) for low, high in events["gap"]),
         *((low, high, grey | {"fill_alpha": 0.45}) for low, high in events["dropout"]),
     ]
 
 
 def _event_strip(data: dict[str, Any], time_range: Range1d) -> Any:
-    """What happened when, a row for each kind, so that no colour is needed to tell them apart."""
+    """Make the event plot, with a row per kind of event."""
     source = _empty_source("strip", "row left right text")
     has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
     rows = FIGURES.strip if has_ekf2 else FIGURES.strip[2:]
@@ -284,7 +286,7 @@ def _event_strip(data: dict[str, Any], time_range: Range1d) -> Any:
 
 
 def _likelihood_map(tuning: Tuning) -> Any:
-    """How likely the innovations are over both noises, and where the sliders stand."""
+    """Make the map of the log-likelihood over SIGMA_A and SIGMA_Z, with the current settings."""
     fig = figure(
         name="map",
         height=250,
@@ -303,9 +305,9 @@ def _likelihood_map(tuning: Tuning) -> Any:
         if isinstance(tuned, AxisTuning):
             x, dw = _pixel_extent(tuned.map.sigma_a_m_s2)
             y, dh = _pixel_extent(tuned.map.sigma_z_m)
-            # rows are SIGMA_Z
+            # rows: SIGMA_Z, columns: SIGMA_A
             image = np.sqrt(2.0 * np.maximum(tuned.map.drop.T, 0.0)).astype(np.float32)
-            draw: Any = fig.image  # its colours stand in no signature
+            draw: Any = fig.image  # color_mapper is missing in its type signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
     trail = _empty_source("trail", "x y")
     best = _empty_source("best", "x y")
@@ -321,20 +323,20 @@ def _likelihood_map(tuning: Tuning) -> Any:
 def _draw_dots(
     fig: Any, source: ColumnDataSource, colour: str | None, size: int, **style: Any
 ) -> Any:
-    """Dots without an edge, unless the style has one, at a source's last two columns."""
+    """Draw dots at the last two columns of a source, without edge unless the style has one."""
     x, y = source.column_names[-2:]
     marker_style = {"size": size, "fill_color": colour, "line_color": None} | style
     return fig.scatter(x, y, source=source, **marker_style)
 
 
 def _pixel_extent(values: Array) -> tuple[float, float]:
-    """Where the pixels of a logarithmic axis begin, and how far they reach."""
+    """Return start and length of an image on a logarithmic axis, from its pixel centres."""
     half = float(np.sqrt(values[1] / values[0]))
     return float(values[0]) / half, float(values[-1]) * half - float(values[0]) / half
 
 
 def _plan_plot() -> Any:
-    """The track seen from above; what is chosen on it is the time that all plots show."""
+    """Make the map of the track; a selection on it sets the time range of all plots."""
     fig = figure(
         name="plan",
         height=250,
@@ -351,7 +353,7 @@ def _plan_plot() -> Any:
     cursor = _empty_source("here", "east north")
     fig.line("east", "north", source=track, line_color=MEASUREMENT_COLOUR, line_width=1.0)
     _draw_dots(fig, track, MEASUREMENT_COLOUR, 3, nonselection_fill_alpha=0.6)
-    _draw_dots(fig, shown_source, KF_COLOUR, 4, name="ours")
+    _draw_dots(fig, shown_source, KF_COLOUR, 4, name="kf")
     _draw_dots(
         fig,
         cursor,
@@ -366,7 +368,7 @@ def _plan_plot() -> Any:
 
 
 def _phase_plot() -> Any:
-    """The phase plane: position and velocity with their ellipse of 2σ, and what was measured."""
+    """Make the phase plane: position and velocity with their 2σ ellipse, and the measurement."""
     fig = figure(
         name="step",
         height=330,
@@ -393,5 +395,5 @@ def _phase_plot() -> Any:
     fig.line("p", "v", source=trail, line_color=MEASUREMENT_COLOUR, line_width=1.0, name="measured")
     fig.line("p", "v", source=before, **KF_LINE | {"line_dash": [6, 3]})
     fig.patch("p", "v", source=current, fill_color=KF_COLOUR, fill_alpha=0.25, **KF_LINE)
-    _draw_dots(fig, mean, KF_COLOUR, 7, name="ours")
+    _draw_dots(fig, mean, KF_COLOUR, 7, name="kf")
     return fig

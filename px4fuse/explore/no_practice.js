@@ -1,2 +1,2 @@
-/* A page that asks nothing. */
+/* Replaces practice.js on pages without questions. */
 const Practice = { suffix: "", hidden: false, toAddress: () => ({}), start() {} };

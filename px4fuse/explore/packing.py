@@ -1,7 +1,7 @@
-"""Arrays in few characters, which the page takes apart again without loss that matters.
+"""Compact encoding of arrays for the page, with a negligible rounding error.
 
-Values become integers of a fixed step, then differences, then planes of bytes, of which the upper
-ones are nearly all the same, then deflate and base64.
+Values become integers of a fixed step, then differences, then byte planes (the upper ones are
+nearly constant), then deflate and base64.
 """
 
 import base64
@@ -12,29 +12,27 @@ import numpy as np
 
 from px4fuse.arrays import Array
 
-# Steps of 1.5e-11: of position, velocity and seconds, a hundredth of what the replay may differ by
+# Steps per unit: 1.5e-11 m, m/s or s, 1 % of the tolerance between the page's KF and Python's
 FINE_SCALE = 2.0**36
-# What is only looked at, and enters means: a micrometre
-COARSE_SCALE = 1e6
-# Whole numbers up to here are exact in the page, where every number is a double
-MAX_EXACT = 2.0**52
+COARSE_SCALE = 1e6  # steps per unit for values that are only drawn or averaged
+MAX_EXACT = 2.0**52  # integers up to this are exact in JavaScript (doubles)
 
 
 @dataclass
 class Packer:
-    """Collects arrays; a place is what stands in the page's data for one of them."""
+    """Collects arrays; the page's data contains their indices instead."""
 
     specs: list[tuple[int, int, float]] = field(default_factory=list)
     _bytes: list[bytes] = field(default_factory=list)
 
     def add(self, values: Array, scale: float = FINE_SCALE) -> int:
-        """Add one array of finite numbers and return its place.
+        """Add one array of finite numbers and return its index.
 
         Parameters
         ----------
         values : ndarray, shape (n,)
         scale : float
-            Steps per unit; fewer where the numbers are too large for it.
+            Steps per unit; reduced for numbers beyond :data:`MAX_EXACT`.
         """
         values = np.asarray(values, dtype=np.float64)
         largest = float(np.max(np.abs(values), initial=1.0))
@@ -49,10 +47,10 @@ class Packer:
         return len(self.specs) - 1
 
     def add_times(self, time_s: Array) -> int:
-        """Add times, in microseconds where that is what they are."""
+        """Add times (s), in whole microseconds if they are multiples of them."""
         is_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
         return self.add(time_s, 1e6 if is_microseconds else FINE_SCALE)
 
     def text(self) -> str:
-        """All arrays, in base64."""
+        """Return all arrays in base64."""
         return base64.b64encode(zlib.compress(b"".join(self._bytes), 9)).decode()

@@ -1,12 +1,12 @@
-/* What moves on the page: settings to replay, replay to plots and numbers. */
+/* Main script of the page: settings to KF run, KF run to plots and numbers. */
 const Explore = (async () => {
-  const MOST_POINTS = 3000, FEW_POINTS = 600; // of a line, and while a slider is dragged
+  const MOST_POINTS = 3000, FEW_POINTS = 600; // drawn points per line; fewer while a slider is dragged
   const DRAG_ENDS_MS = 150;
   const NARROW = matchMedia("(max-width: 60rem)");
   const read = (id) => JSON.parse($(id).textContent);
   const content = read(`content${Practice.suffix}`), ranges = content.ranges;
   if (typeof DecompressionStream === "undefined") {
-    $("problem").textContent = "This browser is too old for this page: use one of 2023 or newer.";
+    $("problem").textContent = "This browser is too old for this page. Use a browser from 2023 or later.";
     $("problem").hidden = false;
     return null;
   }
@@ -31,7 +31,7 @@ const Explore = (async () => {
       },
     })),
   };
-  // the truth is for afterwards
+  // ground truth is hidden until the answer
   if (Practice.hidden) {
     for (const axis of flight.axes) {
       axis.truth = "shown after your answer";
@@ -40,55 +40,55 @@ const Explore = (async () => {
   }
 
   // ------------------------------------------------------------------ settings
-  const KNOBS = [
+  const SETTINGS = [
     { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
       hint: "process noise" },
     { id: "sigma-z", key: "sigmaZ", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
       hint: "measurement noise" },
     { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
     { id: "clock-offset", key: "offset", title: "Clock offset", unit: "s",
-      hint: "added to the stamps" },
+      hint: "added to the timestamps" },
   ];
   const TICKS = 600;
   const settings = { ...flight.settings, axis: flight.main };
-  const chosen = { step: null }; // the measurement that is looked at, from 0
+  const chosen = { step: null }; // index of the selected measurement
   const round = (value, digits) => Number(value.toPrecision(digits));
   const why = flight.offset.why;
   const reach = why ? [settings.offset, settings.offset] : [flight.offset.from, flight.offset.to];
-  const limits = (knob) => knob.key === "offset" ? reach : ranges[knob.id];
-  const fromSlider = (knob, tick) => {
-    if (!knob.log) return Math.round((reach[0] + (reach[1] - reach[0]) * tick / TICKS) * 1e4) / 1e4;
-    const [low, high] = knob.log.map(Math.log);
+  const limits = (setting) => setting.key === "offset" ? reach : ranges[setting.id];
+  const fromSlider = (setting, tick) => {
+    if (!setting.log) return Math.round((reach[0] + (reach[1] - reach[0]) * tick / TICKS) * 1e4) / 1e4;
+    const [low, high] = setting.log.map(Math.log);
     return round(Math.exp(low + (high - low) * tick / TICKS), 3);
   };
-  const toSlider = (knob, value) => {
-    const [low, high] = knob.log ? knob.log.map(Math.log) : reach;
-    const at = (knob.log ? Math.log(value) : value) - low;
+  const toSlider = (setting, value) => {
+    const [low, high] = setting.log ? setting.log.map(Math.log) : reach;
+    const at = (setting.log ? Math.log(value) : value) - low;
     return Math.round(Math.min(Math.max(at / (high - low || 1), 0), 1) * TICKS);
   };
-  for (const knob of KNOBS) {
-    const box = make("div", undefined, { className: "knob" });
-    const label = make("label", `${knob.title} `, { htmlFor: `${knob.id}-value` });
-    label.append(make("small", `${knob.unit}, ${knob.hint}`));
-    knob.number = make("input", undefined, { type: "number", id: `${knob.id}-value`, step: "any" });
-    knob.slider = make("input", undefined, {
-      type: "range", id: knob.id, min: 0, max: TICKS, step: 1, ariaLabel: knob.title });
-    knob.slider.addEventListener("input", () => {
-      set({ [knob.key]: fromSlider(knob, Number(knob.slider.value)) }, true);
+  for (const setting of SETTINGS) {
+    const box = make("div", undefined, { className: "setting" });
+    const label = make("label", `${setting.title} `, { htmlFor: `${setting.id}-value` });
+    label.append(make("small", `${setting.unit}, ${setting.hint}`));
+    setting.number = make("input", undefined, { type: "number", id: `${setting.id}-value`, step: "any" });
+    setting.slider = make("input", undefined, {
+      type: "range", id: setting.id, min: 0, max: TICKS, step: 1, ariaLabel: setting.title });
+    setting.slider.addEventListener("input", () => {
+      set({ [setting.key]: fromSlider(setting, Number(setting.slider.value)) }, true);
     });
-    knob.number.addEventListener("change", () => {
-      const value = knob.number.value === "" ? NaN : Number(knob.number.value);
-      const [low, high] = limits(knob);
-      if (value >= low && value <= high) return set({ [knob.key]: value });
-      say(`${knob.title}: give ${low} to ${high} ${knob.unit}.`);
+    setting.number.addEventListener("change", () => {
+      const value = setting.number.value === "" ? NaN : Number(setting.number.value);
+      const [low, high] = limits(setting);
+      if (value >= low && value <= high) return set({ [setting.key]: value });
+      say(`${setting.title}: enter ${low} to ${high} ${setting.unit}.`);
       show();
     });
-    box.append(label, knob.number, knob.slider);
-    if (knob.key === "offset" && why) {
-      knob.number.disabled = knob.slider.disabled = true;
+    box.append(label, setting.number, setting.slider);
+    if (setting.key === "offset" && why) {
+      setting.number.disabled = setting.slider.disabled = true;
       box.append(make("p", why, { className: "note" }));
     }
-    $("knobs").append(box);
+    $("sliders").append(box);
   }
   const names = axes.map((axis) => axis.name);
   for (const name of names) {
@@ -106,30 +106,29 @@ const Explore = (async () => {
     }
   }
   const axisNow = () => flight.axes.find((axis) => axis.name === settings.axis);
-  const say = (text) => { $("said").textContent = text; };
-  const mapNow = () => flight.maps[axisNow().map] ?? "not made";
+  const say = (text) => { $("message").textContent = text; };
+  const mapNow = () => flight.maps[axisNow().map] ?? "not computed";
 
   $("lesson").addEventListener("click", () => {
     const { sigmaA, sigmaZ, dt } = ranges.lesson;
     set({ sigmaA, sigmaZ, dt });
-    say("The values of the lesson.");
+    say("Values of the lesson.");
   });
   $("likely").addEventListener("click", () => {
     const [sigmaA, sigmaZ] = mapNow().likely;
     set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: flight.settings.dt });
-    say("What makes the innovations of this flight most likely.");
+    say("Maximum-likelihood estimates from the innovations of this flight.");
   });
   $("ekf2-r").addEventListener("click", () => {
     set({ sigmaZ: round(axisNow().ekf2.r, 3) });
-    say("SIGMA_Z is the standard deviation that EKF2 gave the measurements (median).");
+    say("SIGMA_Z is the median measurement standard deviation of EKF2 (√R).");
   });
 
-  /* Take over what differs, replay and draw: at once, and then once a frame; in less detail until a
-     drag has ended */
+  /* Change settings, re-run KF and draw. During a drag: at most once per frame, with fewer points */
   let waiting = false, again = false, rest = null;
   function set(changes, dragged = false) {
     Object.assign(settings, changes);
-    if ($("said").textContent) say("");
+    if ($("message").textContent) say("");
     clearTimeout(rest);
     if (!dragged) return show();
     rest = setTimeout(show, DRAG_ENDS_MS);
@@ -145,7 +144,7 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ the address
   function toAddress() {
     const parts = { axis: settings.axis, input: settings.input };
-    for (const knob of KNOBS) parts[knob.id] = String(settings[knob.key]);
+    for (const setting of SETTINGS) parts[setting.id] = String(settings[setting.key]);
     Object.assign(parts, Practice.toAddress());
     if (view !== "filter") parts.view = view;
     if (chosen.step !== null) parts.measurement = String(chosen.step + 1);
@@ -154,12 +153,12 @@ const Explore = (async () => {
   }
   function fromAddress() {
     const parts = new URLSearchParams(location.hash.slice(1)), ignored = [];
-    for (const knob of KNOBS) {
-      if (!parts.has(knob.id) || (knob.key === "offset" && why)) continue;
-      const text = parts.get(knob.id), value = text === "" ? NaN : Number(text);
-      const [low, high] = limits(knob);
-      if (value >= low && value <= high) settings[knob.key] = value;
-      else ignored.push(knob.id);
+    for (const setting of SETTINGS) {
+      if (!parts.has(setting.id) || (setting.key === "offset" && why)) continue;
+      const text = parts.get(setting.id), value = text === "" ? NaN : Number(text);
+      const [low, high] = limits(setting);
+      if (value >= low && value <= high) settings[setting.key] = value;
+      else ignored.push(setting.id);
     }
     if (names.includes(parts.get("axis"))) settings.axis = parts.get("axis");
     else if (parts.has("axis")) ignored.push("axis");
@@ -170,21 +169,21 @@ const Explore = (async () => {
     else open(parts.get("view") ?? view, false);
     const step = Number(parts.get("measurement"));
     if (Number.isInteger(step) && step > 0) chosen.step = step - 1;
-    if (ignored.length) say(`The address has no usable ${ignored.join(", ")}: left as it was.`);
+    if (ignored.length) say(`Invalid values in the address are ignored: ${ignored.join(", ")}.`);
   }
 
-  // ------------------------------------------------------------------ what is in view
+  // ------------------------------------------------------------------ views
   const PLOTS = { innovation: "Innovations", sigma_p: "σ position", sigma_v: "σ velocity", position: "Position",
     velocity: "Velocity", error: "Error", nis: "NIS", gain: "Gain", strip: "Events" };
   const GROUPS = { filter: ["Innovations and σ", ["innovation", "sigma_p", "sigma_v"]],
-    track: ["Position and truth", ["position", "velocity", "error"]],
+    track: ["Position and ground truth", ["position", "velocity", "error"]],
     more: ["NIS, gain, events", ["nis", "gain", "strip"]] };
-  const CARDS = { step: "Step by step", map: "Likelihood", numbers: "Numbers", recorded: "As recorded" };
+  const CARDS = { step: "Step by step", map: "Likelihood", numbers: "Numbers", recorded: "Findings" };
   const there = (name) => document.querySelector(`[data-plot=${name}]`) !== null;
   const isView = (name) => Object.hasOwn(GROUPS, name) || Object.hasOwn(CARDS, name)
     || (Object.hasOwn(PLOTS, name) && there(name));
   let view = "filter";
-  /* The tab that shows it: on a narrow screen each plot has its own */
+  /* Tab of a view; on a narrow screen each plot has a separate tab */
   function tabOf(name) {
     if (Object.hasOwn(CARDS, name)) return name;
     if (NARROW.matches) return Object.hasOwn(GROUPS, name) ? GROUPS[name][1][0] : name;
@@ -203,7 +202,7 @@ const Explore = (async () => {
       return tab;
     }));
   }
-  /* Show a plot, a group of them or a card */
+  /* Show a plot, a group of plots or a card */
   function open(name, draw = true) {
     view = tabOf(name);
     for (const tab of $("tabs").children) {
@@ -236,7 +235,7 @@ const Explore = (async () => {
     $("others").open = !NARROW.matches;
     open(view);
   });
-  // what sticks on a small screen sticks below the knobs
+  // on a small screen sticky elements stay below the settings
   new ResizeObserver(() => document.body.style.setProperty("--bar", `${$("bar").offsetHeight}px`)).observe($("bar"));
 
   // ------------------------------------------------------------------ Bokeh
@@ -250,7 +249,7 @@ const Explore = (async () => {
     return known.get(name);
   };
   const put = (name, columns) => { model(`${name}-source`).data = columns; };
-  /* Into every plot in view that has such a source */
+  /* Set a source in each visible plot that has it */
   const give = (name, columns) => {
     for (const plot of seenPlots()) {
       const source = model(`${plot}:${name}-source`);
@@ -261,7 +260,7 @@ const Explore = (async () => {
   const figures = ["position", "velocity", "error", "innovation", "sigma_p", "sigma_v",
     "nis", "gain", "strip"].map(model).filter(Boolean);
 
-  /* Rows of columns between two times, the extremes of every column kept where there are many */
+  /* Rows within the visible time range; long series are reduced to the extremes of each bin */
   let most = MOST_POINTS;
   function thin(columns, keys) {
     const t = columns.t, n = t.length;
@@ -293,7 +292,7 @@ const Explore = (async () => {
     names.map((name, i) => [name, columns.length ? columns[i] : EMPTY]));
   const shifted = (t, by) => by ? t.map((x) => x + by) : t;
 
-  /* Set the vertical range of a plot in view */
+  /* Set the vertical range of a visible plot */
   function frame(name, ends, log = false) {
     const range = isSeen(name) ? model(name)?.y_range : undefined;
     if (!range) return;
@@ -302,7 +301,7 @@ const Explore = (async () => {
     const edge = log ? 1.15 : 0.06 * (high - low);
     [range.start, range.end] = log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
   }
-  /* Arrow heads at the edge where something lies beyond it */
+  /* Draw arrow heads at the edge for values outside the plot */
   function marks(drawn) {
     const rows = (...parts) => parts.flatMap(([part, column]) => part === undefined ? []
       : Array.from(part.t, (t, i) => [t, part[column][i]]));
@@ -330,35 +329,35 @@ const Explore = (async () => {
     return sorted.length ? sorted[Math.min(Math.floor(share * sorted.length), sorted.length - 1)] : 0;
   };
 
-  // ------------------------------------------------------------------ a replay and its numbers
-  // of the settings now; run and numbers are null with too few measurements
+  // ------------------------------------------------------------------ KF run and its numbers
+  // current run; run and numbers are null with too few measurements
   const result = { run: null, axis: null, numbers: null };
   function replay(quick) {
     const axis = axisNow(), run = Engine.replay(flight, axis, settings);
     Object.assign(result, { run, axis, numbers: run && numbers(axis, run, quick) });
   }
-  /* What the filter's innovations say of it; unless quick, how far off it is too */
+  /* Statistics of the innovations; unless quick, also differences to EKF2 and ground truth */
   function numbers(axis, run, quick = false) {
-    const ours = Engine.assess(run.updates.nu, run.updates.s) ?? { count: run.updates.nu.length };
-    if (ours.nis !== undefined) ours.band = axis.bands.map((ends) => ends[ours.count - 1]);
-    if (quick) return ours;
+    const kf = Engine.assess(run.updates.nu, run.updates.s) ?? { count: run.updates.nu.length };
+    if (kf.nis !== undefined) kf.band = axis.bands.map((ends) => ends[kf.count - 1]);
+    if (quick) return kf;
     let times = run.steps.time;
     if (typeof axis.ekf2 !== "string") {
       const [time, p, v] = axis.ekf2.state, at = Engine.stateAt(run, time);
-      ours.ekf2P = Engine.rmse(at.p, p);
-      ours.ekf2V = Engine.rmse(at.v, v);
+      kf.ekf2P = Engine.rmse(at.p, p);
+      kf.ekf2V = Engine.rmse(at.v, v);
       times = time;
     }
     if (typeof axis.truth !== "string") {
       const at = Engine.stateAt(run, times), { p, v } = axis.truth;
-      ours.truthP = Engine.rmse(at.p, Engine.interp(times, p[0], p[1], NaN));
-      ours.truthV = v === null ? null : Engine.rmse(at.v, Engine.interp(times, v[0], v[1], NaN));
-      ours.claimed = hidden(run, p, ours.nis);
+      kf.truthP = Engine.rmse(at.p, Engine.interp(times, p[0], p[1], NaN));
+      kf.truthV = v === null ? null : Engine.rmse(at.v, Engine.interp(times, v[0], v[1], NaN));
+      kf.claimed = hidden(run, p, kf.nis);
     }
-    return ours;
+    return kf;
   }
-  /* What σ of position claims, where the truth shows an error that innovations do not
-     (hidden_errors.py) */
+  /* Median reported σ of position, if ground truth shows an error that the innovations do not
+     show (findings/hidden_errors.py) */
   function hidden({ steps }, truth, nis) {
     const known = Engine.interp(steps.time, truth[0], truth[1], NaN);
     let sum = 0, count = 0;
@@ -368,90 +367,89 @@ const Explore = (async () => {
   }
   const ekf2Of = (axis) => typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary;
 
-  // ------------------------------------------------------------------ the needle and the words
-  const DECADES = [-1.3, 1.3]; // of the mean NIS that the scale shows
+  // ------------------------------------------------------------------ NIS gauge and sentences
+  const DECADES = [-1.3, 1.3]; // range of log10(mean NIS) on the gauge
   const place = (nis) => Math.min(Math.max((Math.log10(nis) - DECADES[0]) / (DECADES[1] - DECADES[0]), 0), 1);
-  for (const name of ["band", "hand ekf2", "hand ours"]) $("needle").append(make("span", undefined, { className: name }));
+  for (const name of ["band", "hand ekf2", "hand kf"]) $("needle").append(make("span", undefined, { className: name }));
   for (const nis of [0.1, 0.3, 1, 3, 10]) {
     const tick = make("small", String(nis));
     tick.style.left = `${100 * place(nis)}%`;
     $("needle").append(tick);
   }
-  function drawNeedle({ axis, numbers: ours }) {
-    const [band, theirs, own] = $("needle").children, ekf2 = ekf2Of(axis);
-    for (const [hand, one] of [[own, ours], [theirs, ekf2]]) {
+  function drawNeedle({ axis, numbers: kf }) {
+    const [band, ekf2Hand, kfHand] = $("needle").children, ekf2 = ekf2Of(axis);
+    for (const [hand, one] of [[kfHand, kf], [ekf2Hand, ekf2]]) {
       hand.hidden = one?.nis === undefined;
       if (!hand.hidden) hand.style.left = `${100 * place(one.nis)}%`;
     }
-    band.hidden = ours?.band === undefined;
+    band.hidden = kf?.band === undefined;
     if (!band.hidden) {
-      band.style.left = `${100 * place(ours.band[0])}%`;
-      band.style.width = `${100 * (place(ours.band[1]) - place(ours.band[0]))}%`;
+      band.style.left = `${100 * place(kf.band[0])}%`;
+      band.style.width = `${100 * (place(kf.band[1]) - place(kf.band[0]))}%`;
     }
-    const said = [["ours", ours], ["EKF2", ekf2]].filter(([, one]) => one?.nis !== undefined)
-      .map(([who, one]) => `${who} ${Story.numberWords(one.nis, 2)} (${Story.verdict(one)})`);
-    const words = `mean NIS: ${said.join(", ") || "not known"}`;
-    $("needle").ariaLabel = $("read").textContent = words;
+    const values = [["KF", kf], ["EKF2", ekf2]].filter(([, one]) => one?.nis !== undefined)
+      .map(([name, one]) => `${name} ${Story.formatNumber(one.nis, 2)} (${Story.verdict(one)})`);
+    $("needle").ariaLabel = $("read").textContent = `mean NIS: ${values.join("; ") || "unknown"}`;
   }
-  const tried = (axis) => (changes) => {
+  const rerun = (axis) => (changes) => {
     const run = Engine.replay(flight, axis, { ...settings, ...changes });
     return run && numbers(axis, run, true);
   };
-  function tell({ axis, numbers: ours }) {
+  function drawSentences({ axis, numbers: kf }) {
     const found = mapNow(), { likely } = flight.offset;
     const [sigmaA, sigmaZ] = typeof found === "string" ? [null, null] : found.likely;
-    const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["a clock offset of", "offset", likely]]
+    const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["clock offset", "offset", likely]]
       .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
       .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
-    const words = Story.sentence(axis, ours, ekf2Of(axis))
-      + (Practice.hidden || flight.drifts ? "" : Story.cure(ours, candidates, tried(axis)));
-    for (const line of document.querySelectorAll(".now-said")) {
-      line.textContent = moved() ? `The knobs stand elsewhere now: ${words}` : "";
-      line.parentElement.classList.toggle("stale", moved());
+    const text = Story.sentence(axis, kf, ekf2Of(axis))
+      + (Practice.hidden || flight.drifts ? "" : Story.remedy(kf, candidates, rerun(axis)));
+    for (const line of document.querySelectorAll(".changed-note")) {
+      line.textContent = isChanged() ? `Settings changed since the report: ${text}` : "";
+      line.parentElement.classList.toggle("stale", isChanged());
     }
-    if ($("live").textContent !== words) $("live").textContent = words;
+    if ($("live").textContent !== text) $("live").textContent = text;
   }
-  const moved = () => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
+  const isChanged = () => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
   const ROWS = [
-    ["Mean NIS (1 is consistent)", (x) => x.nis?.toFixed(2)],
-    ["95 % band of it", (x) => x.band && `${x.band[0].toFixed(2)}–${x.band[1].toFixed(2)}`],
+    ["Mean NIS (expected 1)", (x) => x.nis?.toFixed(2)],
+    ["95 % band", (x) => x.band && `${x.band[0].toFixed(2)}–${x.band[1].toFixed(2)}`],
     ["Verdict", Story.verdict],
-    ["Outside ±2√S (5 % is right)", (x) => x.outside === undefined ? undefined
+    ["Outside ±2√S (expected 5 %)", (x) => x.outside === undefined ? undefined
       : `${(100 * x.outside).toFixed(1)} %`],
-    ["Lag-1 correlation of ν", (x) => x.lag1?.toFixed(2)],
+    ["Lag-1 autocorrelation of ν", (x) => x.lag1?.toFixed(2)],
     ["Measurements", (x) => x.count && String(x.count)],
-    ["Position: RMS to EKF2", (x) => x.ekf2P?.toFixed(3).concat(" m")],
-    ["Velocity: RMS to EKF2", (x) => x.ekf2V?.toFixed(3).concat(" m/s")],
-    ["Position: RMS to truth", (x) => x.truthP?.toFixed(3).concat(" m")],
-    ["Velocity: RMS to truth", (x) => x.truthV?.toFixed(3).concat(" m/s")],
+    ["Position: KF - EKF2, RMS", (x) => x.ekf2P?.toFixed(3).concat(" m")],
+    ["Velocity: KF - EKF2, RMS", (x) => x.ekf2V?.toFixed(3).concat(" m/s")],
+    ["Position RMSE", (x) => x.truthP?.toFixed(3).concat(" m")],
+    ["Velocity RMSE", (x) => x.truthV?.toFixed(3).concat(" m/s")],
   ];
   const body = $("table").tBodies[0];
   for (const [title] of ROWS) {
-    body.insertRow().append(make("th", title, { scope: "row" }), make("td", "", { className: "ours" }),
+    body.insertRow().append(make("th", title, { scope: "row" }), make("td", "", { className: "kf" }),
       make("td", "", { className: "ekf2" }));
   }
-  function drawTable({ axis, numbers: ours }) {
+  function drawTable({ axis, numbers: kf }) {
     const ekf2 = ekf2Of(axis);
-    ROWS.forEach(([, words], i) => {
-      const row = body.rows[i], left = ours && words(ours), right = words(ekf2);
+    ROWS.forEach(([, format], i) => {
+      const row = body.rows[i], left = kf && format(kf), right = format(ekf2);
       row.cells[1].textContent = left ?? "–";
       row.cells[2].textContent = right ?? "–";
       row.hidden = (left ?? right) === undefined && i > 5;
     });
     const missing = [];
-    if (ours === null) missing.push("Ours: too few measurements are left in the analysed part.");
+    if (kf === null) missing.push("KF: the segment has too few measurements.");
     if (ekf2.why) missing.push(`EKF2: ${ekf2.why}.`);
-    if (typeof axis.truth === "string") missing.push(`Truth: ${axis.truth}.`);
+    if (typeof axis.truth === "string") missing.push(`Ground truth: ${axis.truth}.`);
     $("why").textContent = missing.join(" ");
   }
 
-  // ------------------------------------------------------------------ plots against time
-  function drawOurs({ run, axis }) {
+  // ------------------------------------------------------------------ plots over time
+  function drawKf({ run, axis }) {
     const { steps, updates } = run;
     const n = steps.time.length, m = updates.nu.length, size = n + m;
     const saw = table(["t", "p", "v", "sp", "sv"], Array.from({ length: 5 }, () => new Float64Array(size)));
     for (let i = 0, k = 0, u = 0; i < n; i++) {
-      if (u < m && updates.step[u] === i) { // just before the update, then just after it
+      if (u < m && updates.step[u] === i) { // before the update, then after it
         saw.t[k] = steps.time[i]; saw.p[k] = updates.p[u]; saw.v[k] = updates.v[u];
         saw.sp[k] = Math.sqrt(updates.p00[u]); saw.sv[k++] = Math.sqrt(updates.p11[u++]);
       }
@@ -484,8 +482,8 @@ const Explore = (async () => {
     }
     return out;
   }
-  /* EKF2, truth: only an axis or a zoom changes them */
-  function drawOthers(axis) {
+  /* Draw EKF2 and ground truth, which change with axis and zoom only */
+  function drawReferences(axis) {
     const seen = {};
     const take = (name, columns, keys) => { seen[name] = thin(columns, keys); give(name, seen[name]); };
     if (typeof axis.ekf2 !== "string") {
@@ -513,13 +511,13 @@ const Explore = (async () => {
     }
     return seen;
   }
-  function frames(ours, others) {
+  function frames(kf, others) {
     const of = (part, column) => part?.[column] ?? EMPTY;
-    const { steps, updates } = ours;
+    const { steps, updates } = kf;
     frame("position", () => extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
     frame("velocity", () => extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
-    frame("error", () => extent(of(ours.error, "e"), of(others.error_ekf2, "e")));
-    frame("innovation", () => { // neither outliers nor a gap may flatten all the rest
+    frame("error", () => extent(of(kf.error, "e"), of(others.error_ekf2, "e")));
+    frame("innovation", () => { // limited, so that outliers and gaps do not hide the other innovations
       const reach = 1.3 * Math.max(...[[updates.nu, updates.plus],
         [of(others.fused, "nu"), of(others.limits, "plus")]].map(([nu, plus]) => {
           const typical = quantile(plus, 0.5);
@@ -531,10 +529,10 @@ const Explore = (async () => {
     frame("sigma_v", () => extent(steps.sv, of(others.variance, "sv")), true);
     frame("nis", () => extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
     frame("gain", () => extent(updates.k0, updates.k1, [0]));
-    marks({ ...others, ...ours });
+    marks({ ...others, ...kf });
   }
 
-  // ------------------------------------------------------------------ the map of both noises
+  // ------------------------------------------------------------------ likelihood map
   const trail = { x: [], y: [] };
   let mapShown = null;
   function drawMap() {
@@ -562,58 +560,58 @@ const Explore = (async () => {
     [plot.x_range.start, plot.x_range.end] = [Math.min(a0, settings.sigmaA / 1.3), Math.max(a1, settings.sigmaA * 1.3)];
     [plot.y_range.start, plot.y_range.end] = [Math.min(z0, settings.sigmaZ / 1.3), Math.max(z1, settings.sigmaZ * 1.3)];
   }
-  function mapWords() {
-    const found = mapNow(), made = flight.settings;
-    if (typeof found === "string") return `Not known: ${found}.`;
-    const axis = axisNow().map === "horizontal" ? "north and east together" : `axis ${axisNow().map}`;
-    const other = made.dt !== settings.dt || made.offset !== settings.offset || made.input !== settings.input;
-    return `Of ${axis}, from ${found.count} measurements, at DT ${made.dt} s, input ${made.input}, clock `
-      + `offset ${round(made.offset, 4)} s. Dark is likely, the cross is the best, each shade half a standard `
-      + `deviation.${other ? " DT, input or clock offset are now others: the map would be another." : ""}`;
+  function mapNote() {
+    const found = mapNow(), initial = flight.settings;
+    if (typeof found === "string") return `No map: ${found}.`;
+    const axis = axisNow().map === "horizontal" ? "North and east together" : `Axis ${axisNow().map}`;
+    const differs = initial.dt !== settings.dt || initial.offset !== settings.offset || initial.input !== settings.input;
+    return `${axis}, ${found.count} measurements, DT ${initial.dt} s, input ${initial.input}, clock offset `
+      + `${round(initial.offset, 4)} s. Darker: higher likelihood. Cross: maximum. One shade: half a standard `
+      + `deviation.${differs ? " The map is not valid for the current DT, input or clock offset." : ""}`;
   }
 
-  // ------------------------------------------------------------------ the command
+  // ------------------------------------------------------------------ command
   const quoted = (x) => String(round(x, 12));
   function command() {
     const { bare, held, input, found } = flight.command, lesson = ranges.lesson;
     const words = [settings.offset !== flight.settings.offset ? held : bare];
-    for (const knob of KNOBS) {
-      const usual = knob.key === "offset" ? 0 : lesson[knob.key];
-      if (knob.key === "offset" && why) continue;
-      if (settings[knob.key] !== usual) words.push(`--${knob.id} ${quoted(settings[knob.key])}`);
+    for (const setting of SETTINGS) {
+      const standard = setting.key === "offset" ? 0 : lesson[setting.key];
+      if (setting.key === "offset" && why) continue;
+      if (settings[setting.key] !== standard) words.push(`--${setting.id} ${quoted(settings[setting.key])}`);
     }
     if (settings.input !== found || input !== null) words.push(`--input ${settings.input}`);
     return words.join(" ");
   }
   $("copy").addEventListener("click", async () => {
-    $("copy-note").textContent = await copied($("command")) ? " copied" : " marked: press Ctrl+C";
+    $("copy-note").textContent = await copied($("command")) ? " copied" : " selected, press Ctrl+C";
   });
   async function copied(node) {
     try {
       await navigator.clipboard.writeText(node.textContent);
       return true;
-    } catch { // where the browser does not allow it, as from a file
+    } catch { // browsers forbid clipboard access for local files
       getSelection().selectAllChildren(node);
       return document.execCommand("copy");
     }
   }
 
-  // ------------------------------------------------------------------ all of it
+  // ------------------------------------------------------------------ whole page
   let axisShown = null;
   let others = null;
-  /* Replay and draw what is in view; quick leaves out what is only read, until a drag has ended */
+  /* Run KF and draw the visible parts; quick (during a drag) leaves out texts and tables */
   function show(quick = false) {
     most = quick ? FEW_POINTS : MOST_POINTS;
-    for (const knob of KNOBS) {
-      if (document.activeElement !== knob.number || !quick) knob.number.value = settings[knob.key];
-      if (!quick) knob.slider.value = toSlider(knob, settings[knob.key]);
-      knob.slider.ariaValueText = `${settings[knob.key]} ${knob.unit}`;
+    for (const setting of SETTINGS) {
+      if (document.activeElement !== setting.number || !quick) setting.number.value = settings[setting.key];
+      if (!quick) setting.slider.value = toSlider(setting, settings[setting.key]);
+      setting.slider.ariaValueText = `${settings[setting.key]} ${setting.unit}`;
     }
     const another = axisShown !== settings.axis;
     axisShown = settings.axis;
     replay(quick);
-    if (another) others = drawOthers(result.axis);
-    if (result.run) frames(drawOurs(result), others);
+    if (another) others = drawReferences(result.axis);
+    if (result.run) frames(drawKf(result), others);
     drawNeedle(result);
     if (isSeen("map")) drawMap();
     if (quick) return;
@@ -626,19 +624,19 @@ const Explore = (async () => {
       .filter(Boolean).join(", ");
     $("likely").disabled = typeof found === "string" || found.likely.includes(null);
     $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
-    $("map-note").textContent = mapWords();
+    $("map-note").textContent = mapNote();
     drawTable(result);
     $("command").textContent = command();
     if (another) times.strip(axis);
     times.plan();
     stepper.draw();
-    tell(result);
+    drawSentences(result);
     toAddress();
   }
-  /* After a zoom: the same replay, other rows of it */
+  /* Draw the same run after a zoom */
   function look() {
-    others = drawOthers(result.axis);
-    if (result.run) frames(drawOurs(result), others);
+    others = drawReferences(result.axis);
+    if (result.run) frames(drawKf(result), others);
     times.plan();
   }
 

@@ -1,4 +1,4 @@
-"""The page as one file: Bokeh, the flight's data, the engine and what moves them."""
+"""The page as one HTML file: Bokeh, the flight's data, the KF engine and the user interface."""
 
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -12,19 +12,18 @@ from px4fuse.explore.figures import FIGURES, document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.webpage.safe import clean_values, inert_json, part, policy_hash, template
 
-# Longer text from a log is cut
-MAX_CHARACTERS = 2000
+MAX_CHARACTERS = 2000  # longer texts from a log are shortened
 SCRIPTS = ("dom", "story", "step", "times", "tour")
 PACKAGE = "px4fuse.explore"
 
 
 def html_text(analysis: Analysis) -> str:
-    """Lay out the page.
+    """Make the page of an analysis.
 
     Parameters
     ----------
     analysis : Analysis
-        Made from a request.
+        Must have a request.
 
     Returns
     -------
@@ -37,13 +36,13 @@ def html_text(analysis: Analysis) -> str:
         data_scripts(data, analysis, packer),
         data,
         command="explore",
-        heading="Turn the knobs and watch",
+        heading="Interactive Kalman filter",
         title=data["log"],
     )
 
 
 def data_scripts(data: dict[str, Any], analysis: Analysis, packer: Packer, suffix: str = "") -> str:
-    """Return the elements with the data of one flight; none of them is run.
+    """Return the script elements with the data of one flight; none of them is executed.
 
     Parameters
     ----------
@@ -51,9 +50,9 @@ def data_scripts(data: dict[str, Any], analysis: Analysis, packer: Packer, suffi
         From :func:`px4fuse.explore.data.flight_data`.
     analysis : Analysis
     packer : Packer
-        That the data were made with.
+        Packer of the arrays in the data.
     suffix : str
-        Of the elements' ids, where a page has several such sets.
+        Suffix of the element ids, for pages with several flights.
     """
     document, places = document_json(data, analysis.tuning)
     content = {"flight": data, "ranges": ranges(), "packed": packer.specs, "places": places}
@@ -77,23 +76,24 @@ def page_text(
     rounds: int = 0,
     choices: Mapping[str, str] = {},
 ) -> str:
-    """The page around data that :func:`data_scripts` made.
+    """Make the page around the data elements.
 
     Parameters
     ----------
     scripts : str
+        Elements of :func:`data_scripts`.
     data : dict
-        A flight of the page; all have ground truth, or none has.
+        One flight of the page; either all flights have ground truth or none.
     command, heading, title : str
     rounds : int
-        How many flights are asked about.
+        Number of flights in a practice set.
     choices : mapping of str to str
-        What may be answered, by name in words; none where nothing is asked.
+        Possible answers with their texts; empty for a page without questions.
     """
     practice = "practice" if choices else "no_practice"
     code = {
-        # BokehJS itself, without widgets, tables and formulas; what follows it only sets a log
-        # level, and says so on the console
+        # BokehJS core without widgets, tables and formulas; the second script of Bokeh only sets
+        # the log level and writes to the console
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
         "engine": part("engine.js", PACKAGE),
         "script": "".join(part(f"{name}.js", PACKAGE) for name in (*SCRIPTS, practice, "page")),

@@ -1,9 +1,9 @@
-/* Which flight of the set is shown, what was answered, and what was right. All of it is kept in the
-   address, so that a reload shows the same; the answers are decoded only after a choice. */
+/* Practice: current flight, given answers and score. The address contains the state, so a reload keeps
+   it. The correct answers are decoded only after an answer. */
 const Practice = (() => {
   const count = Number($("quiz").dataset.rounds), parts = new URLSearchParams(location.hash.slice(1));
-  const given = (parts.get("answers") ?? "").split("~").slice(0, count);
-  const answers = Array.from({ length: count }, (_, i) => given[i] ?? "");
+  const saved = (parts.get("answers") ?? "").split("~").slice(0, count);
+  const answers = Array.from({ length: count }, (_, i) => saved[i] ?? "");
   const wanted = Math.trunc(Number(parts.get("flight") ?? 1)) - 1;
   const at = wanted >= 0 && wanted < count ? wanted : 0;
   const hidden = answers[at] === "";
@@ -13,7 +13,7 @@ const Practice = (() => {
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
     return JSON.parse(await new Response(stream).text());
   }
-  /* 1 for all that is wrong and nothing else, half for one of two and nothing else */
+  /* 1 point for all mistakes and no wrong choice, 0.5 for one of two and no wrong choice */
   function points(answer, { right }) {
     const chosen = answer.split(" ");
     if (chosen.some((one) => !right.includes(one))) return 0;
@@ -28,7 +28,7 @@ const Practice = (() => {
   async function start(page) {
     $("quiz-title").textContent = `Flight ${at + 1} of ${count}`;
     $("tour-start").hidden = true;
-    $("as-report").hidden = true; // there is no such log
+    $("as-report").hidden = true; // the flight is not a log file
     const boxes = [...document.querySelectorAll("[name=choice]")];
     for (const box of boxes) {
       box.disabled = !hidden;
@@ -43,7 +43,7 @@ const Practice = (() => {
     $("quiz-check").hidden = !hidden;
     $("quiz-check").addEventListener("click", () => {
       const chosen = boxes.filter((box) => box.checked).map((box) => box.value);
-      if (!chosen.length) { $("quiz-said").textContent = "Choose at least one."; return; }
+      if (!chosen.length) { $("quiz-result").textContent = "Select at least one."; return; }
       answers[at] = chosen.sort().join(" ");
       to(at);
     });
@@ -53,7 +53,7 @@ const Practice = (() => {
     $("quiz-again").hidden = answers.every((answer) => answer === "");
     $("quiz-again").addEventListener("click", () => { answers.fill(""); to(0); });
     await score();
-    if (!hidden) await told(page);
+    if (!hidden) await showSolution(page);
   }
   async function score() {
     let sum = 0, done = 0;
@@ -62,20 +62,21 @@ const Practice = (() => {
       sum += points(answer, await keyOf(number));
       done++;
     }
-    $("quiz-score").textContent = done === 0 ? "" : `${sum} of ${done} right${done === count
-      ? ": the set is done" : " so far"}`;
+    $("quiz-score").textContent = done === 0 ? "" : `${sum} of ${done} correct${done === count
+      ? ", set finished" : " so far"}`;
   }
-  async function told(page) {
-    const key = await keyOf(at), won = points(answers[at], key);
-    $("quiz-said").textContent = won === 1 ? "Right." : `${won === 0 ? "Not so." : "Half of it."} It was: ${key.right.join(" and ")}.`;
-    const box = $("quiz-told");
-    if (!key.made.length) {
-      box.append(make("p", "Nothing was wrong: the innovations lie within ±2√S, one in twenty outside, and follow no order."));
+  async function showSolution(page) {
+    const key = await keyOf(at), score = points(answers[at], key);
+    const grade = { 1: "Correct.", 0.5: "Half correct.", 0: "Wrong." }[score];
+    $("quiz-result").textContent = score === 1 ? grade : `${grade} Correct answer: ${key.right.join(" and ")}.`;
+    const box = $("quiz-solution");
+    if (!key.mistakes.length) {
+      box.append(make("p", "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."));
     }
-    for (const { what, tell, view, span } of key.made) {
-      const line = make("p", `${what} The tell-tale: ${tell} `);
-      const when = span === null ? "all along" : `at ${span[0].toFixed(1)} s`;
-      const button = make("button", `show me (${when})`, { type: "button", className: "jump" });
+    for (const { description, symptom, view, span } of key.mistakes) {
+      const line = make("p", `${description} Symptom: ${symptom} `);
+      const when = span === null ? "whole flight" : `at ${span[0].toFixed(1)} s`;
+      const button = make("button", `show (${when})`, { type: "button", className: "jump" });
       button.addEventListener("click", () => {
         page.open(view);
         if (span !== null) page.look(span[0] - 3, span[1] + 3);
@@ -84,7 +85,7 @@ const Practice = (() => {
       box.append(line);
     }
     page.recorded(key);
-    page.open(key.made[0]?.view ?? "error");
+    page.open(key.mistakes[0]?.view ?? "error");
   }
 
   return { suffix: `-${at}`, hidden, toAddress, start, points };

@@ -1,11 +1,11 @@
-/* One step of the filter at a time: an ellipse of 2σ on the phase plane that stretches and leans on
-   predict and collapses along the measurement on update, with the lesson's equations in numbers. */
+/* Step-by-step view: 2σ ellipse in the phase plane, which grows in each prediction and shrinks along
+   the measurement in each update, with the lesson's equations in numbers. */
 const Step = (() => {
   const CORNERS = 120;
-  const TRAIL = 60; // means that the trail keeps
+  const TRAIL = 60; // steps in the trail of means
   const PACES_MS = [1600, 800, 400, 200, 100, 50];
 
-  /* Points of the ellipse of 2σ, by the Cholesky factor of P */
+  /* Points of the 2σ ellipse, from the Cholesky factor of P */
   function ellipse([p, v, p00, p01, p11]) {
     const a = Math.sqrt(p00), b = p01 / a, c = Math.sqrt(Math.max(p11 - b * b, 0));
     const out = { p: new Float64Array(CORNERS + 1), v: new Float64Array(CORNERS + 1) };
@@ -17,7 +17,7 @@ const Step = (() => {
     return out;
   }
 
-  /* Every predict and every update of a run in turn: step of the grid, and measurement or -1 */
+  /* All predictions and updates of a run in order: i step, u measurement or -1 */
   function moments({ steps, updates }) {
     const list = [{ i: 0, u: -1, updated: false }];
     for (let i = 1, u = 0; i < steps.time.length; i++) {
@@ -33,37 +33,37 @@ const Step = (() => {
     return u >= 0 && !updated ? [s.p[u], s.v[u], s.p00[u], s.p01[u], s.p11[u]] : after(run, i);
   }
 
-  const words = (x, digits = 4) => Math.abs(x) >= 1e-4 || x === 0 ? x.toFixed(digits) : x.toExponential(2);
-  const matrix = (a, b, d) => `[${words(a, 5)}  ${words(b, 5)}; ${words(b, 5)}  ${words(d, 5)}]`;
-  const grows = (before, now) => now > before ? "grows" : now < before ? "shrinks" : "stays";
-  const sigma = (before, now) => `σ_p ${grows(before, now)}: ${words(Math.sqrt(before))} to ${words(Math.sqrt(now))} m`;
+  const format = (x, digits = 4) => Math.abs(x) >= 1e-4 || x === 0 ? x.toFixed(digits) : x.toExponential(2);
+  const matrix = (a, b, d) => `[${format(a, 5)}  ${format(b, 5)}; ${format(b, 5)}  ${format(d, 5)}]`;
+  const grows = (before, now) => now > before ? "increases" : now < before ? "decreases" : "unchanged";
+  const sigma = (before, now) => `σ_p ${grows(before, now)}: ${format(Math.sqrt(before))} to ${format(Math.sqrt(now))} m`;
 
-  /* The lesson's equations with this moment's numbers; whether the row is of the update */
+  /* Equations of the lesson with the numbers of this step: label, text, true if part of the update */
   function equations(run, settings, moment) {
     const { steps: s, updates: m } = run, { i, u, updated } = moment;
     const [, , b00, b01, b11] = after(run, i - 1), prior = state(run, { i, u, updated: false });
     const [p, v, p00, p01, p11] = prior, dt = s.time[i] - s.time[i - 1], a = s.acceleration[i - 1];
     const q = (settings.sigmaA ** 2 + s.extra[i - 1]) * settings.dt;
     const rows = [
-      ["Before", `x⁺ = [${words(s.p[i - 1])} m, ${words(s.v[i - 1])} m/s]`, false],
+      ["Before", `x⁺ = [${format(s.p[i - 1])} m, ${format(s.v[i - 1])} m/s]`, false],
       ["", `P⁺ = ${matrix(b00, b01, b11)}`, false],
-      ["Predict", `F = [1  ${words(dt)}; 0  1], B = [${words(dt * dt / 2, 5)}; ${words(dt)}], a = ${words(a, 3)} m/s²`, false],
+      ["Predict", `F = [1  ${format(dt)}; 0  1], B = [${format(dt * dt / 2, 5)}; ${format(dt)}], a = ${format(a, 3)} m/s²`, false],
       ["", `Q = ${matrix(q * dt ** 3 / 4, q * dt * dt / 2, q * dt)}`, false],
-      ["", `x⁻ = Fx⁺ + Ba = [${words(p)} m, ${words(v)} m/s]`, false],
+      ["", `x⁻ = Fx⁺ + Ba = [${format(p)} m, ${format(v)} m/s]`, false],
       ["", `P⁻ = FP⁺Fᵀ + Q = ${matrix(p00, p01, p11)}`, false],
       ["", sigma(b00, p00), false],
     ];
     if (u < 0) return rows;
     const r = settings.sigmaZ ** 2;
     rows.push(
-      ["Measure", `z = ${words(m.z[u])} m, R = SIGMA_Z² = ${words(r, 5)} m²`, true],
-      ["Compare", `ν = z − Hx⁻ = ${words(m.nu[u])} m`, true],
-      ["", `S = HP⁻Hᵀ + R = ${words(m.s[u], 5)} m²; ν²/S = ${words(m.nu[u] ** 2 / m.s[u], 2)}`, true]);
+      ["Measure", `z = ${format(m.z[u])} m, R = SIGMA_Z² = ${format(r, 5)} m²`, true],
+      ["Compare", `ν = z − Hx⁻ = ${format(m.nu[u])} m`, true],
+      ["", `S = HP⁻Hᵀ + R = ${format(m.s[u], 5)} m²; ν²/S = ${format(m.nu[u] ** 2 / m.s[u], 2)}`, true]);
     if (updated) {
       const [x, w, c00, c01, c11] = after(run, i);
       rows.push(
-        ["Gain", `K = P⁻Hᵀ/S = [${words(m.k0[u])}, ${words(m.k1[u])} 1/s]`, true],
-        ["Update", `x⁺ = x⁻ + Kν = [${words(x)} m, ${words(w)} m/s]`, true],
+        ["Gain", `K = P⁻Hᵀ/S = [${format(m.k0[u])}, ${format(m.k1[u])} 1/s]`, true],
+        ["Update", `x⁺ = x⁻ + Kν = [${format(x)} m, ${format(w)} m/s]`, true],
         ["", `P⁺ = (I − KH)P⁻ = ${matrix(c00, c01, c11)}`, true],
         ["", sigma(p00, c00), true]);
     }
@@ -78,9 +78,9 @@ const Step = (() => {
       if (cached.run !== run) cached = { run, list: run === null ? [] : moments(run) };
       return cached.list;
     };
-    let moment = null, playing = null, pace = 2; // place in the list
+    let moment = null, playing = null, pace = 2; // indices: moments of the run, PACES_MS
 
-    /* To a measurement, counted from 0: just after its update */
+    /* Go to a measurement (index), after its update */
     function go(measurement) {
       const list = listNow();
       if (!list.length) return;
@@ -111,7 +111,7 @@ const Step = (() => {
       if (moment === null || moment >= list.length - 1) moment = 0;
       playing = setInterval(advance, PACES_MS[pace]);
       $("play").textContent = "Pause";
-      $("now").ariaLive = "off"; // nobody can listen that fast
+      $("now").ariaLive = "off"; // too fast for a screen reader
     }
     function faster(by) {
       pace = Math.min(Math.max(pace + by, 0), PACES_MS.length - 1);
@@ -133,7 +133,7 @@ const Step = (() => {
       for (const id of ["first", "previous", "next", "last", "play"]) $(id).disabled = run === null;
       if (run !== null) $("cursor").max = run.updates.nu.length - 1;
       if (!known) {
-        $("now").textContent = "Choose a measurement: press n, or the buttons.";
+        $("now").textContent = "Select a measurement with n or the buttons.";
         return;
       }
       const list = listNow(), one = list[Math.min(moment, list.length - 1)], t = run.steps.time[one.i];
@@ -145,7 +145,7 @@ const Step = (() => {
         + (one.updated ? "" : ": predicted, not yet updated") : `Predicted to ${t.toFixed(3)} s`;
       if (!isSeen("step")) return;
       drawPlane(run, one);
-      if (one.i === 0) return $("numbers").replaceChildren(make("p", "The filter begins here."));
+      if (one.i === 0) return $("numbers").replaceChildren(make("p", "Initial state."));
       const table = make("table");
       for (const [head, text, update] of equations(run, settings, one)) {
         const row = table.insertRow();
@@ -170,7 +170,7 @@ const Step = (() => {
         [band.left, band.right] = [z - 2 * settings.sigmaZ, z + 2 * settings.sigmaZ];
         line.location = z;
       }
-      // as large at every moment, so that what grows is the ellipse: the widest prior of the run
+      // constant scale over the run, so that changes of the ellipse are visible
       const reach = reachOf(run);
       [plot.x_range.start, plot.x_range.end] = [now[0] - reach[0], now[0] + reach[0]];
       [plot.y_range.start, plot.y_range.end] = [now[1] - reach[1], now[1] + reach[1]];
@@ -189,7 +189,7 @@ const Step = (() => {
       slower: () => faster(-1), faster: () => faster(1) };
     for (const [id, act] of Object.entries(clicks)) $(id).addEventListener("click", act);
     $("cursor").addEventListener("input", (event) => go(Number(event.target.value)));
-    const another = () => { // a new run has other moments: stay at the measurement
+    const another = () => { // a new run has different steps: stay at the measurement
       moment = null;
       draw();
     };

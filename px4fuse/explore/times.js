@@ -1,10 +1,10 @@
-/* Time: what part of the flight is looked at, and what happened when. */
+/* Time range of the plots, events, map and findings. */
 const Times = (() => {
-  // by the places' names: the colours of both modes of the screen
+  // by name of the drawn element, for light and dark mode
   const COLOURS = {
-    light: { ours: "#123f7a", ekf2: "#e0741a", truth: "#111111", measured: "#9a9a9a",
+    light: { kf: "#123f7a", ekf2: "#e0741a", truth: "#111111", measured: "#9a9a9a",
       paper: "#ffffff", ink: "#1b2027", muted: "#55606c", line: "#d9dee4", event: "#aab3bd" },
-    dark: { ours: "#8ab8ff", ekf2: "#f0a35c", truth: "#f2f2f2", measured: "#7f8892",
+    dark: { kf: "#8ab8ff", ekf2: "#f0a35c", truth: "#f2f2f2", measured: "#7f8892",
       paper: "#1a1f26", ink: "#e5e9ee", muted: "#a0abb7", line: "#343c46", event: "#55616e" },
   };
 
@@ -12,14 +12,14 @@ const Times = (() => {
     const { flight, settings, model, put, timeRange, figures, look, shifted, isSeen, keys: others } = page;
     const ends = flight.segment;
 
-    // ------------------------------------------------------------------ the part in view
+    // ------------------------------------------------------------------ visible time range
     let waiting = false;
     const seen = () => {
       if (waiting) return;
       waiting = true;
-      requestAnimationFrame(() => { waiting = false; said(); look(); });
+      requestAnimationFrame(() => { waiting = false; showRange(); look(); });
     };
-    const said = () => {
+    const showRange = () => {
       $("span").textContent = `${timeRange.start.toFixed(1)} s to ${timeRange.end.toFixed(1)} s`;
     };
     function view(low, high) {
@@ -50,7 +50,7 @@ const Times = (() => {
       if (keys[event.key]) { keys[event.key](); event.preventDefault(); }
     });
 
-    // ------------------------------------------------------------------ what happened
+    // ------------------------------------------------------------------ events
     function strip(axis) {
       const rows = { row: [], left: [], right: [], text: [] };
       const add = (row, low, high, text) => {
@@ -59,7 +59,7 @@ const Times = (() => {
       const { events } = flight, sliver = (ends[1] - ends[0]) / 800;
       for (const [low, high, name] of events.modes) add("mode", low, high, name);
       for (const [low, high] of events.ground) add("on the ground", low, high, "");
-      for (const [low, high] of events.silent) add("source silent", low, high, "");
+      for (const [low, high] of events.gap) add("gap in source", low, high, "");
       for (const [low, high] of events.dropout) add("log dropout", low, high, "");
       if (typeof axis.ekf2 !== "string") {
         for (const t of events.reset) add("EKF2 reset", t, t + sliver, "");
@@ -69,7 +69,7 @@ const Times = (() => {
       put("strip", rows);
     }
 
-    // ------------------------------------------------------------------ the plan
+    // ------------------------------------------------------------------ map
     function plan() {
       if (typeof flight.plan === "string" || !isSeen("plan")) return;
       const [time, north, east] = flight.plan, t = shifted(time, settings.offset - flight.settings.offset);
@@ -88,7 +88,7 @@ const Times = (() => {
       put("shown", { north: inside.map((i) => north[i]), east: inside.map((i) => east[i]) });
     }
 
-    /* Where the vehicle was at a time of the filter, and that time in view */
+    /* Mark the vehicle on the map at a time of KF, and make that time visible */
     function show(t) {
       if (t < timeRange.start || t > timeRange.end) {
         const half = (timeRange.end - timeRange.start) / 2;
@@ -99,30 +99,31 @@ const Times = (() => {
       put("here", { north: Engine.interp(at, time, north), east: Engine.interp(at, time, east) });
     }
 
-    // ------------------------------------------------------------------ findings and words
+    // ------------------------------------------------------------------ summary and findings
     $("facts").textContent = `positions from ${flight.source}, ${ends.map((t) => t.toFixed(1)).join(" s to ")} s`;
-    /* Show the story and the findings of the report */
+    /* Show the summary and the findings of the report */
     function recorded({ story, findings }) {
       const { sigmaA, sigmaZ, dt, offset } = flight.settings;
       $("found").replaceChildren();
-      if (!story.length) { $("found").append(make("p", "Not told yet.")); return; }
-      $("found").append(make("p", `Recorded and judged at SIGMA_A ${sigmaA}, SIGMA_Z ${sigmaZ}, DT ${dt} s, clock `
-        + `offset ${Number(offset.toPrecision(4))} s; no knob changes this:`, { className: "note" }),
+      if (!story.length) { $("found").append(make("p", "Hidden until you answer.")); return; }
+      $("found").append(make("p", `Analysed with SIGMA_A ${sigmaA} m/s², SIGMA_Z ${sigmaZ} m, DT ${dt} s, clock `
+        + `offset ${Number(offset.toPrecision(4))} s. The settings of this page do not change it.`, { className: "note" }),
       make("p", story.join(" "), { dir: "auto", className: "story" }));
-      if (!findings.length) $("found").append(make("p", "No findings."));
-      for (const finding of findings) $("found").append(told(finding));
+      if (!findings.length) $("found").append(make("p", "Findings: none."));
+      for (const finding of findings) $("found").append(findingBox(finding));
     }
     recorded(flight);
-    function told(finding) {
+    function findingBox(finding) {
       const box = make("div"), line = make("p", undefined, { dir: "auto" });
-      line.append(make("span", `${finding.severity}: `, { className: `severity ${finding.severity}` }), finding.message);
+      line.append(make("span", `${finding.severity}: `, { className: `severity ${finding.severity}` }),
+        make("strong", `${finding.title} [${finding.id}]. `), finding.message);
       box.append(line);
-      if (finding.remedy) box.append(make("p", finding.remedy, { className: "note", dir: "auto" }));
-      // the page rewrites what hangs on the knobs
-      if (finding.knobs) box.append(make("p", "", { className: "now-said" }));
+      if (finding.remedy) box.append(make("p", `Action: ${finding.remedy}`, { className: "note", dir: "auto" }));
+      // filled in after a change of settings
+      if (finding.depends_on_settings) box.append(make("p", "", { className: "changed-note" }));
       finding.spans.forEach(([low, high]) => {
         const text = high - low > 0.05 ? `${low.toFixed(1)} s to ${high.toFixed(1)} s` : `${low.toFixed(1)} s`;
-        const button = make("button", `look at ${text}`, { type: "button", className: "jump" });
+        const button = make("button", `show ${text}`, { type: "button", className: "jump" });
         button.addEventListener("click", () => {
           const around = Math.max(2, 0.3 * (high - low));
           view(low - around, high + around);
@@ -130,7 +131,7 @@ const Times = (() => {
         });
         box.append(button);
       });
-      for (const more of finding.more) box.append(told(more));
+      for (const more of finding.more) box.append(findingBox(more));
       return box;
     }
 
@@ -155,19 +156,19 @@ const Times = (() => {
       }
     }
     function colour(name, glyph, colours) {
-      if (name === "ours_band") { glyph.fill_color = colours.ours; return; }
+      if (name === "kf_band") { glyph.fill_color = colours.kf; return; }
       if (name === "ink") { glyph.text_color = colours.ink; return; }
       if (name === null || colours[name] === undefined) return;
       const drawn = (one) => Boolean(one !== null && typeof one === "object" ? one.value : one);
       if (drawn(glyph.line_color)) glyph.line_color = colours[name];
-      if (drawn(glyph.fill_color)) glyph.fill_color = colours[name]; // what is hollow stays so
+      if (drawn(glyph.fill_color)) glyph.fill_color = colours[name]; // hollow marks stay hollow
     }
     dark.addEventListener("change", paint);
     paint();
-    if (matchMedia("(pointer: coarse)").matches) { // a finger scrolls; the buttons zoom
+    if (matchMedia("(pointer: coarse)").matches) { // touch scrolls the page; zoom with the buttons
       for (const plot of figures) plot.toolbar.active_drag = null;
     }
-    said();
+    showRange();
     return { strip, plan, show, view, recorded };
   }
 

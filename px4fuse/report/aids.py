@@ -1,4 +1,4 @@
-"""What EKF2 fused: a page with a table and a strip of innovations for each aid."""
+"""Page on EKF2's aids: table of verdicts and normalised innovations of each aid."""
 
 from collections.abc import Iterator, Mapping
 
@@ -9,32 +9,31 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.ekf2.aids import AidResult, flight_span
 from px4fuse.findings import Finding
 from px4fuse.flight import AidLog, Flight, Unavailable, step_values_at
-from px4fuse.plain import format_factor, format_number
+from px4fuse.plain import format_number
 from px4fuse.report import style
 from px4fuse.report.cover import flight_line, write_findings
 from px4fuse.report.marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix
+from px4fuse.report.words import format_sigma_verdict
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults
 
-TITLE = "What EKF2 fused"
-STRIP_HEIGHT = 21.0  # points, height of the innovations of one aid
-MAX_NORMALISED = 4.0  # in √S; what is beyond stands at the edge
-MAX_DOTS = 400  # of each axis, at most
-# Horizontal aids other than external vision: with them a flight has the page in its appendix
+TITLE = "Aids of EKF2"
+LEAD = (
+    "Each aid is tested with its own innovations in flight (mean NIS, expected 1). A small NIS "
+    "does not prove accuracy: time-correlated errors, wrong delays and wrong headings do not show "
+    "in it."
+)
+STRIP_HEIGHT = 21.0  # points; height of the axes of one aid
+MAX_NORMALISED = 4.0  # √S; larger innovations are drawn at the edge
+MAX_DOTS = 400  # drawn points per axis
+# A comparison has the aids page only if EKF2 fused one of these, not external vision alone
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw a page of the appendix where something besides external vision carried the flight."""
-    page = Page(
-        appendix(TITLE),
-        (
-            "Each aid is tested with its own innovations in flight (mean NIS, expected "
-            "1). A small NIS does not prove accuracy: time-correlated errors, wrong "
-            "delays and wrong headings do not show in it."
-        ),
-    )
+    """Draw the appendix page if EKF2 fused a horizontal aid besides external vision."""
+    page = Page(appendix(TITLE), LEAD)
     aid_results = write_appendix(page, analysis)
     if aid_results:
         _draw_strips(page, analysis.flight, aid_results)
@@ -42,7 +41,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def write_appendix(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
-    """Write the table of a comparison's aids, and return them; of the lab's flights none."""
+    """Write the table of a comparison's aids and return them; {} for external vision alone."""
     aid_results = analysis.aids
     if isinstance(aid_results, Unavailable):
         return {}
@@ -54,14 +53,7 @@ def write_appendix(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
 
 def draw_alone(alone: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
-    page = Page(
-        TITLE,
-        (
-            "Each aid is tested with its own innovations in flight (mean NIS, expected "
-            "1). A small NIS does not prove accuracy: time-correlated errors, wrong "
-            "delays and wrong headings do not show in it."
-        ),
-    )
+    page = Page(TITLE, LEAD)
     page.write(flight_line(results.student, alone.flight.log), colour=style.MUTED_COLOUR)
     write_alone(page, alone, results.findings)
     _draw_strips(page, alone.flight, alone.aids)
@@ -69,16 +61,16 @@ def draw_alone(alone: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
 
 
 def write_alone(page: Page, alone: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
-    """Write why there is no comparison, the table and the findings."""
+    """Write the reason for the missing comparison, the table of aids and the findings."""
     missing_data = alone.missing_data
-    page.write(f"Our filter has nothing to compare with EKF2: {missing_data.reason}.", above=2.0)
+    page.write(f"No comparison with KF: {missing_data.reason}.", above=2.0)
     page.write(with_options(missing_data.remedy), colour=style.MUTED_COLOUR)
     write_aids(page, alone.aids)
     write_findings(page, findings)
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
-    """Write a table with a row for each aid and axis; what EKF2 never fused is named below."""
+    """Write a table row per aid and axis, and a list of the disabled aids below it."""
     rows: list[list[Cell]] = []
     for aid in aids.values():
         if aid.verdict == "idle":
@@ -115,9 +107,9 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         [
             "aid",
             "verdict",
-            "meant",
+            "enabled",
             "rejec-\nted",
-            "longest\nwithout (s)",
+            "longest\ngap (s)",
             "√R",
             "axis",
             "n",
@@ -132,27 +124,28 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     disabled_labels = [aid.label for aid in aids.values() if aid.verdict == "idle"]
     if disabled_labels:
         page.write(
-            f"Logged but never fused in flight: {', '.join(disabled_labels)}.",
+            f"Disabled in flight (logged, never fused): {', '.join(disabled_labels)}.",
             colour=style.MUTED_COLOUR,
             size=7.0,
         )
 
 
 def format_aid_verdict(aid: AidResult) -> str:
-    """The verdict on an aid in a few words, with its factor in σ."""
+    """Format the verdict on an aid, with the factor between reported and actual σ."""
+    if aid.verdict == "starved":
+        return f"not fused for {aid.longest_without:.1f} s"
     if not aid.verdict.startswith("variance"):
         return aid.verdict
-    factor = max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5
-    return f"{aid.verdict.removeprefix('variance ')} {format_factor(factor)}× in σ"
+    return format_sigma_verdict(aid.verdict, max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5)
 
 
 def _draw_strips(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
-    """Innovations over √S of each aid that was fused, one below the other."""
+    """Draw the normalised innovations of each fused aid, one panel below the other."""
     span = flight_span(flight)
     if isinstance(flight.ekf2, Unavailable) or isinstance(span, Unavailable):
         return
     fused_names = [name for name, aid in aids.items() if aid.verdict != "idle"]
-    page.heading("Innovations over √S, all axes of an aid", above=8.0)
+    page.heading("Normalised innovations of each aid (all axes)", above=8.0)
     page.numbers(
         "Normalised innovations ν/√S. Expected: 95 % within ±2 (lines). Hollow: not "
         f"fused. Grey: fusion disabled. Values beyond ±{MAX_NORMALISED:g} are drawn "

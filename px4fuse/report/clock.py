@@ -1,4 +1,4 @@
-"""Appendix: the clock. Its page when there is something to say, else a line of provenance."""
+"""Time offset of the position source: an appendix page, or a line on the provenance page."""
 
 from collections.abc import Iterable, Iterator
 
@@ -14,27 +14,24 @@ from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
 from px4fuse.results.contract import ComparisonResults
 
-CURVE_HEIGHT = 170.0  # height of the axes in points
-# Beyond this the curve tells nothing more
-MAX_DROP = 12.0
-# How many intervals the curve is drawn over, to either side
-CURVE_REACH = 2.5
-# One update of EKF2 (EKF2_PREDICT_US)
-NEGLIGIBLE_S = 0.010
-# What is said about the clock in a finding has its page
+CURVE_HEIGHT = 170.0  # points; height of the axes
+MAX_DROP = 12.0  # nats; lower end of the log-likelihood axis
+CURVE_REACH = 2.5  # distance that is drawn on each side, as a multiple of the 95 % interval
+NEGLIGIBLE_S = 0.010  # s; one EKF2 step (EKF2_PREDICT_US)
+# Findings for which the report has the page
 CLOCK_FINDINGS = ("source_clock_changes", "source_clock_offset", "ekf2_ev_delay_wrong")
 
 
 def summary_line(analysis: Analysis, findings: Iterable[Finding]) -> str:
-    """What the clock estimate says, in one line."""
+    """Summarise the time offset in one line."""
     if has_page(analysis, findings):
-        return "see its page"
+        return "see the appendix on the time offset"
     advice = clock_advice(analysis, analysis.clock)
-    return "; ".join(advice[label] for label in ("Reading", "Offset") if label in advice)
+    return " ".join(advice[label] for label in ("Result", "Offset") if label in advice)
 
 
 def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
-    """Whether the flight says more about the clock than that it is right."""
+    """Return True if the time offset is significant, changes or cannot be estimated."""
     clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
@@ -42,57 +39,62 @@ def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
-    """What the clock estimate says, and what follows from it, as labels and sentences."""
+    """Return the estimated time offset and the actions as labelled texts."""
     if isinstance(clock, Unavailable):
-        return {"Offset": f"not determinable: {clock.reason}. {clock.remedy}"}
+        return {"Offset": f"Cannot be estimated: {clock.reason}. {clock.remedy}"}
     if not clock.determinable:
         return {
-            "Offset": f"not determinable: {clock.reason}.",
-            "Next": "fly passes of 5 m or more with clear starts and stops.",
+            "Offset": f"Cannot be estimated: {clock.reason}.",
+            "Action": "Fly passes of 5 m or more with clear starts and stops.",
         }
     offset, (low, high) = clock.offset_s, clock.interval_s
     advice = {
+        "Result": "No significant time offset.",
         "Offset": (
-            f"{offset:+.3f} s (95 % {low:+.3f} to {high:+.3f} s), to add to the "
-            "timestamps of the source"
+            f"{offset:+.3f} s (95 % {low:+.3f} to {high:+.3f} s), to add to the timestamps of the "
+            "position source."
         ),
-        "Reading": "the stamps are right as far as this flight can tell",
     }
     if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_S):
         side = "late" if offset < 0.0 else "early"
-        advice["Reading"] = f"the stamps are {side} by {abs(offset):.3f} s"
+        advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
         typed = typed_offset_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
     delay, name = delay_ms(comparison), aid_of(comparison).delay
     age_s = comparison.source.age_s
     least, most = age_s - high, age_s - low
     if delay is not None and least - NEGLIGIBLE_S <= delay * 1e-3 <= most + NEGLIGIBLE_S:
-        advice["PX4"] = f"{name} {delay:g} ms fits"
+        advice["PX4"] = f"{name} {delay:g} ms is within the 95 % interval."
     elif delay is not None and offset > age_s and delay <= 0.0:
-        advice["PX4"] = f"{name} is 0 ms and cannot be negative: correct the sender's clock"
+        advice["PX4"] = f"{name} is 0 ms and cannot be negative. Correct the sender's clock."
     elif delay is not None:
         ml_delay_ms, least, most = (max(1e3 * s, 0.0) for s in (age_s - offset, least, most))
         advice["PX4"] = (
-            f"{name} is {delay:g} ms; the estimate is {ml_delay_ms:.0f} ms (95 % "
-            f"{least:.0f} to {most:.0f} ms). Set it, or correct the sender's clock."
+            f"Set {name} to {ml_delay_ms:.0f} ms (now {delay:g} ms; 95 % {least:.0f} to "
+            f"{most:.0f} ms), or correct the sender's clock."
         )
     if clock.change_p is not None and clock.change_p < MAX_CHANGE_P:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         advice["Changes"] = (
-            f"the offset is not the same throughout ({format_p_value(clock.change_p)}): {offset_texts}"
+            f"The offset changes during the flight ({format_p_value(clock.change_p)}): "
+            f"{offset_texts}."
         )
     if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
-        advice["Drift"] = f"{clock.drift_ppm:+.0f} ± {1.96 * clock.drift_sigma_ppm:.0f} ppm"
+        half_width_ppm = 1.96 * clock.drift_sigma_ppm
+        note = ", not significant" if abs(clock.drift_ppm) < half_width_ppm else ""
+        advice["Drift"] = (
+            f"Clock drift {clock.drift_ppm:+.0f} ± {half_width_ppm:.0f} ppm (95 %){note}."
+        )
     return advice
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw one page; none where a line says it all."""
+    """Draw the page if the time offset needs one, see :func:`has_page`."""
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
         return
     page = Page(
-        "Appendix: the clock of the position source",
+        "Appendix: time offset of the position source",
         (
             "Late or early timestamps hardly change the innovations: the filter follows "
             "the positions. px4fuse maximises the likelihood of the positions over the "
@@ -108,13 +110,13 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
         "interval also includes the IMU noise, so it is wider than the curve shows. "
         f"{clock.count} measurements."
     )
-    title = "ln of how much less likely each offset is than the best"
+    title = "Log-likelihood relative to its maximum (nats, downwards)"
     draw_curve(page.panel(title, curve_sentence, CURVE_HEIGHT, above=14.0), clock)
     yield page
 
 
 def draw_curve(axes: Axes, clock: ClockOffset) -> None:
-    """Likelihood over the offset."""
+    """Draw the log-likelihood over the time offset, with the 95 % interval."""
     (low, high), best, applied = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low, high, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_drop, **KF_LINE)
@@ -126,5 +128,5 @@ def draw_curve(axes: Axes, clock: ClockOffset) -> None:
         min(max(best - reach, ends[0]), applied - 0.1 * reach),
         max(min(best + reach, ends[1]), applied + 0.1 * reach),
     )
-    axes.set_xlabel("offset added to the source's stamps (s)")
+    axes.set_xlabel("offset added to the source's timestamps (s)")
     legend_above(axes)

@@ -1,4 +1,4 @@
-"""Appendix: NIS, distribution and whiteness of both filters, by the same rules."""
+"""Appendix: consistency tests of KF and EKF2 (mean NIS, distribution, whiteness)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilt
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.since import format_change, format_explained_share
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capitalise_first, format_number, format_p_value
+from px4fuse.plain import format_number, format_p_value
 from px4fuse.report import marks
 from px4fuse.report.page import Cell, Page, halves, legend_above
 from px4fuse.report.style import (
@@ -31,23 +31,22 @@ from px4fuse.report.words import VERDICT_HEAD, filters_by_name, format_verdict, 
 MAX_LAG = 20
 MAX_NORMALISED = 4.0
 BINS = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
-# Of the normal curve's 0.4: higher bars are cut, so that the curve stays in sight
+# Upper end of the density axis; the normal curve has its maximum at 0.4 and stays visible
 MAX_DENSITY = 1.6
-# p of "white" below which a word is said
+# p value of the Ljung-Box test below which the caption reports non-white innovations
 SMALL_P = 0.01
-# Heights of the axes in points
-RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0
+RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # points; heights of the axes
 GREY = "#dcdcdc"
-# What a cause explains: its name, and the power that is shown
+# Statistic that a cause explains: its label, and the power of the value that is printed
 CAUSE_STATISTICS: Mapping[Of, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
-    "nees": ("error (σ)", 0.5),
-    "apart": ("apart (m)", 1.0),
+    "nees": ("√NEES", 0.5),
+    "apart": ("KF - EKF2 (m)", 1.0),
 }
 
 
 class Series(NamedTuple):
-    """Innovations over √S of one filter, and what they state."""
+    """Normalised innovations ν/√S of one filter, with their statistics."""
 
     name: str
     values: pd.Series[float]
@@ -55,7 +54,7 @@ class Series(NamedTuple):
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw one page: the axis of the lab in three panels, all axes in a table."""
+    """Draw one page: three panels of the main axis, and a table of all axes."""
     result = analysis.main
     along = result.axis.called
     page = Page(
@@ -72,7 +71,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         axes = marks.panel(
             page,
             analysis,
-            "Mean NIS so far, log scale",
+            "Running mean NIS (log scale)",
             _nis_sentence(series),
             RUNNING_HEIGHT,
             above=LEGEND_HEIGHT,
@@ -81,7 +80,11 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         legend_above(axes)
         first, second = halves()
         left = first.panel(
-            "Size: ν / √S", _shape_sentence(series), LOWER_HEIGHT, above=LEGEND_HEIGHT, left=4.0
+            "Distribution of ν/√S",
+            _shape_sentence(series),
+            LOWER_HEIGHT,
+            above=LEGEND_HEIGHT,
+            left=4.0,
         )
         right = second.panel(
             "Autocorrelation", _whiteness_sentence(series), LOWER_HEIGHT, above=LEGEND_HEIGHT
@@ -103,12 +106,12 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write what each change would make of both filters along the axis of the lab."""
+    """Write the table of re-runs along the main axis: one change each, before and after."""
     axis = analysis.main.axis
     rows: list[list[Cell]] = []
     for cause in analysis.causes:
         if cause.axis == axis.name:
-            owner = "ours" if cause.filter == "kf" else "EKF2"
+            owner = "KF" if cause.filter == "kf" else "EKF2"
             statistic, power = CAUSE_STATISTICS[cause.of]
             values = (format_number(number**power, 2) for number in (cause.before, cause.after))
             rows.append(
@@ -122,8 +125,9 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
             )
     if not rows:
         return
-    page.heading(f"Causes that were tried along {axis.called}", above=12.0)
-    page.table(["filter", "cause", "number", "flown", "put right", "explains"], rows, right=(3, 4))
+    page.heading(f"Tested causes along {axis.called}", above=12.0)
+    head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
+    page.table(head, rows, right=(3, 4))
     page.write(
         (
             "Each row is a re-run with one change. 'all': the change brings the number "
@@ -136,8 +140,8 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
 
 
 def _series(result: AxisComparison) -> list[Series]:
-    """Of each filter that has enough innovations."""
-    frames = {"ours": result.replay.updates, "EKF2": result.ekf2_innovations}
+    """Return the normalised innovations of each filter with at least MIN_INNOVATIONS."""
+    frames = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     series = []
     for name, one in filters_by_name(result).items():
         frame = frames[name]
@@ -162,11 +166,11 @@ def _draw_running_nis(axes: Axes, series: list[Series]) -> None:
         drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
         time = one.values.index[drawn_counts - 1]
-        if one.name == "ours":
-            axes.fill_between(time, low, high, color=GREY, lw=0, label="95 % band of ours")
+        if one.name == "KF":
+            axes.fill_between(time, low, high, color=GREY, lw=0, label="95 % band KF")
         else:
             axes.plot(time, low, **_thin_line_style(one))
-            axes.plot(time, high, **_thin_line_style(one), label="of EKF2")
+            axes.plot(time, high, **_thin_line_style(one), label="95 % band EKF2")
         settled = running[len(running) // 4 :]
         lowest, highest = min(lowest, 0.7 * settled.min()), max(highest, 1.4 * settled.max())
     axes.axhline(1.0, color="black", lw=0.5)
@@ -197,12 +201,17 @@ def _draw_autocorrelation(axes: Axes, series: list[Series]) -> None:
         r = autocorrelation(np.asarray(one.values, np.float64), lags)
         at = np.arange(1, lags + 1) + shift
         axes.vlines(at, 0.0, r, color=LINES[one.name]["color"], lw=1.2)
-        filled = {"mfc": LINES[one.name]["color"] if one.name == "ours" else "white"}
+        filled = {"mfc": LINES[one.name]["color"] if one.name == "KF" else "white"}
         axes.plot(at, r, **DOTS[one.name] | filled | {"ms": 3.0, "mew": 0.6}, label=one.name)
         bound = _whiteness_bound(one)
-        if one.name == "ours":
+        if one.name == "KF":
             axes.axhspan(
-                -bound, bound, color=KF_BAND_COLOUR, lw=0, zorder=0.5, label="95 % of white"
+                -bound,
+                bound,
+                color=KF_BAND_COLOUR,
+                lw=0,
+                zorder=0.5,
+                label="95 % band of white noise",
             )
         else:
             for level in (-bound, bound):
@@ -215,28 +224,25 @@ def _draw_autocorrelation(axes: Axes, series: list[Series]) -> None:
 
 
 def _whiteness_bound(one: Series) -> float:
-    """How far the autocorrelation of white innovations goes, 95 %."""
+    """Half width of the 95 % band for the autocorrelation of white innovations."""
     return float(1.96 / np.sqrt(len(one.values)))
 
 
 def _nis_sentence(series: list[Series]) -> str:
     return " ".join(
-        f"{capitalise_first(one.name)} ends at {format_number(one.statement.nis_mean)} "
-        "({:.2f} to {:.2f} is consistent): ".format(*one.statement.nis_band)
+        f"{one.name}: final mean NIS {format_number(one.statement.nis_mean)} "
+        "(expected {:.2f} to {:.2f}): ".format(*one.statement.nis_band)
         + f"{format_verdict(one.statement)}."
         for one in series
     )
 
 
 def _shape_sentence(series: list[Series]) -> str:
-    sentences = [
-        (
-            f"{capitalise_first(one.name)}: {one.statement.outside_two_sigma:.1%} beyond "
-            f"2√S (expected 4.5 %), mean {one.statement.innovation_mean_m:+z.3f} m ({format_p_value(one.statement.bias_p)})."
-        )
+    return "\n".join(
+        f"{one.name}: {one.statement.outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), mean "
+        f"{one.statement.innovation_mean_m:+z.3f} m ({format_p_value(one.statement.bias_p)})."
         for one in series
-    ]
-    return "\n".join([*sentences, "4.5% are expected there."])
+    )
 
 
 def _whiteness_sentence(series: list[Series]) -> str:
@@ -245,10 +251,8 @@ def _whiteness_sentence(series: list[Series]) -> str:
         r, p = one.statement.lag1_autocorrelation, one.statement.ljung_box_p
         reading = "white" if p >= SMALL_P else "not white"
         if p < SMALL_P and abs(r) > _whiteness_bound(one):
-            reading = "it follows too slowly" if r > 0.0 else "it jumps after every measurement"
-        sentences.append(
-            f"{capitalise_first(one.name)}: lag 1 {r:+.2f}, Ljung-Box {format_p_value(p)}: {reading}."
-        )
+            reading = "the filter lags" if r > 0.0 else "the filter follows measurement noise"
+        sentences.append(f"{one.name}: lag 1 {r:+.2f}, Ljung-Box {format_p_value(p)}: {reading}.")
     return "\n".join(sentences)
 
 

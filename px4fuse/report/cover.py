@@ -1,4 +1,4 @@
-"""Cover: what happened, the verdict, the findings, and the flight from above."""
+"""Cover: summary, verdict along the main axis, findings and map."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -12,9 +12,9 @@ from px4fuse.comparison.interventions import error_beyond_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, within
-from px4fuse.findings import Finding, by_root
+from px4fuse.findings import Finding, by_root, finding_title
 from px4fuse.flight import Ekf2, Truth, Unavailable
-from px4fuse.plain import format_length
+from px4fuse.plain import capitalise_first, format_number
 from px4fuse.recording import LogInfo
 from px4fuse.report.marks import LANDING_MARK, TAKE_OFF_MARK
 from px4fuse.report.page import PAGE_WIDTH, Page, halves, legend_above, words
@@ -39,22 +39,18 @@ from px4fuse.report.words import (
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
 
-# A track so many times longer than wide lies along the page, else north is up
+# Ratio of length and width above which the track is drawn along the page; else north is up
 MIN_LONG_RATIO = 2.2
-MAX_MAP_HEIGHT, MIN_MAP_HEIGHT, SIDE_MAP_HEIGHT, SIDE_MAP_WIDTH = (
-    120.0,
-    56.0,
-    150.0,
-    256.0,
-)  # points
-MAX_POINTS = 2000
+MAX_MAP_HEIGHT, MIN_MAP_HEIGHT = 120.0, 56.0  # points; of a map above the facts
+SIDE_MAP_HEIGHT, SIDE_MAP_WIDTH = 150.0, 256.0  # points; of a map beside the facts
+MAX_POINTS = 2000  # drawn points per track
 Coordinates = tuple[Array, Array]
 HORIZONTAL_AXES = ("north", "east")
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the cover; findings that it has no room for go to the next page."""
-    page = Page("Two-state Kalman filter against EKF2")
+    """Draw the cover; findings that do not fit continue on the next page."""
+    page = Page("EKF2 check: comparison with a two-state Kalman filter (KF)")
     page.foot(_map_and_facts(analysis, facts(analysis)))
     page.write(flight_line(results.student, analysis.flight.log), colour=MUTED_COLOUR, above=-4.0)
     for sentence in results.story:
@@ -66,27 +62,27 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
 
 
 def flight_line(student: Student, log: LogInfo) -> str:
-    """Whose report it is, and of which flight, on one line."""
+    """Format student, log, duration, firmware and hardware on one line."""
     flight_facts = (log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
     return " · ".join(filter(None, (student_line(student, ", "), *flight_facts)))
 
 
 def student_line(student: Student, separator: str) -> str:
-    """Name and id, as far as they are given."""
+    """Join the student's name and id; either may be empty."""
     return separator.join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
-    """Write all findings below a heading, each with what follows from it."""
+    """Write all findings below a heading, each with its consequences."""
     page.heading("Findings", 10.5, above=12.0)
     if not findings:
-        page.write("None: no detector has anything to say about this flight.")
+        page.write("None.")
     for findings_of_cause in by_root(findings):
         write_finding(page, findings_of_cause)
 
 
 def _write_verdict(page: Page, analysis: Analysis) -> None:
-    """The main axis, large: each filter on its half of the page."""
+    """Write the verdicts along the main axis in large letters, KF left and EKF2 right."""
     result, columns = analysis.main, []
     along = result.axis.called
     for (name, one), colour in zip(
@@ -94,15 +90,14 @@ def _write_verdict(page: Page, analysis: Analysis) -> None:
     ):
         is_judged = isinstance(one, Consistency)
         column, _ = halves()
-        owner = "our filter" if name == "ours" else name
-        subject, large_text = "variance is", format_verdict(one)
+        large_text = format_verdict(one)
         if excess := error_beyond_reported_sigma(one):
-            subject, sigma_text = "error is", format_length(excess.reported_sigma_m)
-            large_text = f"{format_length(excess.rmse_m)}, claimed {sigma_text}"
-        column.write(f"Along {along} {owner}'s {subject}")
+            rmse, sigma = (format_number(m, 2) for m in (excess.rmse_m, excess.reported_sigma_m))
+            large_text = f"position RMSE {rmse} m, reported σ {sigma} m"
+        column.write(f"{name} along {along}")
         column.write(
             large_text,
-            size=16.0,
+            size=12.0,
             bold=True,
             colour=colour if is_judged else MUTED_COLOUR,
             above=1.0,
@@ -113,19 +108,19 @@ def _write_verdict(page: Page, analysis: Analysis) -> None:
     page.beside(*columns, above=14.0)
     notes = [
         (
-            "Mean NIS, expected 1. Below its 95 % band: underconfident (σ too large). "
+            "Mean NIS: expected 1. Below its 95 % band: underconfident (σ too large). "
             "Above: overconfident (σ too small)."
         )
     ]
     if isinstance(result.ekf2_state, Unavailable):
-        notes.append(f"There is no EKF2 to compare with: {result.ekf2_state.reason}.")
+        notes.append(f"No EKF2 in the log: {result.ekf2_state.reason}.")
     if not isinstance(analysis.flight.truth, Truth):
-        notes.append("The log has no truth to say who is right.")
+        notes.append("No ground truth in the log, so position errors are unknown.")
     page.write(" ".join(notes), size=7.0, colour=MUTED_COLOUR)
 
 
 def facts(comparison: Comparison) -> dict[str, str]:
-    """What was compared, in labels and sentences."""
+    """Return filter settings, position source, segment and input files as labelled texts."""
     flight = comparison.flight
     log, source, segment = flight.log, comparison.source, comparison.segment
     position = (
@@ -146,20 +141,23 @@ def facts(comparison: Comparison) -> dict[str, str]:
     entries = {
         "Filter": format_settings(comparison.settings),
         "Position": position,
-        "Placed": placement,
+        "Aligned": placement,
         "Clock": clock,
         "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
         "Aisle": "" if aisle is None else f"{aisle.heading_deg:.1f}° from north ({aisle.note})",
-        "With": ", ".join(f"{file.name}, SHA-256 {file.sha256[:12]}…" for file in flight.inputs),
+        "Inputs": ", ".join(f"{file.name}, SHA-256 {file.sha256[:12]}…" for file in flight.inputs),
         "SHA-256": f"{log.sha256[:32]}…, {log.bytes / 1e6:.2f} MB",
     }
     return {label: text for label, text in entries.items() if text}
 
 
 def write_finding(page: Page, group: list[Finding]) -> None:
-    """Write severity, when it shows, sentence and remedy, and what follows from it."""
+    """Write severity, time, title with id, message, action and consequences of a finding."""
     finding, *followers = group
-    texts = [words(finding.message, 8.0), words(finding.remedy, 7.5, MUTED_COLOUR)]
+    title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
+    texts = [words(title, 8.0, bold=True), words(finding.message, 8.0)]
+    if finding.remedy:
+        texts.append(words(f"Action: {finding.remedy}", 7.5, MUTED_COLOUR))
     if followers:
         texts.append(words(format_consequences(followers), 7.5, MUTED_COLOUR))
     page.labelled(
@@ -172,7 +170,7 @@ def write_finding(page: Page, group: list[Finding]) -> None:
 
 
 def _aisle(comparison: Comparison) -> Axis | None:
-    """The aisle, where one is known."""
+    """Return the aisle axis, if the comparison has one."""
     return next((line for line in comparison.lines if line.name == AISLE), None)
 
 
@@ -180,13 +178,13 @@ def _aisle(comparison: Comparison) -> Axis | None:
 
 
 class MapView(NamedTuple):
-    """How the map lies on the page: the heading (rad) of its x axis, and the names of both."""
+    """Orientation of the map: heading (rad) of its x axis, and the labels of both axes."""
 
     heading: float
     labels: tuple[str, str]
 
     def project(self, north: Any, east: Any) -> Coordinates:
-        """Where positions (m) lie on the page: to the right, and up."""
+        """Rotate north and east (m) to map coordinates: right and up (m)."""
         c, s = np.cos(self.heading), np.sin(self.heading)
         return c * north + s * east, s * north - c * east
 
@@ -195,15 +193,7 @@ NORTH_UP = MapView(np.pi / 2.0, ("east", "north"))
 
 
 def _map_and_facts(analysis: Analysis, facts: Mapping[str, str]) -> Page:
-    """The map of a flight, with labelled sentences below or beside it.
-
-    A long track lies along the page and takes its width, with the facts below it.
-
-    Parameters
-    ----------
-    analysis : Analysis
-    facts : mapping from labels to sentences
-    """
+    """Draw the map, with the facts below it (long track) or beside it."""
     tracks = _tracks(analysis)
     along = _map_view(analysis)
     wide, high = (float(np.ptp(values)) for values in along.project(*tracks["measurement"]))
@@ -215,11 +205,9 @@ def _map_and_facts(analysis: Analysis, facts: Mapping[str, str]) -> Page:
         height = float(
             np.clip(1.3 * high * PAGE_WIDTH / (1.1 * wide), MIN_MAP_HEIGHT, MAX_MAP_HEIGHT)
         )
-    # beside the facts the legend needs two lines
+    # the narrow map needs two lines for its legend
     above = 16.0 if is_long else 28.0
-    _draw_map(
-        map_page.panel("From above", "", height, above=above, left=36.0), analysis, view, tracks
-    )
+    _draw_map(map_page.panel("Map", "", height, above=above, left=36.0), analysis, view, tracks)
     for label, text in facts.items():
         beside.labelled(label, text, size=7.0, above=-0.5)
     if not is_long:
@@ -228,7 +216,7 @@ def _map_and_facts(analysis: Analysis, facts: Mapping[str, str]) -> Page:
 
 
 def _tracks(comparison: Comparison) -> dict[str, Coordinates]:
-    """North and east of each track in the segment, m."""
+    """North and east (m) of each track within the segment."""
     segment, flight = comparison.segment, comparison.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
@@ -237,24 +225,24 @@ def _tracks(comparison: Comparison) -> dict[str, Coordinates]:
 
     tracks = {"measurement": cut(comparison.source.samples)}
     if isinstance(flight.truth, Truth):
-        tracks["truth"] = cut(flight.truth.samples)
+        tracks["ground truth"] = cut(flight.truth.samples)
     if isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut(flight.ekf2.state)
     if set(HORIZONTAL_AXES) <= comparison.axes.keys():
         north, east = (
             comparison.axes[name].replay.steps["position_m"].to_numpy() for name in HORIZONTAL_AXES
         )
-        tracks["ours"] = north, east
+        tracks["KF"] = north, east
     return tracks
 
 
 def _map_view(comparison: Comparison) -> MapView:
-    """Along the aisle where one is known; north is up, not down."""
+    """Return the view along the aisle axis, at a heading below 180°; else north up."""
     aisle = _aisle(comparison)
     if aisle is None or aisle.heading_deg is None:
         return NORTH_UP
     degrees = aisle.heading_deg % 180.0
-    return MapView(np.deg2rad(degrees), (f"along {degrees:.0f}° from north", "to its left"))
+    return MapView(np.deg2rad(degrees), (f"along heading {degrees:.0f}°", "left of it"))
 
 
 def _draw_map(
@@ -265,7 +253,7 @@ def _draw_map(
         **{**MEASUREMENT_DOTS, "ms": 3.0},
         label="measurement",
     )
-    for name in ("EKF2", "ours", "truth"):
+    for name in ("EKF2", "KF", "ground truth"):
         if name in tracks:
             north, east = tracks[name]
             stride = max(1, len(north) // MAX_POINTS)

@@ -1,4 +1,4 @@
-"""Errors of a trajectory as evo's users know them: path by error, APE and RPE, on one page."""
+"""Page on trajectory errors: map coloured by error, APE and RPE, named as in evo."""
 
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -16,7 +16,7 @@ from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
-# Indices of the axes that are right, up the page and vertical; and whether the last points down
+# Indices of the axes to the right, up the page and vertical; True if the vertical axis is down
 PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "NED": (1, 0, 2, True),
     "FRD": (1, 0, 2, True),
@@ -24,15 +24,13 @@ PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "camera": (0, 2, 1, True),
     "unknown": (0, 1, 2, False),
 }
-# A path whose height is less than this share of its length is seen from above alone
+# Ratio of height and length of a path below which the side view is left out
 MAX_FLAT_RATIO = 0.1
-# Steps of so many median ones are gaps: no line crosses them
+# Time step, as a multiple of the median one, above which a line is interrupted
 MIN_GAP_STEPS = 10.0
 MAX_PATH_POINTS = 1200
-# Axes of errors reach at least this far: rounding is no error to look at
-MIN_SCALE_M = 1e-3
-# In points: heights of a panel, of the maps and of a legend, and between the maps
-PANEL_HEIGHT, MAP_HEIGHT, MAP_GAP = 76.0, 128.0, 16.0
+MIN_SCALE_M = 1e-3  # m; minimum range of an error axis, so that rounding errors look small
+PANEL_HEIGHT, MAP_HEIGHT, MAP_GAP = 76.0, 128.0, 16.0  # points
 MAX_DELTA_LABELS = 12
 REFERENCE_LINE: dict[str, Any] = {"color": TRUTH_COLOUR, "lw": 0.8, "ls": (0, (4, 2))}
 STATISTIC_LINES: tuple[tuple[str, str, dict[str, Any]], ...] = (
@@ -41,15 +39,14 @@ STATISTIC_LINES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("mean", "mean", {"color": "black", "lw": 0.9, "ls": (0, (5, 2))}),
     ("median", "median", {"color": "black", "lw": 0.9, "ls": (0, (5, 1.5, 1, 1.5))}),
 )
-# Rounding: no error to say anything about
-NEGLIGIBLE_M = 1e-6
-SHADES_CAPTION = "The darker the path, the larger its error; × is the largest."
+NEGLIGIBLE_M = 1e-6  # m; smaller errors are rounding
+SHADES_CAPTION = "Darker: larger error. ×: largest error."
 SCORE_HEAD = ("error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)")
 
 
 @cache
 def error_colours() -> Colormap:
-    """Colours from light to dark, so that grey shows them in order; none is as light as paper."""
+    """Return a colour map from light to dark that stays readable in grey and on white."""
     import matplotlib as mpl  # noqa: PLC0415
     from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415
 
@@ -59,7 +56,7 @@ def error_colours() -> Colormap:
 
 
 class View(NamedTuple):
-    """From where a path is seen: the axes across and up the page, and their names."""
+    """View of a path: indices of the axes across and up the page, and their names."""
 
     across: int
     up: int
@@ -67,12 +64,12 @@ class View(NamedTuple):
     names: tuple[str, str]
 
     def project(self, position_m: Array) -> Array:
-        """Coordinates on the page, shape (n, 3) to (n, 2)."""
+        """Project positions, shape (n, 3), to page coordinates, shape (n, 2)."""
         return np.asarray(position_m[:, (self.across, self.up)])
 
 
 def path_views(score: Evaluation) -> list[View]:
-    """From above; and from the side where the path is not flat."""
+    """Return the view from above, and the side view if the path is not flat."""
     across, up, vertical, is_down = PAGE_AXES[score.reference.frame]
     names = AXES_OF_FRAME[score.reference.frame]
     extent = np.maximum(np.ptp(score.reference_m, axis=0), np.ptp(score.estimate_m, axis=0))
@@ -85,7 +82,7 @@ def path_views(score: Evaluation) -> list[View]:
 
 
 def draw(score: Evaluation, _: object) -> Iterator[Page]:
-    """Draw the page, and another where the table of a run over many deltas fills the first."""
+    """Draw the evaluation: scores, maps and error panels."""
     page = Page(
         "Trajectory error",
         (
@@ -101,7 +98,7 @@ def draw(score: Evaluation, _: object) -> Iterator[Page]:
 
 
 def _draw_maps(page: Page, score: Evaluation) -> None:
-    """The two as they stand, and the aligned path by its error, from one or two sides."""
+    """Draw the paths before alignment, and the aligned path coloured by error in each view."""
     map_views, is_aligned = path_views(score), score.alignment != "none"
     count = len(map_views) + is_aligned
     width = (PAGE_WIDTH - MAP_GAP * (count - 1)) / count
@@ -119,7 +116,7 @@ def _draw_maps(page: Page, score: Evaluation) -> None:
         columns[-1].numbers(unaligned_sentence(score))
     for view in map_views:
         columns.append(Page(width=width))
-        title = f"{'After alignment, by' if is_aligned else 'By'} error"
+        title = f"{'After alignment, coloured' if is_aligned else 'Coloured'} by error"
         axes = columns[-1].panel(title, "", MAP_HEIGHT, left=34.0, right=40.0)
         draw_path(axes, score, view)
         columns[-1].numbers(
@@ -130,7 +127,7 @@ def _draw_maps(page: Page, score: Evaluation) -> None:
 
 
 def draw_path(axes: Axes, score: Evaluation, view: View) -> None:
-    """The aligned path by its error, the reference dashed upon it."""
+    """Draw the aligned path coloured by error, with the reference dashed."""
     error, path = score.position_error_m, view.project(score.estimate_m)
     stride = max(1, len(error) // MAX_PATH_POINTS)
     scatter_points = axes.scatter(
@@ -164,7 +161,7 @@ def _set_map_frame(axes: Axes, view: View) -> None:
 
 
 def _draw_panels(page: Page, score: Evaluation) -> None:
-    """APE over time and over distance; RPE per delta."""
+    """Draw the panels: APE over time and distance, RPE per delta."""
     left, right = halves()
     axes = left.panel("APE over time (m)", "", PANEL_HEIGHT)
     draw_ape(axes, score, *time_from_start(score))
@@ -182,7 +179,7 @@ def _draw_panels(page: Page, score: Evaluation) -> None:
 
 
 def draw_ape(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
-    """APE with its statistics as lines; thinned to its extremes, no gap in time is crossed."""
+    """Draw the APE with its statistics as horizontal lines, interrupted at gaps in time."""
     error, low, high = score.position_error_m, float(along[0]), float(along[-1])
     shown_along, values = style.thin_series(along, error, style.MAX_POINTS_NARROW)
     gap_indices = np.searchsorted(shown_along, along[_gap_indices(score.time_s)])
@@ -202,7 +199,7 @@ def draw_ape(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
 
 
 def _draw_rpe(axes: Axes, score: Evaluation) -> None:
-    """RMSE of the RPE of every delta, with its 95 % interval."""
+    """Draw the RPE (RMSE) of each delta with its 95 % interval."""
     for place, (error, statistics) in enumerate(known := _known_rpe(score)):
         if isinstance(error.interval_m, Interval):
             ends = error.interval_m.low, error.interval_m.high
@@ -220,19 +217,19 @@ def _known_rpe(score: Evaluation) -> list[tuple[PairwiseError, Statistics]]:
 
 
 def time_from_start(score: Evaluation) -> tuple[Array, str]:
-    """Time of each pose on the page, and what its axis is called."""
+    """Return the time of each pose as drawn (s), and the axis label."""
     zero = time_origin_s(score)
     return score.time_s - zero, "time from the first pose (s)" if zero else "time (s)"
 
 
 def _gap_indices(time_s: Array) -> IntArray:
-    """Indices of the poses after a gap in time."""
+    """Return the indices of the poses after a gap in time."""
     steps = np.diff(time_s)
     return np.asarray(np.flatnonzero(steps > MIN_GAP_STEPS * np.median(steps)) + 1)
 
 
 def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None:
-    """A path on a map, shape (n, 2), thinned evenly; no gap in time is crossed."""
+    """Draw a path, shape (n, 2), reduced to MAX_PATH_POINTS and interrupted at gaps in time."""
     gaps = _gap_indices(time_s)
     evenly_spaced = np.linspace(0, len(positions) - 1, min(len(positions), MAX_PATH_POINTS)).astype(
         np.intp
@@ -243,11 +240,11 @@ def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None
     )
 
 
-# ---------------------------------------------------------------------------------------- words
+# ---------------------------------------------------------------------------------------- text
 
 
 def format_metres(value: float) -> str:
-    """A length with the digits that matter.
+    """Format a length with three decimals, one from 10 m on.
 
     >>> format_metres(0.0512), format_metres(31.26)
     ('0.051 m', '31.3 m')
@@ -256,28 +253,28 @@ def format_metres(value: float) -> str:
 
 
 def time_origin_s(score: Evaluation) -> float:
-    """Where times on the page count from: the first pose where stamps are UNIX time, else zero."""
+    """Return the origin of the time axes: the first pose if timestamps are UNIX time, else 0 s."""
     start = float(score.time_s[0])
     return start if start > SMALLEST_STAMP_S else 0.0
 
 
 def summary(score: Evaluation) -> str:
-    """The score in one sentence."""
+    """Summarise ATE and largest error in one line."""
     worst_index = int(np.argmax(score.position_error_m))
     aligned = "without" if score.alignment == "none" else "after"
     return (
-        f"{score.estimate.name} is {format_metres(score.ate.translation_m.rmse)} (RMSE) from "
-        f"{score.reference.name} {aligned} alignment; farthest, "
-        f"{format_metres(score.ate.translation_m.max)}, at {score.time_s[worst_index] - time_origin_s(score):.1f} s, "
-        f"{score.distance_m[worst_index]:.1f} m along."
+        f"ATE {format_metres(score.ate.translation_m.rmse)} (RMSE {aligned} alignment). Largest "
+        f"error {format_metres(score.ate.translation_m.max)} at "
+        f"{score.time_s[worst_index] - time_origin_s(score):.1f} s, after "
+        f"{score.distance_m[worst_index]:.1f} m of the path."
     )
 
 
 def write_evaluation(page: Page, score: Evaluation) -> None:
-    """Write what was scored and how, and the statistics of all errors."""
+    """Write estimate, reference, method and the table of error statistics."""
     page.labelled("Estimate", describe_track(score.estimate))
     page.labelled("Against", describe_track(score.reference))
-    page.labelled("How", describe_score(score))
+    page.labelled("Method", describe_score(score))
     for text in score.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
     page.table(SCORE_HEAD, score_rows(score), right=range(1, len(SCORE_HEAD)))
@@ -285,7 +282,7 @@ def write_evaluation(page: Page, score: Evaluation) -> None:
 
 
 def score_rows(score: Evaluation) -> list[list[str]]:
-    """Of the ATE and every RPE: what :data:`SCORE_HEAD` says."""
+    """Return the table rows of the ATE and each RPE, with the columns of SCORE_HEAD."""
     errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": score.ate}
     errors |= {f"RPE {error.delta_words} (m)": error for error in score.rpe}
     rows = []
@@ -303,7 +300,7 @@ def score_rows(score: Evaluation) -> list[list[str]]:
 
 
 def missing_reasons(score: Evaluation) -> list[str]:
-    """Why a number is missing, each reason once."""
+    """Return a sentence per missing quantity with its reason, without repetitions."""
     quantities = [
         score.ate.interval_m,
         score.ate.rotation_deg,
@@ -316,27 +313,25 @@ def missing_reasons(score: Evaluation) -> list[str]:
 
 
 def unaligned_sentence(score: Evaluation) -> str:
-    """How far the two are apart as their numbers stand, and what the alignment took away."""
+    """Caption of the map before alignment: RMSE, and the transform of the alignment."""
     x, y = score.unaligned_m, score.reference_m
     rmse_m = float(np.sqrt(((x - y) ** 2).sum(axis=1).mean()))
     alignment = score.transform
-    scale_text = (
-        f", scaled {alignment.scale:.3g} times" if alignment.degrees_of_freedom == 7 else ""
-    )
+    scale_text = f", scale {alignment.scale:.3g}" if alignment.degrees_of_freedom == 7 else ""
     shift_m = float(np.linalg.norm(alignment.apply(x.mean(axis=0)) - x.mean(axis=0)))
     return (
-        f"As they stand {format_metres(rmse_m)} apart (RMSE). Turned by "
-        f"{np.degrees(alignment.rotation.magnitude()):.1f}°, moved {format_metres(shift_m)}{scale_text}: a choice "
-        "of frame, no error."
+        f"RMSE before alignment {format_metres(rmse_m)}. Alignment: rotation "
+        f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)}"
+        f"{scale_text} (choice of frame, not an error)."
     )
 
 
 def vertical_error_sentence(score: Evaluation, axis: int) -> str:
-    """How much of the squared error is vertical."""
+    """Caption of the side view: RMSE along the vertical axis and its share."""
     squares = ((score.estimate_m - score.reference_m) ** 2).mean(axis=0)
     name = AXES_OF_FRAME[score.reference.frame][axis]
     if not squares.any():
-        return f"There is no error along {name}."
+        return f"The error along {name} is zero."
     return (
         f"Along {name} the RMSE is {format_metres(float(np.sqrt(squares[axis])))}: "
         f"{squares[axis] / squares.sum():.0%} of the squared error."
@@ -344,7 +339,7 @@ def vertical_error_sentence(score: Evaluation, axis: int) -> str:
 
 
 def worst_moments_sentence(score: Evaluation) -> str:
-    """Whether a few moments decide."""
+    """Caption of the APE panel: share of the squared error in the worst 10 % of the poses."""
     squares = np.sort(score.position_error_m**2)
     worst = squares[-max(1, len(squares) // 10) :].sum() / max(squares.sum(), NEGLIGIBLE_M**2)
     return (
@@ -354,7 +349,7 @@ def worst_moments_sentence(score: Evaluation) -> str:
 
 
 def quarter_rmse(score: Evaluation) -> list[float]:
-    """RMSE over each quarter of the reference's path (m); fewer where one has no pose."""
+    """Return the RMSE (m) of each quarter of the reference path that contains poses."""
     along = score.distance_m
     edges = np.linspace(0.0, along[-1], 5)
     quarter_index = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, 3)
@@ -363,7 +358,7 @@ def quarter_rmse(score: Evaluation) -> list[float]:
 
 
 def quarters_sentence(score: Evaluation) -> str:
-    """Whether the error grows along the path."""
+    """Caption of the APE over distance: RMSE per quarter of the path."""
     found = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(score))
     return (
         f"RMSE per quarter of the path: {found} m. Drift grows along the path; after "
@@ -372,7 +367,7 @@ def quarters_sentence(score: Evaluation) -> str:
 
 
 def rpe_growth_sentence(rpe: tuple[PairwiseError, ...]) -> str:
-    """How the RPE grows with its delta, which tells noise from drift."""
+    """Caption of the RPE panel: growth of the RPE with delta, which separates noise from drift."""
     interval_note = "RMSE with its 95 % interval."
     rmse: dict[tuple[str, float], float] = {
         (error.unit, error.delta): error.translation_m.rmse
@@ -383,23 +378,23 @@ def rpe_growth_sentence(rpe: tuple[PairwiseError, ...]) -> str:
     unit = max(units, key=units.count, default="")
     deltas = sorted(delta for one, delta in rmse if one == unit)
     if len(deltas) < 2:
-        return f"{interval_note} A second distance would tell noise from drift."
+        return f"{interval_note} Give a second distance (--rpe) to distinguish noise from drift."
     low, high = deltas[0], deltas[-1]
     ratio, growth = high / low, rmse[unit, high] / rmse[unit, low]
     return (
-        f"{interval_note} From {low:g} to {high:g} {unit}, {ratio:.3g} times, the RMSE is {growth:.2g} times "
-        f"as large: 1 is noise of each pose, {np.sqrt(ratio):.2g} a random walk, {ratio:.3g} a "
-        "wrong scale or heading."
+        f"{interval_note} From {low:g} to {high:g} {unit} the RMSE grows {growth:.2g} times. "
+        f"Expected: 1 for independent noise, {np.sqrt(ratio):.2g} for a random walk, {ratio:.3g} "
+        "for a scale or heading error."
     )
 
 
 def format_interval(interval: Interval | Unavailable) -> str:
-    """An interval; nothing where there is none."""
+    """Format an interval as "low–high", "" if it is missing."""
     return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, Interval) else ""
 
 
 def describe_track(path: Trajectory) -> str:
-    """A trajectory by its name, what it is, its length in time and its frame."""
+    """Format name, kind, number of poses, duration and frame of a trajectory."""
     return (
         f"{path.name}: {path.kind}, {len(path)} poses over "
         f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
@@ -407,10 +402,10 @@ def describe_track(path: Trajectory) -> str:
 
 
 def describe_score(score: Evaluation) -> str:
-    """How a score was made, in one sentence."""
+    """Format alignment, association and time offset of a score on one line."""
     matched = score.association
     offset = score.time_offset.offset_s
-    clock = "" if not offset else f"; clocks matched by {offset:+.3f} s"
+    clock = "" if not offset else f"; time offset {offset:+.3f} s"
     return (
         f"alignment {score.alignment} ({score.alignment_reason.rstrip('.')}); "
         f"{matched.poses} pose pairs, {matched.coverage_estimate:.0%} of the "

@@ -1,6 +1,6 @@
-"""The flight along the main axis, both filters on one time axis: tracks, innovations, variances.
+"""Pages on the flight: position, velocity, innovations and σ of KF and EKF2 over time.
 
-Besides, a zoom into predict and update, and the other axes beside the main one.
+The main axis has two pages, with a zoom into prediction and update; the other axes share one.
 """
 
 from collections.abc import Iterator
@@ -20,15 +20,15 @@ from px4fuse.report.why import unexplained_note
 from px4fuse.report.words import filters_by_name, format_verdict, verdict_notes
 
 COLUMN_GAP = 14.0  # points between columns
-ZOOM_UPDATES = 15
+ZOOM_UPDATES = 15  # updates in the zoom
 MIN_ZOOM_S = 1.0
-ZOOM_HEIGHT = 125.0  # height of the axes in points
+ZOOM_HEIGHT = 125.0  # points; height of the axes
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw one page."""
+    """Draw the page on position and velocity along the main axis."""
     result = analysis.main
-    page = Page(f"The flight along {result.axis.called}")
+    page = Page(f"Position and velocity along {result.axis.called}")
     _write_legend(page, analysis)
     reference = panels.error_reference(result)
     shown_panels = [panels.POSITION, panels.VELOCITY]
@@ -40,29 +40,29 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         )
     page.write(unexplained_note(analysis), above=6.0)
     if isinstance(reference, Unavailable):
-        page.write(f"No error is drawn: {reference.reason}. {reference.remedy}", above=6.0)
+        page.write(f"No error plot: {reference.reason}. {reference.remedy}", above=6.0)
     yield page
 
 
 def _write_legend(page: Page, analysis: Analysis) -> None:
-    """Write the legend of lines and marks that holds for all pages."""
+    """Write the legend of lines and marks, valid for all pages."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
     result = analysis.main
     lines: list[Artist] = [
         Line2D([], [], **{**style.MEASUREMENT_DOTS, "ms": 5.0}, label="measurement"),
-        Line2D([], [], **LINES["ours"], label="ours"),
-        Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="ours ±2σ"),
+        Line2D([], [], **LINES["KF"], label="KF"),
+        Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="KF ±2σ"),
     ]
-    for name, frame in (("EKF2", result.ekf2_state), ("truth", result.truth)):
+    for name, frame in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
         if isinstance(frame, pd.DataFrame):
             lines.append(Line2D([], [], **LINES[name], label=name))
     page.legend(lines, marks.legend_entries(analysis))
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw one page: innovations, σ_p and σ_v on one time axis, then a zoom."""
+    """Draw the page on innovations, σ_p and σ_v along the main axis, with a zoom."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.called}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
@@ -75,7 +75,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _draw_zoom(page: Page, analysis: Analysis) -> None:
-    """Predict and update, seen near."""
+    """Draw σ_p in each prediction and update of a short part of the flight."""
     result = analysis.main
     start_s, end_s = window = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
@@ -93,17 +93,17 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
     axes.set_xlabel(style.TIME_LABEL)
     symbols = []
     if isinstance(result.ekf2_innovations, pd.DataFrame):
-        symbols += ["triangle up just before an update", "down just after"]
+        symbols += ["triangle up before the update", "triangle down after"]
     if isinstance(result.ekf2_variance, pd.DataFrame):
         symbols.append("square as logged")
     ekf2 = f" EKF2: {', '.join(symbols)}." if symbols else ""
-    page.numbers(f"Line: our filter, predict and update; grey ticks: measurements.{ekf2}")
+    page.numbers(f"Line: KF. Grey ticks: measurements.{ekf2}")
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
-    """Part of the flight with about fifteen updates, near the middle of what EKF2 logged too.
+    """Return start and end (s) of the zoom, with about ZOOM_UPDATES updates.
 
-    That middle is a measurement, so that the part does not lie in a gap of the source.
+    It is centred on the middle measurement (of EKF2's, if logged), so it avoids gaps.
     """
     times = result.replay.updates.index.to_numpy()
     if len(times) < 2:
@@ -119,10 +119,10 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
 
 
 def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
-    """σ_p with both values at each update, just before and just after."""
+    """Draw σ_p with two values per update: before and after it."""
     updates, steps = result.replay.updates, result.replay.steps
     prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
-    # stable, so that the prior stands first at equal times
+    # a stable sort keeps the prior before the posterior at equal times
     variances = pd.concat([prior, posterior]).sort_index(kind="stable").loc[slice(*window)]
     axes.plot(
         variances.index, np.sqrt(variances), color=KF_COLOUR, lw=1.1, marker=".", ms=2.4, mew=0
@@ -140,16 +140,17 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
 
 
 def zoom_sentence(result: AxisComparison) -> str:
-    """What to see in the zoom."""
+    """Caption of the zoom: σ_p before and after an update, for KF and EKF2."""
     texts = []
     for name, one in filters_by_name(result).items():
         before, after = one.sigma_p_before_update_m, one.sigma_p_after_update_m
         if before is None or after is None:
-            texts += ["EKF2: S or R not logged, so no before and after"] if name == "EKF2" else []
+            if name == "EKF2":
+                texts.append("EKF2: S or R not logged, so σ before and after the update is unknown")
             continue
         shrink = 1.0 - after**2 / before**2
         shrinks = f"{name} {before:.3f} to {after:.3f} m, {shrink:.0%} of the variance"
-        if name == "ours":
+        if name == "KF":
             shrinks = (
                 "σ grows in each prediction (SIGMA_A "
                 f"{result.replay.settings.sigma_a_m_s2:g} m/s²) and decreases with each "
@@ -160,7 +161,7 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the axes that the core leaves out, a column each; no page where there is but one."""
+    """Draw the other axes, one column each; no page if the comparison has one axis only."""
     others = analysis.others
     if not others:
         return
@@ -171,13 +172,13 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 3)
     columns = [Page(width=width) for _ in others]
     for column, result in zip(columns, others, strict=True):
-        verdicts = ", ".join(
+        verdicts = "; ".join(
             f"{name} {format_verdict(one)}" for name, one in filters_by_name(result).items()
         )
         if isinstance(result.difference, Difference):
-            verdicts += f"; {result.difference.position_rmse_m:.3f} m RMS apart"
+            verdicts += f"; KF - EKF2 {result.difference.position_rmse_m:.3f} m RMS"
         column.heading(result.axis.name)
-        column.write(f"Innovation variance: {verdicts}.", size=7.5)
+        column.write(f"{verdicts}.", size=7.5)
     page.beside(*columns, gap=COLUMN_GAP)
     shown_panels = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
     if any(isinstance(panels.error_reference(axis), pd.DataFrame) for axis in others):

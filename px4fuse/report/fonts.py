@@ -1,7 +1,6 @@
-"""Fonts for names and notes in every script: which of this machine draw a text, or what to install.
+"""Fonts for names and notes in any script: installed fonts for a text, and missing characters.
 
-Typst shapes text, so that Arabic joins, Devanagari orders and Thai stacks as they should. What it
-needs is a font that has the characters.
+Typst shapes the text (Arabic, Devanagari, Thai); it only needs fonts with the characters.
 """
 
 from functools import cache
@@ -10,17 +9,17 @@ from pathlib import Path
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
-# Matplotlib's own, always there: Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
+# Installed with matplotlib; has Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
-# These have a box for every character
+# Parts of the names of fonts that draw a box for every character
 BOX_FONTS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
-MAX_SHOWN = 12
+MAX_SHOWN = 12  # characters listed in the advice
 
 
 @cache
 def font_of(character: str) -> str | None:
-    """The font that draws a character: DejaVu Sans, else the first of the machine that has it."""
+    """Return the font for a character: DejaVu Sans, else the first installed one, or None."""
     if ord(character) in _characters(font_manager.findfont(FONT)):
         return FONT
     return next(
@@ -29,25 +28,25 @@ def font_of(character: str) -> str | None:
 
 
 def font_names(text: str) -> list[str]:
-    """Fonts that draw a text, DejaVu Sans first."""
+    """Return the fonts needed for a text, DejaVu Sans first."""
     names = [font_of(character) for character in _non_ascii(text)]
     return list(dict.fromkeys([FONT, *(name for name in names if name is not None)]))
 
 
 def font_folders(names: tuple[str, ...]) -> list[str]:
-    """Folders that hold the files of some fonts."""
+    """Return the folders of the files of the named fonts."""
     paths = {name: path for name, path in _other_fonts() if name in names} if len(names) > 1 else {}
     font_files = [font_manager.findfont(FONT), *paths.values()]
     return list(dict.fromkeys(str(Path(str(path)).parent) for path in font_files))
 
 
 def missing_characters(text: str) -> str:
-    """Characters of a text that no font of this machine has, each once."""
+    """Return the characters of a text that no installed font has, each once."""
     return "".join(character for character in _non_ascii(text) if font_of(character) is None)
 
 
 def font_advice(characters: str) -> str:
-    """What to install for :func:`missing_characters` characters, as one sentence or two."""
+    """Format the advice to install a font for missing characters."""
     shown = characters[:MAX_SHOWN] + ("…" if len(characters) > MAX_SHOWN else "")
     return (
         f"No installed font has the characters {shown}; the report shows {NO_GLYPH} "
@@ -62,14 +61,14 @@ def _non_ascii(text: str) -> list[str]:
 
 @cache
 def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
-    """Every other font of the machine, also those newer than matplotlib's own list."""
+    """Return names and paths of the other installed fonts, preferred ones first."""
     manager = font_manager.fontManager
     known = {str(entry.fname) for entry in manager.ttflist}
     for path in sorted(set(font_manager.findSystemFonts()) - known):
         try:
             manager.addfont(path)
         except (OSError, RuntimeError, NotImplementedError):
-            continue  # what matplotlib cannot read draws nothing
+            continue  # a font that matplotlib cannot read is not used
     entries = [
         entry
         for entry in manager.ttflist
@@ -81,10 +80,9 @@ def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
 
 
 def _sort_key(entry: FontEntry) -> tuple[object, ...]:
-    """Those of Noto first, then without serifs, then the most regular.
+    """Sort key: Noto Sans first, then sans serif, then regular weight; PostScript outlines last.
 
-    Those with PostScript outlines come late: they are embedded as if they were TrueType, and not
-    every viewer forgives that.
+    PostScript outlines are embedded as TrueType, which some PDF viewers do not display.
     """
     weight = entry.weight if isinstance(entry.weight, int) else 400
     postscript = str(entry.fname).lower().endswith(".otf")

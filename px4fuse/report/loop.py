@@ -1,4 +1,4 @@
-"""Loop: the path before and after, the closure error, and scores of every correction."""
+"""Page on a loop: closure error, corrected paths, and scores of each correction."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -25,7 +25,13 @@ from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import Interval, Statistics
 
-MAX_ROWS = 10  # of rejected closures
+LEAD = (
+    "The closure error is the distance between the end of the odometry and the true end. Each "
+    "correction distributes it along the path: by distance (positions only as in Example 2 of the "
+    "lesson, or headings too), or by pose graph optimisation. Each closure is tested first: a "
+    "false one would deform the whole path."
+)
+MAX_ROWS = 10  # rejected closures listed on the terminal
 GREEN, RED = "#3a7d5c", style.SEVERITY_COLOURS["error"]
 PATH_STYLES: Mapping[str, dict[str, Any]] = {
     corrections.UNCORRECTED: {"color": EKF2_COLOUR, "lw": 1.1, "ls": (0, (4, 1.6))},
@@ -36,56 +42,38 @@ PATH_STYLES: Mapping[str, dict[str, Any]] = {
 }
 TRACK_KINDS = {
     "vio": "odometry (external vision)",
-    "ekf2": "EKF2's track",
-    "kf": "our filter's track",
+    "ekf2": "EKF2 track",
+    "kf": "KF track",
     "truth": "ground truth",
-    "slam": "a SLAM system's trajectory",
-    "unknown": "a trajectory",
+    "slam": "SLAM trajectory",
+    "unknown": "trajectory of unknown kind",
 }
 CLOSURE_HEAD = (
-    "same place at",
-    "missed\nby (m)",
+    "closure",
+    "distance\n(m)",
     "d²",
-    "dof",
+    "degrees of\nfreedom",
     "p",
     "gate",
     "DCS\nweight",
     "GNC\nweight",
 )
 TITLE = "Loop closure"
-MAP_POINTS = 2000
-MAP_HEIGHT, LEGEND_HEIGHT = 290.0, 38.0  # of the axes, and of the legend below them, in points
+MAP_POINTS = 2000  # drawn points per path
+MAP_HEIGHT, LEGEND_HEIGHT = 290.0, 38.0  # points; axes, and legend below them
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the loop's page; none where the flight holds no loop."""
+    """Draw the appendix page if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(
-            appendix(TITLE),
-            (
-                "The closure error is the distance between the end of the odometry and the "
-                "true end. Each correction distributes it along the path: by distance "
-                "(positions only as in Example 2 of the lesson, or headings too), or by "
-                "pose graph optimisation. Each closure is tested first: a false one would "
-                "deform the whole path."
-            ),
-        )
+        page = Page(appendix(TITLE), LEAD)
         _write_page(page, analysis.loop)
         yield page
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the page of a report on a loop alone, with its findings."""
-    page = Page(
-        TITLE,
-        (
-            "The closure error is the distance between the end of the odometry and the "
-            "true end. Each correction distributes it along the path: by distance "
-            "(positions only as in Example 2 of the lesson, or headings too), or by "
-            "pose graph optimisation. Each closure is tested first: a false one would "
-            "deform the whole path."
-        ),
-    )
+    """Draw the page of ``px4fuse loop``, with its findings."""
+    page = Page(TITLE, LEAD)
     if student := student_line(results.student, ", "):
         page.labelled("Student", student)
     page.labelled("SHA-256", loop.odometry.trajectory.sha256)
@@ -94,7 +82,7 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
-    """Write what was found, the map, and the scores; as many sheets as that takes."""
+    """Write the results, the map, the closures and the scores."""
     write_loop(page, loop, findings)
     _draw_map(page, loop)
     page.heading("Closures and scores", 10.5, above=14.0)
@@ -110,13 +98,13 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
 
 
 def shown_paths(loop: Loop) -> list[CorrectedPath]:
-    """The paths that are drawn: each kind of correction once."""
+    """Return the corrected paths that the map shows, one per kind of correction."""
     return [part for part in loop.reported_paths if part.name in PATH_STYLES]
 
 
 def _draw_map(page: Page, loop: Loop) -> None:
     axes = page.panel(
-        "From above, in the odometry's frame", "", MAP_HEIGHT, left=36.0, below=LEGEND_HEIGHT
+        "Map in the frame of the odometry", "", MAP_HEIGHT, left=36.0, below=LEGEND_HEIGHT
     )
     draw_map(axes, loop)
     below = -(TICKS_HEIGHT + AXIS_LABEL_HEIGHT + 2.0) / MAP_HEIGHT
@@ -124,7 +112,7 @@ def _draw_map(page: Page, loop: Loop) -> None:
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:
-    """Every path from above, where it ended, and where it should have."""
+    """Draw each path from above, with the end of the odometry and the true end."""
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _draw_reference(axes, loop)
@@ -134,31 +122,34 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     start, end = path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
     axes.plot(
-        *end, "s", color=EKF2_COLOUR, mec="black", mew=0.6, ms=5, label="end by odometry", zorder=5
+        *end, "s", color=EKF2_COLOUR, mec="black", mew=0.6, ms=5, label="end of odometry", zorder=5
     )
     if loop.closure_error_axes_m is not None:
         true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
         arrow = {"arrowstyle": "->", "color": RED, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
         axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow)
-        axes.plot([], [], color=RED, lw=1.2, label=f"gap {loop.closure_error_m:.2f} m")
-        axes.plot(*true_end, "x", color=RED, ms=5, mew=1.2, zorder=6, label="where it really ended")
+        label = f"closure error {loop.closure_error_m:.2f} m"
+        axes.plot([], [], color=RED, lw=1.2, label=label)
+        axes.plot(*true_end, "x", color=RED, ms=5, mew=1.2, zorder=6, label="true end")
     set_map_axes(axes, names[1], names[0])
 
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
-    """The first reference in the odometry's frame, placed by the best correction there is."""
+    """Draw the first reference, aligned to the odometry's frame with the best correction."""
     for reference in loop.references[:1]:
         score = loop.best.scores.get(reference.name)
         if isinstance(score, Evaluation):
             at = score.transform.apply_inverse(score.reference_m)[:, (1, 0)]
-            plot_path(axes, at, score.time_s, label=reference.name, **LINES["truth"], zorder=4)
+            plot_path(
+                axes, at, score.time_s, label=reference.name, **LINES["ground truth"], zorder=4
+            )
 
 
-# ---------------------------------------------------------------------------------------- words
+# ---------------------------------------------------------------------------------------- text
 
 
 def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
-    """What was found about a loop."""
+    """Make the terminal page of a loop: results, scores and findings."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
@@ -168,7 +159,7 @@ def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
 
 
 def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
-    """Write what was found, with every path, how far it moved, and its ATE to each reference."""
+    """Write closure error, gate, and a table of the corrected paths with their ATE."""
     path = loop.odometry.trajectory
     track_text = (
         f"{path.name}: {TRACK_KINDS[path.kind]}, {len(path)} poses, "
@@ -178,7 +169,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     page.labelled("Part", f"{_format_span(loop)}, {loop.part_reason}")
     page.labelled("Closure", describe_closure_error(loop))
     end = loop.known_end
-    page.labelled("End", "not used" if isinstance(end, Unavailable) else end.source)
+    page.labelled("True end", "not used" if isinstance(end, Unavailable) else end.source)
     for closure in loop.closures[:1]:
         page.labelled("Gate", describe_gate(closure))
     single = SINGLE_LOOP if len(loop.closures) == 1 else ""
@@ -188,7 +179,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         write_finding(page, group)
     names = [reference.name for reference in loop.references]
     page.table(
-        ["path", "moved RMS\n/ max (m)", *(f"ATE to\n{name} (m)" for name in names)],
+        ["path", "correction\nRMS / max (m)", *(f"ATE against\n{name} (m)" for name in names)],
         [
             [
                 part.name,
@@ -212,7 +203,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
 
 
 def write_scores(page: Page, loop: Loop) -> None:
-    """Write every closure with its gate and weights, RPE, and how scores were made."""
+    """Write the tables of closures (gate and weights) and RPE, and the method of the scores."""
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
@@ -257,30 +248,30 @@ def write_scores(page: Page, loop: Loop) -> None:
 
 def _format_span(part: Loop) -> str:
     if part.start_s > SMALLEST_STAMP_S:
-        return f"{part.end_s - part.start_s:.1f} s from stamp {part.start_s:.2f} s"
+        return f"{part.end_s - part.start_s:.1f} s from timestamp {part.start_s:.2f} s"
     return f"{part.start_s:.1f} s to {part.end_s:.1f} s"
 
 
 def describe_closure_error(loop: Loop) -> str:
-    """The closure error in m, in percent, per axis and in heading."""
+    """Format the closure error in m, in percent of the path, per axis and in heading."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
-        return f"path {loop.path_length_m:.1f} m; no closure error is stated: it did not come back"
+        return f"path {loop.path_length_m:.1f} m; no closure error: the loop is open (--open)"
     text = (
-        f"{error:.2f} m after {loop.path_length_m:.1f} m = {error / loop.path_length_m:.2%} "
-        f"({format_vector(misclosure)})"
+        f"{error:.2f} m after {loop.path_length_m:.1f} m ({error / loop.path_length_m:.2%}): "
+        f"{format_vector(misclosure)}"
     )
     heading_deg = loop.heading_error_deg
     if isinstance(heading_deg, Unavailable):
-        return f"{text}; heading: not known, {heading_deg.reason}"
-    return f"{text}; heading {heading_deg:+.1f}°"
+        return f"{text}; heading error unknown: {heading_deg.reason}"
+    return f"{text}; heading error {heading_deg:+.1f}°"
 
 
 def describe_gate(closure: Closure) -> str:
-    """What the gate says about one closure."""
-    verdict = "as the stated drift allows"
+    """Format the chi-square test of one closure."""
+    verdict = "accepted (consistent with the stated drift)"
     if not closure.accepted:
-        verdict = "REJECTED: the drift cannot explain it"
+        verdict = "REJECTED (not explained by the stated drift)"
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
         f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
@@ -288,7 +279,7 @@ def describe_gate(closure: Closure) -> str:
 
 
 def closure_name(closure: Closure, loop: Loop) -> str:
-    """Which closure; long stamps count from the first pose."""
+    """Format the two times of a closure; UNIX timestamps are counted from the first pose."""
     if closure.source == LANDING:
         return "take-off and landing"
     zero = loop.start_s if loop.start_s > SMALLEST_STAMP_S else 0.0
@@ -296,13 +287,13 @@ def closure_name(closure: Closure, loop: Loop) -> str:
 
 
 def by_distance_sentence(loop: Loop) -> str:
-    """What the corrections by distance are; nothing where there is none."""
+    """Explain the corrections by distance; "" if the loop has none."""
     if "by_distance_plain" not in loop.paths:
         return ""
     heading_deg = loop.heading_error_deg
-    headings = "Headings too: each step is first turned back by its share of the heading error."
+    headings = "Headings too: each step is also rotated by its share of the heading error."
     if isinstance(heading_deg, Unavailable):
-        headings = f"Headings are not turned: {heading_deg.reason}."
+        headings = f"The correction of headings is missing: {heading_deg.reason}."
     return (
         "By distance, positions only (Example 2 of the lesson): each position moves "
         f"by its share of the closure error; headings are not corrected. {headings}"
@@ -310,7 +301,7 @@ def by_distance_sentence(loop: Loop) -> str:
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    """Why a correction is missing, each reason once."""
+    """Return the missing corrections with their reasons, without repetitions."""
     unavailable = [p for p in loop.corrections.values() if isinstance(p, Unavailable)]
     reasons = [f"{p.what}: {p.reason}" for p in unavailable]
     return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
@@ -323,7 +314,7 @@ def _format_ate(score: Evaluation | Unavailable) -> str:
 
 
 def _format_error(translation: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
-    """RMSE of an error, in brackets its interval where there is one."""
+    """Format an RMSE, with its 95 % interval in brackets if available."""
     interval_text = format_interval(interval)
     return _format_rmse(translation) + (f" ({interval_text})" if interval_text else "")
 
@@ -333,14 +324,14 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 
 def format_correction(correction: CorrectedPath) -> str:
-    """How far the poses moved."""
+    """Format RMS and maximum (m) of a correction."""
     if not correction.moved_max_m:
         return "–"
     return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
 
 
 def graph_summary(solved: SolvedGraph) -> Page:
-    """How a pose graph was solved, and the closures that the gate rejects."""
+    """Make the terminal page of a pose graph: gate, solver and costs."""
     page = Page()
     page.labelled(
         "Graph",
@@ -351,20 +342,22 @@ def graph_summary(solved: SolvedGraph) -> Page:
     )
     gates = solved.gates
     if isinstance(gates, Unavailable):
-        page.labelled("Gate", f"none: {gates.reason}")
+        page.labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:
-        page.labelled("Gate", "no closures to judge: every edge is odometry")
+        page.labelled("Gate", "no closures to test: every edge is odometry")
     else:
         rejected = [gate for gate in gates if not gate.accepted]
         lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected[:MAX_ROWS]]
         lines += [f"and {len(rejected) - MAX_ROWS} more"] if len(rejected) > MAX_ROWS else []
-        page.labelled("Gate", f"rejects {len(rejected)} of {len(gates)} closures", *lines)
+        page.labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *lines)
     if len(solved.solutions) == 1 and (~solved.graph.successive).sum() > MAX_ROBUST_CLOSURES:
-        page.labelled("Robust", "left out for so many closures: --robust takes minutes")
+        page.labelled(
+            "Robust", "not solved for this many closures; add --robust (takes some minutes)"
+        )
     unsolved = [SOLUTIONS[key] for key, one in solved.solutions.items() if not one.converged]
     if unsolved:
         page.labelled(
-            "Solver", f"not converged: {', '.join(unsolved)}. Its cost is not the minimum"
+            "Solver", f"not converged: {', '.join(unsolved)}. The cost is not at its minimum."
         )
     rows = [
         [
@@ -376,6 +369,6 @@ def graph_summary(solved: SolvedGraph) -> Page:
         ]
         for key, solution in solved.solutions.items()
     ]
-    head = ("path", "cost before", "cost", "iterations", "closures dropped")
+    head = ("path", "initial cost", "final cost", "iterations", "dropped closures")
     page.table(head, rows, right=(1, 2, 3, 4))
     return page

@@ -1,4 +1,4 @@
-"""What happened, drawn the same way on every time axis: gaps, modes, resets, rejections."""
+"""Events drawn on all time axes: gaps, flight modes, resets, rejections, outliers."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,8 +11,8 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
 from px4fuse.report.style import EKF2_REJECTED, MUTED_COLOUR, Artist, Axes, label_time_axis
 
-# Bands differ in grey by hatch and depth; marks stand on lines at the foot of the axes, resets
-# hang from their top
+# Bands differ in shade and hatching, so they remain distinct in grey. Marks are at the bottom of
+# the axes, resets at the top
 GROUND_BAND: dict[str, Any] = {"facecolor": "#e4e4e4", "edgecolor": "none", "lw": 0.0}
 GAP_BAND: dict[str, Any] = {
     "facecolor": "#fbfbfb",
@@ -33,14 +33,14 @@ OUTLIER_MARK: dict[str, Any] = {
 TAKE_OFF_MARK: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
 LANDING_MARK: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
 REJECTED_HEIGHT, OUTLIER_HEIGHT, RESET_HEIGHT = 0.025, 0.075, 0.92
-STRIP_HEIGHT = 12.0  # points for the names of flight modes
-# Marks closer than this share of the segment fall on one another
+STRIP_HEIGHT = 12.0  # points; room for the names of flight modes
+# Share of the segment; of marks that are closer, only the first is drawn
 MIN_MARK_DISTANCE = 1.0 / 300.0
-STRIP_FONT_SIZE, STRIP_LETTER_WIDTH = 6.5, 4.0  # of the letters, and of one of them, in points
+STRIP_FONT_SIZE, STRIP_LETTER_WIDTH = 6.5, 4.0  # points
 
 
 class Mark(NamedTuple):
-    """What happened: bands of the whole height, or signs at a height of the axes."""
+    """Kind of event: bands over the full height (height None), or markers at a height (0 to 1)."""
 
     label: str
     spans_or_times: Sequence[Any] | Array
@@ -49,13 +49,13 @@ class Mark(NamedTuple):
 
 
 def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
-    """Each kind of mark; bands lie on those before them."""
+    """Return all kinds of marks in drawing order."""
     events = analysis.events
     modes = [(mode.start_s, mode.end_s) for mode in events.modes]
     return (
-        Mark("flight modes, in turn", modes[1::2], MODE_BAND),
+        Mark("flight modes (alternating)", modes[1::2], MODE_BAND),
         Mark("on the ground", events.ground, GROUND_BAND),
-        Mark("source silent", events.gaps, GAP_BAND),
+        Mark("gap in position source", events.gaps, GAP_BAND),
         Mark("log dropout", events.dropouts, DROPOUT_BAND),
         Mark("EKF2 rejected", rejected_s, EKF2_REJECTED, REJECTED_HEIGHT),
         Mark("outlier", outlier_times(analysis), OUTLIER_MARK, OUTLIER_HEIGHT),
@@ -68,18 +68,17 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
 def draw_marks(
     axes: Axes, analysis: Analysis, *, axis: str | None = None, strip: bool = False
 ) -> None:
-    """Mark what happened on a time axis, behind what is drawn there; it spans the segment.
+    """Draw the events behind the curves, and set the limits of the time axis to the segment.
 
     Parameters
     ----------
     axes : Axes
-        x is seconds since the first data.
+        x in seconds since the first data.
     analysis : Analysis
     axis : str, optional
-        Whose rejections to mark at the foot; by default the main axis. Empty for none, where the
-        axes show the rejected innovations themselves.
+        Axis of the rejections to mark, by default the main axis; "" for none.
     strip : bool
-        Name the flight modes above the axes.
+        Write the names of the flight modes above the axes.
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
@@ -101,7 +100,7 @@ def draw_marks(
             )
             mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
             markers = Line2D(visible_times, np.full(len(visible_times), height), **mark_style)
-            axes.add_artist(markers)  # which leaves the limits alone
+            axes.add_artist(markers)  # unlike add_line this does not change the limits
     if strip:
         _draw_mode_names(axes, analysis)
 
@@ -118,12 +117,12 @@ def panel(
     strip: bool = False,
     last: bool = True,
 ) -> Axes:
-    """A panel over the time of the flight, marked as by :func:`draw_marks`.
+    """Add a panel over time with the marks of :func:`draw_marks`.
 
     Parameters
     ----------
     last : bool
-        Whether it says what its x axis is; else another one below it does.
+        Label the time axis; False if a panel below it has the label.
     """
     strip = strip and bool(analysis.events.modes)
     axes = page.panel(title, sentence, height, above=max(above, STRIP_HEIGHT if strip else 0.0))
@@ -133,7 +132,7 @@ def panel(
 
 
 def outlier_times(analysis: Analysis) -> Array:
-    """Times of the measurements that tuning takes for outliers, of all its axes together."""
+    """Return the times (s) of the outliers that tuning found, horizontally or on the main axis."""
     names = HORIZONTAL, analysis.main.axis.name
     times_by_axis = [
         tuned.outlier_time_s
@@ -145,7 +144,7 @@ def outlier_times(analysis: Analysis) -> Array:
 
 
 def legend_entries(analysis: Analysis) -> list[Artist]:
-    """Legend entries of the kinds of marks that this flight has."""
+    """Return legend entries for the kinds of marks in this flight."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -158,14 +157,14 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
 
 
 def _visible_times(times: Any, min_interval_s: float) -> Array:
-    """Times without those that would be drawn on one another."""
+    """Return the first time in each interval, so that markers do not overlap."""
     values = np.asarray(times, dtype=np.float64)
     visible: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]
     return visible
 
 
 def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:
-    """Names of the flight modes above the axes, as far as each has room for its name."""
+    """Write the names of the flight modes above the axes if they fit."""
     low, high = axes.get_xlim()
     width = 72.0 * axes.bbox.width / axes.figure.dpi
     for mode in analysis.events.modes:

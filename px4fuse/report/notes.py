@@ -1,8 +1,7 @@
-"""The student's own words, from a Markdown file, as text: headings, lists, code and tables.
+"""Answer form and student notes: Markdown set as plain text, lists, code and tables.
 
-Mathematics between dollar signs becomes letters as far as these go (σ, ≤, √), a picture its
-description, and HTML loses its tags: nothing is printed as markup, nothing is loaded and nothing
-runs.
+Mathematics in dollar signs becomes Unicode text (σ, ≤, √), a picture becomes its description, and
+HTML tags are removed. Nothing is loaded or executed.
 """
 
 from __future__ import annotations
@@ -29,15 +28,16 @@ BODY_SIZE = 8.5
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # points
 MAX_INDENTS = 8
-# Levels of Markdown; each takes three levels of Python's stack, which has 1000
+# Levels of nesting; each takes three levels of Python's stack, which has 1000
 MOST_NESTED = 100
 TABLE_SIZE = 8.0
-# $ opens before what is no space and closes after it, not before a digit: prices stay prices
+# An opening $ has no space after it, a closing $ no space before and no digit after it, so prices
+# such as $5 and $10 are not mathematics
 MATHS_PATTERN = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
 COMMAND_PATTERN = re.compile(r"\\([A-Za-z]+|.)")
 FRACTION_PATTERN = re.compile(r"\\frac\s*\{([^{}]*)\}\s*\{([^{}]*)\}")
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
-# Commands of TeX that HTML has no entity of the same name for, or another one
+# TeX commands without an HTML entity of the same name and meaning
 SYMBOLS = {
     "cdot": "·",
     "sqrt": "√",
@@ -63,20 +63,20 @@ SYMBOLS = {
 
 
 def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
-    """Draw as many pages as the form and the notes need; none without both."""
-    title, answers = "What the student found", results.student.answers
+    """Draw the answer form and the notes; no page if the report has neither."""
+    title, answers = "Student notes", results.student.answers
     page = Page(appendix(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):
-        page.heading("The form, as it was filled in")
+        page.heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]
-        page.table(("Asked", "Answer"), rows, shares=[3.0, 4.0], size=TABLE_SIZE)
+        page.table(("Question", "Answer"), rows, shares=[3.0, 4.0], size=TABLE_SIZE)
     write(page, results.student.notes)
     if len(page.blocks) > 1:
         yield page
 
 
 def write(page: Page, notes: str) -> None:
-    r"""Write Markdown on a page, without its marks.
+    r"""Write Markdown on a page as plain text.
 
     >>> page = Page()
     >>> write(page, "# A *b*\n\n- $\\sigma_z^2$ is `R`\n\n![a map](m.png)")
@@ -89,20 +89,20 @@ def write(page: Page, notes: str) -> None:
 
 
 def parse(notes: str, name: str = "the notes") -> list[Token]:
-    """Parse Markdown into tokens that can be drawn.
+    """Parse Markdown into tokens.
 
     Parameters
     ----------
     notes : str
     name : str
-        For the message.
+        Name of the text in error messages.
 
     Raises
     ------
     SettingsError
-        Emphasis, lists and quotes are nested more than :data:`MOST_NESTED` deep.
+        Emphasis, lists and quotes are nested deeper than :data:`MOST_NESTED`.
     """
-    # the parser costs a fiftieth of a second: not where there are no notes
+    # imported here because it takes 20 ms, which reports without notes save
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
@@ -112,14 +112,14 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
     depth = max(accumulate(token.nesting for token in every), default=0)
     if depth > MOST_NESTED:
         raise SettingsError(
-            f"{name}: nested {depth} deep, at most {MOST_NESTED} are drawn",
-            "Take repeated * and _ out.",
+            f"{name}: {depth} levels of nesting, at most {MOST_NESTED} are allowed",
+            "Remove repeated * and _.",
         )
     return tokens
 
 
 def _write_blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = "") -> None:
-    """Write what a node holds, the mark of a list before the first line of it."""
+    """Write the children of a node, with the list mark before the first line."""
     indent = INDENT * min(indents, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
@@ -148,7 +148,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = ""
                 page.write(
                     TAG_PATTERN.sub("", child.content).strip(), size=BODY_SIZE, indent=indent
                 )
-            case _:  # also a rule across, which says nothing
+            case _:  # paragraphs; a horizontal rule has no text
                 above = 0.0 if mark else 2.0
                 page.write(
                     _inline_text(child), size=BODY_SIZE, indent=indent, mark=mark, above=above
@@ -157,7 +157,7 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = ""
 
 
 def _inline_text(node: SyntaxTreeNode) -> str:
-    """Words of a block without their marks."""
+    """Return the text of a block without Markdown marks."""
     return "".join(map(_node_text, node.children))
 
 
@@ -172,14 +172,14 @@ def _node_text(node: SyntaxTreeNode) -> str:
         case "image":
             return f"[picture: {node.content}]" if node.content else "[picture]"
         case "link":
-            words, address = _inline_text(node), str(node.attrs.get("href", ""))
-            return words if words in (address, "") else f"{words} ({address})"
+            label, address = _inline_text(node), str(node.attrs.get("href", ""))
+            return label if label in (address, "") else f"{label} ({address})"
         case _:
             return _inline_text(node)
 
 
 def _parse_maths(state: StateInline, silent: bool) -> bool:
-    """Mathematics in dollar signs, as a rule of the parser: code and escapes come before it."""
+    """Parser rule for mathematics in dollar signs; code and escapes take precedence."""
     maths_match = MATHS_PATTERN.match(state.src, state.pos)
     if maths_match is None:
         return False
@@ -190,12 +190,12 @@ def _parse_maths(state: StateInline, silent: bool) -> bool:
 
 
 def _tex_to_text(maths: str) -> str:
-    """TeX as letters, as far as letters go."""
+    """Convert TeX to Unicode text as far as possible."""
     text = COMMAND_PATTERN.sub(_symbol, FRACTION_PATTERN.sub(r"(\1)/(\2)", maths))
     return text.translate(str.maketrans("{}~", "() "))
 
 
 def _symbol(command_match: re.Match[str]) -> str:
-    """Greek letters and most signs are called as in HTML."""
+    """Return the character of a TeX command; most names equal those of HTML entities."""
     name = command_match[1]
     return SYMBOLS[name] if name in SYMBOLS else html5.get(f"{name};", name)

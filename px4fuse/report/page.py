@@ -1,7 +1,7 @@
-"""What is shown, as data: titles, sentences, tables and panels in order.
+"""Pages as data: ordered blocks of titles, text, tables and panels.
 
-``report.typ`` sets a page as PDF, :mod:`px4fuse.report.screen` prints its words and tables on the
-terminal. Text from outside (names, notes) is data too, and is never read as markup.
+``report.typ`` sets them as PDF, :mod:`px4fuse.report.screen` prints text and tables on the
+terminal. Text from outside (names, notes) is data and is never interpreted as markup.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from typing import Any
 
 from px4fuse.report.style import MUTED_COLOUR, Artist, Axes
 
-# Points: width of the text, of the numbers beside an axes, of the labels before sentences
+# points; width of the text, of the tick labels left of axes, of the labels before texts
 PAGE_WIDTH, AXIS_LEFT, LABEL_WIDTH = 512.0, 26.0, 52.0
-# Points below an axes for its numbers, and for its label
+# points; room below axes for tick labels, for the axis label, and without both
 TICKS_HEIGHT, AXIS_LABEL_HEIGHT, BARE_HEIGHT = 12.0, 11.0, 3.0
-ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"  # though not printable by themselves
-# What has no place to break a line: PDF/A takes no string of 32,768 characters, and no page a line
+ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"  # kept, although str.isprintable is False
+# Words without a possible line break are split: PDF/A limits strings to 32,767 characters
 LONG_WORD = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
 Block = dict[str, Any]
 Cell = str | tuple[str, str]
 
 
 class Page:
-    """A part of a report that begins on a new page, or a column of one.
+    """A part of a report that begins on a new page, or a column of a page.
 
     Attributes
     ----------
     blocks : list of Block
-        What was written, in order; panels hold their figures until :func:`data`.
+        Content in order; panels contain their figures until :func:`data` converts them.
     """
 
     def __init__(self, title: str = "", lead: str = "", *, width: float = PAGE_WIDTH) -> None:
@@ -40,7 +40,7 @@ class Page:
             self.add("title", text=title, lead=lead)
 
     def add(self, kind: str, **fields: Any) -> Block:
-        """Add a block of a kind that ``report.typ`` knows."""
+        """Add a block of a kind that ``report.typ`` sets, and return it."""
         self.blocks.append({"kind": kind, **fields})
         return self.blocks[-1]
 
@@ -55,7 +55,7 @@ class Page:
         indent: float = 0.0,
         mark: str = "",
     ) -> None:
-        """Write a paragraph, so many points below and to the right, with the mark of a list."""
+        """Write a paragraph; `above` and `indent` in points, `mark` before a list item."""
         if text or mark:
             styled_text = words(text, size, colour, bold)
             self.add("text", above=above, indent=indent, mark=mark, **styled_text)
@@ -65,7 +65,7 @@ class Page:
         self.add("heading", above=above, **words(text, size, bold=True))
 
     def numbers(self, text: str) -> None:
-        """Write the numbers of the panel above in small letters."""
+        """Write the numbers of the panel above in small print."""
         self.write(text, size=7.0, colour=MUTED_COLOUR, above=-1.0)
 
     def labelled(
@@ -78,13 +78,13 @@ class Page:
         colour: str = "black",
         bold: bool = True,
     ) -> None:
-        """Write a label, and beside it sentences, of which :func:`words` have their own looks."""
+        """Write a label with texts beside it; :func:`words` sets the style of a text."""
         styled_texts = [words(text, size) if isinstance(text, str) else text for text in texts]
         styled_label = words(label, size, colour, bold)
         self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=above)
 
     def advice(self, texts: Mapping[str, str], size: float = 8.0) -> None:
-        """Write sentences, each with its label."""
+        """Write labelled texts."""
         for label, text in texts.items():
             self.labelled(label, text, size=size)
 
@@ -104,9 +104,9 @@ class Page:
         head : sequence of str
         rows : sequence of sequence of str, or of (str, colour)
         shares : sequence of float, optional
-            Widths of the columns; by default as wide as their words, and the page is shared.
+            Relative widths of the columns; by default they follow the content.
         right : sequence of int
-            Columns of numbers, which stand at the right.
+            Right-aligned columns (numbers).
         """
         self.add("table", head=head, rows=rows, shares=shares, right=right, size=size)
 
@@ -121,16 +121,18 @@ class Page:
         right: float = 8.0,
         below: float = 0.0,
     ) -> Axes:
-        """Axes of the column's width below a title and the sentence that says what to see.
+        """Add axes as wide as the column, below a title and a caption; return them.
 
         Parameters
         ----------
+        say : str
+            Caption.
         height : float
-            Of the axes alone, in points.
+            Height of the axes alone (points).
         above, left, right, below : float
-            Points around the axes; below them those for ticks and label are added.
+            Margins of the axes (points); room for tick labels and axis label is added below.
         """
-        # matplotlib costs a third of a second: not where words alone are shown
+        # imported here because matplotlib takes 0.3 s, which text-only commands save
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
@@ -153,7 +155,7 @@ class Page:
         return axes
 
     def legend(self, *rows: Sequence[Artist]) -> None:
-        """Legend of several panels, a line for each row of entries."""
+        """Add a legend for several panels, one line per row of entries."""
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         visible_rows = [row for row in rows if row]
@@ -174,23 +176,23 @@ class Page:
         self.add("panel", title="", say="", alt=alt, width=self.width, figure=figure)
 
     def beside(self, *columns: Page, gap: float = 14.0, above: float = 6.0) -> None:
-        """Put columns beside one another, so many points below what stands above."""
+        """Set columns side by side; `gap` and `above` in points."""
         blocks, widths = [c.blocks for c in columns], [c.width for c in columns]
         self.add("beside", columns=blocks, widths=widths, gap=gap, above=above)
 
     def foot(self, part: Page) -> None:
-        """Put a part at the foot of this page; what does not fit above goes to the next one."""
+        """Set a part at the foot of this page; text that does not fit above it goes to the next."""
         self.add("foot", blocks=part.blocks)
 
 
 def halves(first: float = 0.5, gap: float = 14.0) -> tuple[Page, Page]:
-    """Two columns that share the width of a page."""
+    """Return two columns that share the width of a page; `first` is the share of the left one."""
     left = first * (PAGE_WIDTH - gap)
     return Page(width=left), Page(width=PAGE_WIDTH - gap - left)
 
 
 def words(text: str, size: float, colour: str = "black", bold: bool = False) -> Block:
-    """A sentence with its looks."""
+    """Return a text with its size (points), colour and weight."""
     return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
 
 
@@ -204,7 +206,7 @@ def appendix(title: str) -> str:
 
 
 def legend_above(axes: Axes, columns: int = 9, **options: Any) -> None:
-    """Legend of a panel in the line above its axes, at the right, where nothing lies beneath."""
+    """Draw the legend of a panel above its axes, at the right."""
     axes.legend(
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
@@ -217,7 +219,7 @@ def legend_above(axes: Axes, columns: int = 9, **options: Any) -> None:
 
 
 def replace_unprintable(text: str) -> str:
-    """Text without control characters or endless words, a white square for what no font draws."""
+    """Remove control characters, split long words, replace characters without a font by □."""
     from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     return "".join(
@@ -228,7 +230,7 @@ def replace_unprintable(text: str) -> str:
 
 
 def data(block: Any) -> Any:
-    """Blocks as Typst takes them: text that can be printed, and figures as SVG."""
+    """Convert blocks for Typst: printable text, and figures as SVG."""
     if isinstance(block, str):
         return replace_unprintable(block)
     if isinstance(block, Mapping):
@@ -250,10 +252,7 @@ def _figure_svg(block: Mapping[str, Any]) -> str:
 
 
 def _place_axes(block: Mapping[str, Any]) -> None:
-    """Give the axes of a panel their place, with room for the ticks and the label that they have.
-
-    The figure is as high as that asks for.
-    """
+    """Set figure height and axes position, with room for existing tick labels and axis label."""
     axes, width, height = block["axes"], block["width"], block["height"]
     left, right, below, above = block["around"]
     has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]

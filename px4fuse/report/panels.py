@@ -1,4 +1,4 @@
-"""What is drawn of one axis, for every page: each panel with its sentence and its numbers."""
+"""Panels over time for one axis, used by all pages: curves, caption and numbers."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capitalise_first
 from px4fuse.report import marks, style
 from px4fuse.report.page import Page
 from px4fuse.report.style import DOTS, LINES, Axes, draw_curve, draw_sigma_band, set_log_scale
 from px4fuse.report.words import filters_by_name, format_verdict
 
-NARROW_HEIGHT = 72.0  # points: height of the axes in a column of three
-# The axes of innovations reach this much beyond 2√S, or beyond 99 % of the innovations if that is
-# further, but not beyond so many √S; what lies outside is drawn at the edge and counted
+NARROW_HEIGHT = 72.0  # points; height of the axes in the three-column appendix
+# Half height of the innovation axes: EDGE_FACTOR times the larger of 2√S and the 99 % quantile,
+# the latter at most MAX_EDGE_SIGMAS √S. Innovations outside are drawn at the edge and counted
 EDGE_FACTOR, MAX_EDGE_SIGMAS = 1.3, 5.0
 
 
 class Quantity(NamedTuple):
-    """What both filters estimate: its unit, and where it and its errors stand."""
+    """Estimated quantity: its unit, and the columns and fields that contain it."""
 
     unit: str
     column: str
@@ -44,7 +43,7 @@ VELOCITIES = Quantity(
 
 
 class Panel(NamedTuple):
-    """A panel over time: how it is drawn, and what is said above and below it."""
+    """Panel over time: title, height (points), drawing function, caption and numbers."""
 
     title: str
     height: float
@@ -53,8 +52,9 @@ class Panel(NamedTuple):
     numbers: Callable[[AxisComparison], str]
 
     def full_title(self, result: AxisComparison) -> str:
-        """Its title, with what errors are counted from."""
-        return self.title.format("truth" if isinstance(result.truth, pd.DataFrame) else "EKF2")
+        """Title with the reference of the errors, ground truth or EKF2."""
+        has_truth = isinstance(result.truth, pd.DataFrame)
+        return self.title.format("ground truth" if has_truth else "EKF2")
 
     def draw_on_page(
         self,
@@ -66,19 +66,21 @@ class Panel(NamedTuple):
         strip: bool = False,
         narrow: bool = False,
     ) -> None:
-        """Draw it on a page, above others on the same time axis unless it is the last.
+        """Draw the panel on a page.
 
         Parameters
         ----------
+        last : bool
+            Label the time axis, which the panels above share.
         strip : bool
-            Name the flight modes above it.
+            Write the names of the flight modes above it.
         narrow : bool
-            In a column of its own, without its sentence.
+            Draw it for a narrow column, without caption.
         """
         sentence, height = (
             ("", NARROW_HEIGHT) if narrow else (self.sentence(analysis, result), self.height)
         )
-        # rejected innovations are there themselves
+        # this panel already shows the rejected innovations as hollow dots
         rejected = "" if self is INNOVATIONS else result.axis.name
         axes = marks.panel(
             page,
@@ -100,31 +102,31 @@ class Panel(NamedTuple):
 
 
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
-    """Draw what was measured, both filters with our band, and the truth."""
+    """Draw measurements, KF with its ±2σ band, EKF2 and ground truth."""
     if quantity is POSITIONS:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
         draw_curve(axes, measurements, **style.MEASUREMENT_DOTS)
     kf_values = result.replay.steps[quantity.column]
     draw_sigma_band(axes, kf_values, np.sqrt(result.replay.steps[quantity.variance]))
     drawn_series = [kf_values]
-    for frame, name in ((result.ekf2_state, "EKF2"), (result.truth, "truth")):
+    for frame, name in ((result.ekf2_state, "EKF2"), (result.truth, "ground truth")):
         if isinstance(frame, pd.DataFrame) and frame[quantity.column].notna().any():
             draw_curve(axes, frame[quantity.column], **LINES[name], zorder=2.5)
             drawn_series.append(frame[quantity.column])
-    draw_curve(axes, kf_values, **LINES["ours"])
-    # scaled to the tracks, not to the wide band of the first second
+    draw_curve(axes, kf_values, **LINES["KF"])
+    # scaled to the tracks, because the band is very wide in the first second
     all_values = pd.concat(drawn_series)
     pad = 0.08 * (all_values.max() - all_values.min()) + 1e-3
     axes.set_ylim(all_values.min() - pad, all_values.max() + pad)
 
 
 def error_reference(result: AxisComparison) -> pd.DataFrame | Unavailable:
-    """What errors are counted from: the truth, or else EKF2."""
+    """Return the reference for errors: ground truth if available, else EKF2."""
     return result.truth if isinstance(result.truth, pd.DataFrame) else result.ekf2_state
 
 
 def position_difference(frame: pd.DataFrame, reference: pd.DataFrame) -> pd.Series[float]:
-    """Position of one track minus another's (m), where both are known."""
+    """Return the position difference (m) of two tracks at the times of the first."""
     times, known = frame.index, reference["position_m"]
     at = np.interp(times, known.index, known, left=np.nan, right=np.nan)
     distance: pd.Series[float] = (frame["position_m"] - at).dropna()
@@ -132,7 +134,7 @@ def position_difference(frame: pd.DataFrame, reference: pd.DataFrame) -> pd.Seri
 
 
 def draw_error(axes: Axes, result: AxisComparison) -> None:
-    """Draw position errors against truth, or the difference to EKF2 where there is no truth."""
+    """Draw position errors against ground truth, or without it the difference KF - EKF2."""
     reference, steps = error_reference(result), result.replay.steps
     assert isinstance(reference, pd.DataFrame)
     sigma = np.sqrt(steps["position_variance_m2"])
@@ -144,31 +146,31 @@ def draw_error(axes: Axes, result: AxisComparison) -> None:
         ekf2_error = position_difference(result.ekf2_state, reference)
         draw_curve(axes, ekf2_error, **LINES["EKF2"], zorder=2.5)
         highest.append(ekf2_error.abs().max())
-    draw_curve(axes, error, **LINES["ours"])
+    draw_curve(axes, error, **LINES["KF"])
     axes.set_ylim(-1.1 * max(highest), 1.1 * max(highest))
 
 
 def _position_sentence(_: Analysis, result: AxisComparison) -> str:
     travelled = float(np.ptp(result.axis.measurement_m))
-    words = f"{len(result.replay.updates)} measurements over {travelled:.3g} m"
+    text = f"{len(result.replay.updates)} measurements over {travelled:.3g} m"
     if isinstance(result.ekf2_state, Unavailable) or isinstance(result.difference, Unavailable):
-        return f"{words}; our filter follows them."
+        return f"{text}."
     distance = position_difference(result.ekf2_state, result.replay.steps).abs()
     return (
-        f"{words}; the largest difference between KF and EKF2 is "
-        f"{distance.max():.2g} m at {distance.idxmax():.1f} s."
+        f"{text}; the largest difference between KF and EKF2 is {distance.max():.2g} m at "
+        f"{distance.idxmax():.1f} s."
     )
 
 
 def _velocity_sentence(_: Analysis, result: AxisComparison) -> str:
-    words = "Never measured: each filter infers it from positions and IMU."
-    return f"{words} {compare_rmse(result, VELOCITIES)}".rstrip()
+    text = "Velocity is not measured: each filter estimates it from positions and IMU."
+    return f"{text} {compare_rmse(result, VELOCITIES)}".rstrip()
 
 
 def _error_sentence(_: Analysis, result: AxisComparison) -> str:
     share = fraction_inside_two_sigma(result)
     if isinstance(result.truth, pd.DataFrame):
-        coverage_text = f"{share:.0%} of our error lies in our own ±2σ (blue), where 95% should."
+        coverage_text = f"{share:.0%} of the KF errors are within ±2σ (blue; expected 95 %)."
         return f"{compare_rmse(result, POSITIONS)} {coverage_text}".lstrip()
     return (
         "No ground truth in the log: this is the difference KF - EKF2, not an "
@@ -177,18 +179,18 @@ def _error_sentence(_: Analysis, result: AxisComparison) -> str:
 
 
 def compare_rmse(result: AxisComparison, quantity: Quantity) -> str:
-    """Which filter is nearer to the truth, by root mean square; empty where one is not known."""
+    """Compare the RMSE of KF and EKF2 in a sentence; "" if one of them is unknown."""
     errors = _rmse_by_filter(result, quantity)
     if len(errors) < 2:
         return ""
     (low, first), (high, second) = sorted((error, name) for name, error in errors.items())
     if high < 1.1 * low:
-        return "Ours and EKF2 are equally near to the truth."
-    return f"{capitalise_first(first)} is {high / low:.2g} times nearer to the truth than {second}."
+        return "KF and EKF2 have the same RMSE (within 10 %)."
+    return f"{first} has a {high / low:.2g} times smaller RMSE than {second}."
 
 
 def fraction_inside_two_sigma(result: AxisComparison) -> float:
-    """Share of our errors, or differences to EKF2, inside our own ±2σ."""
+    """Return the fraction of KF errors (without ground truth: differences to EKF2) within ±2σ."""
     reference, steps = error_reference(result), result.replay.steps
     assert isinstance(reference, pd.DataFrame)
     error = position_difference(steps, reference)
@@ -196,7 +198,7 @@ def fraction_inside_two_sigma(result: AxisComparison) -> float:
 
 
 def _rmse_by_filter(result: AxisComparison, quantity: Quantity) -> dict[str, float]:
-    """RMSE to the truth of each filter that has one."""
+    """Return the RMSE against ground truth of each filter for which it is known."""
     values = {
         name: getattr(one.truth, quantity.rmse, None)
         for name, one in filters_by_name(result).items()
@@ -208,7 +210,7 @@ def _error_numbers(result: AxisComparison, quantity: Quantity = POSITIONS) -> st
     errors = ", ".join(
         f"{name} {error:.3f}" for name, error in _rmse_by_filter(result, quantity).items()
     )
-    return f"RMS to truth ({quantity.unit}): {errors}" if errors else ""
+    return f"RMSE against ground truth ({quantity.unit}): {errors}" if errors else ""
 
 
 def _position_numbers(result: AxisComparison) -> str:
@@ -216,15 +218,15 @@ def _position_numbers(result: AxisComparison) -> str:
     if isinstance(part, Unavailable):
         return f"{part.what}: {part.reason}"
     return (
-        f"KF - EKF2: RMS {part.position_rmse_m:.3f} m, mean "
-        f"{part.position_mean_m:+.3f} m, maximum {part.position_maximum_m:.2f} m"
+        f"KF - EKF2: RMS {part.position_rmse_m:.3f} m, mean {part.position_mean_m:+.3f} m, "
+        f"maximum {part.position_maximum_m:.2f} m"
     )
 
 
 def _velocity_numbers(result: AxisComparison) -> str:
     texts = [_error_numbers(result, VELOCITIES)]
     if isinstance(result.difference, Difference):
-        texts.append(f"ours - EKF2: RMS {result.difference.velocity_rmse_m_s:.3f} m/s")
+        texts.append(f"KF - EKF2: RMS {result.difference.velocity_rmse_m_s:.3f} m/s")
     return "; ".join(filter(None, texts))
 
 
@@ -232,7 +234,7 @@ def _velocity_numbers(result: AxisComparison) -> str:
 
 
 def _axis_half_height(result: AxisComparison) -> float:
-    """Half height of the axes: neither outliers nor a gap may flatten all the rest."""
+    """Return the half height (m) of the innovation axes, limited despite outliers and gaps."""
     limits = []
     for frame in (result.replay.updates, result.ekf2_innovations):
         if isinstance(frame, pd.DataFrame):
@@ -245,12 +247,12 @@ def _axis_half_height(result: AxisComparison) -> float:
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
-    """Draw innovations of both filters with ±2√S; what EKF2 rejected is hollow."""
+    """Draw the innovations of KF and EKF2 with ±2√S; rejected ones are hollow."""
     edge, updates, frame = _axis_half_height(result), result.replay.updates, result.ekf2_innovations
     kf_innovations = updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     axes.axhline(0.0, color="black", lw=0.5)
-    dots = [(kf_innovations, DOTS["ours"])]
+    dots = [(kf_innovations, DOTS["KF"])]
     if isinstance(frame, pd.DataFrame):
         two_sigma = 2.0 * np.sqrt(frame["innovation_variance_m2"])
         for side in (two_sigma, -two_sigma):
@@ -265,7 +267,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     for values, marker_style in dots:
         draw_curve(axes, values[values.abs() <= edge], **marker_style)
         for sign, marker in ((1.0, "^"), (-1.0, "v")):
-            outside_times = values.index[sign * values > edge]  # shown at the edge
+            outside_times = values.index[sign * values > edge]
             edge_style: dict[str, Any] = {
                 **marker_style,
                 "marker": marker,
@@ -280,27 +282,27 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
-    """What to see in the innovations."""
+    """Caption of the innovations: fraction outside ±2√S, verdict and rejections."""
     sentences = []
     for name, one in filters_by_name(result).items():
         if isinstance(one, Unavailable):
-            sentences.append(f"{capitalise_first(name)}: {one.reason}.")
+            sentences.append(f"{name}: {one.reason}.")
         else:
             sentences.append(
-                f"{capitalise_first(name)}: {one.outside_two_sigma:.1%} of {one.count} "
-                f"innovations outside ±2√S (expected 5 %): {format_verdict(one)}."
+                f"{name}: {one.outside_two_sigma:.1%} of {one.count} innovations outside ±2√S "
+                f"(expected 5 %): {format_verdict(one)}."
             )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
     elif isinstance(result.ekf2_innovations, pd.DataFrame):
         count = int((result.ekf2_innovations["rejected"] > 0).sum())
-        sentences += [f"It rejected {count} of them (hollow)."] if count else []
+        sentences += [f"EKF2 rejected {count} (hollow)."] if count else []
     return " ".join(sentences)
 
 
 def _innovation_numbers(result: AxisComparison) -> str:
     edge, texts = _axis_half_height(result), []
-    frames = {"ours": result.replay.updates, "EKF2": result.ekf2_innovations}
+    frames = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     for name, one in filters_by_name(result).items():
         frame = frames[name]
         if isinstance(one, Consistency) and isinstance(frame, pd.DataFrame):
@@ -310,32 +312,30 @@ def _innovation_numbers(result: AxisComparison) -> str:
                     f"{name}: mean {one.innovation_mean_m:+.3f} m, standard deviation "
                     f"{one.innovation_std_m:.3f} m, median √S {one.sqrt_s_median_m:.3f} m"
                 )
-                + (f", {outside_count} beyond the axis (triangles)" if outside_count else "")
+                + (f", {outside_count} outside the plot (triangles)" if outside_count else "")
             )
     return "; ".join(texts)
 
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
-    for frame, name in ((result.replay.steps, "ours"), (result.ekf2_variance, "EKF2")):
+    for frame, name in ((result.replay.steps, "KF"), (result.ekf2_variance, "EKF2")):
         if isinstance(frame, pd.DataFrame):
             draw_curve(axes, np.sqrt(frame[quantity.variance]), **LINES[name])
     set_log_scale(axes)
 
 
 def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
-    """By how much σ grows in the longest gap of the source; empty where there is none."""
+    """Caption of σ: its growth in the longest gap of the source; "" without a gap."""
     if not analysis.events.gaps:
         return ""
     start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
     largest = {
         name: float(np.sqrt(frame.loc[start:end, "position_variance_m2"].max()))
-        for name, frame in (("ours", result.replay.steps), ("EKF2's", result.ekf2_variance))
+        for name, frame in (("KF", result.replay.steps), ("EKF2", result.ekf2_variance))
         if isinstance(frame, pd.DataFrame)
     }
-    growth = ", ".join(f"{name} to {to:.2g} m" for name, to in largest.items() if np.isfinite(to))
-    return (
-        f"In the {end - start:.1f} s without measurements from {start:.0f} s on σ grew: {growth}."
-    )
+    growth = " and ".join(f"{to:.2g} m ({name})" for name, to in largest.items() if np.isfinite(to))
+    return f"In the {end - start:.1f} s gap from {start:.0f} s, σ grew to {growth}."
 
 
 def _medians(result: AxisComparison, quantity: Quantity) -> str:

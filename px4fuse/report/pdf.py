@@ -1,7 +1,7 @@
-"""The PDF of a report: its pages in order, set by Typst, with the results attached inside.
+"""PDF report: pages set by Typst, with the results attached.
 
-PDF/A-3a and PDF/UA-1: for archives, and for screen readers. Typst sees the template and the data
-alone: its root is an empty folder, and it loads no font but those of :mod:`px4fuse.report.fonts`.
+Standards PDF/A-3a (archives) and PDF/UA-1 (screen readers). Typst reads the template and the data
+only: its root is an empty folder, and its fonts are those of :mod:`px4fuse.report.fonts`.
 """
 
 import json
@@ -36,7 +36,7 @@ from px4fuse.results.model import NO_STUDENT
 
 RESULTS_NAME = "results.json"
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
-# Of each kind of results
+# Drawing functions of the pages, in order, by type of results
 PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.ComparisonResults: (
         cover.draw,
@@ -59,7 +59,7 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
 
 
 def _title_name_hash(results: Any) -> tuple[str, str, str]:
-    """Title of the PDF, and name and SHA-256 of the file that it is about."""
+    """Return the title of the PDF, and name and SHA-256 of the analysed file."""
     match results:
         case contract.LoopResults(track=track):
             return f"px4fuse loop {track.name}", track.name, track.sha256
@@ -70,34 +70,34 @@ def _title_name_hash(results: Any) -> tuple[str, str, str]:
 
 
 def render(content: Any, results: Any, results_json: str) -> bytes:
-    """Set the report.
+    """Draw all pages and set them as PDF.
 
     Parameters
     ----------
-    content : Analysis, AidsAlone, Loop or Evaluation
-        What is drawn.
+    content : Analysis, AidsOnlyAnalysis, Loop or Evaluation
+        Source of the figures.
     results : Results
-        What is written of it; each kind has its :data:`PAGES`.
+        Results for the texts; their type selects the :data:`PAGES`.
     results_json : str
-        Attached inside the PDF as ``results.json``, so that the PDF alone can be checked.
+        Attached to the PDF as ``results.json``, so the PDF alone can be verified.
 
     Returns
     -------
     bytes
-        The same for the same input and the same versions: no dates, no random identifiers.
+        Identical for the same input and versions: no dates, no random identifiers.
     """
     blocks, written_text = list[Any](), ""
     with report_style():
-        # one at a time: the figures of all pages would be a tenth of all memory
+        # convert page by page, because the figures of all pages would take much memory
         for page in (page for draw in PAGES[type(results)] for page in draw(content, results)):
             written_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
             blocks += data(page.blocks)
     title, name, sha256 = _title_name_hash(results)
     made_by = f"px4fuse {metadata.version('px4fuse')}"
     student = student_line(getattr(results, "student", NO_STUDENT), " · ")
-    release_free_memory()  # what drew the figures; Typst takes as much
-    # figures have no text of others
-    words = title + name + student + written_text
+    release_free_memory()  # free the memory of the figures before Typst starts
+    # figures contain no text from outside
+    all_text = title + name + student + written_text
     return compile_pdf(
         {
             "title": title,
@@ -105,7 +105,7 @@ def render(content: Any, results: Any, results_json: str) -> bytes:
             "head": _shorten(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
             "student": _shorten(student, 40),
             "foot": made_by,
-            "fonts": fonts.font_names(words),
+            "fonts": fonts.font_names(all_text),
             "blocks": blocks,
             "results": results_json,
         }
@@ -113,18 +113,18 @@ def render(content: Any, results: Any, results_json: str) -> bytes:
 
 
 def _shorten(text: str, max_length: int) -> str:
-    """One line of so many letters at most."""
+    """Return the text on one line of at most `max_length` characters."""
     line = " ".join(replace_unprintable(text).split())
     return line if len(line) <= max_length else f"{line[: max_length - 1]}…"
 
 
 def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
-    """Data set by a template, by default ``report.typ``.
+    """Set data with a Typst template, by default ``report.typ``.
 
     Raises
     ------
     typst.TypstError
-        The template is not right, or asks for a file.
+        The template has an error or reads a file.
     """
     if template is None:
         template = Path(__file__).with_name("report.typ").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Provenance: where every number comes from, so that somebody else can make it again."""
+"""Provenance page: versions, files, parameters and methods needed to repeat the analysis."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -18,37 +18,37 @@ INDENT, SIZE = 140.0, 7.5
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw one page or more."""
+    """Draw the provenance of a comparison."""
     flight, source = analysis.flight, analysis.source
     placement = source.alignment
     page = _start_page("Appendix: provenance", results)
     _write_log(page, flight, source)
     clocks = map(format_clock_map, flight.clocks)
-    _write_section(page, "Clocks, to the autopilot's boot clock", plain=clocks)
+    _write_section(page, "Clocks, mapped to the autopilot's boot clock", plain=clocks)
     _write_section(
         page,
-        f"Stamps of {source.name}, by the IMU",
+        f"Time offset of {source.name} (against the IMU)",
         plain=[clock.summary_line(analysis, results.findings)],
     )
     if placement is not None:
-        _write_section(page, f"Placement of {source.name}", describe_alignment(placement).items())
-    _write_section(page, "Choices made on the way", plain=analysis.notes or ["none"])
+        _write_section(page, f"Alignment of {source.name}", describe_alignment(placement).items())
+    _write_section(page, "Automatic choices", plain=analysis.notes or ["none"])
     _write_missing(page, analysis.missing)
     _write_methods(page, "methods.md")
     yield page
 
 
 def draw_aids(alone: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
-    """Draw one page or more about a flight whose aids alone were judged."""
+    """Draw the provenance of a flight without a position source."""
     flight, page = alone.flight, _start_page("Provenance", results)
     _write_log(page, flight)
-    _write_section(page, "Choices made on the way", plain=flight.log.notes or ["none"])
+    _write_section(page, "Automatic choices", plain=flight.log.notes or ["none"])
     _write_missing(page, (alone.missing_data, *flight.missing))
     yield page
 
 
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
-    """What the log is, which position was taken, and its parameters without those of others."""
+    """Write log, position source and parameters, without those of position aids not used."""
     log, facts = flight.log, dict[str, str]()
     others = (f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source)
     other_parameters = set[str]()
@@ -69,12 +69,12 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
         "SHA-256": log.sha256,
         **{f.role: f"{f.name}, {f.bytes} bytes, SHA-256 {f.sha256}" for f in flight.inputs},
         "firmware": f"{log.firmware}, git {log.firmware_hash}",
-        "time zero": f"{log.boot_time_s:.6f} s after boot, the first sample of data",
+        "time zero": f"{log.boot_time_s:.6f} s after boot (first data sample)",
         **facts,
-        "also in the log": ", ".join(others) or "no other position",
+        "other positions": ", ".join(others) or "none",
         "parameters": ", ".join(parameters) or "none",
     }
-    _write_section(page, "The log", facts.items())
+    _write_section(page, "Log", facts.items())
 
 
 def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
@@ -82,12 +82,12 @@ def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None
         (part.source or part.what, f"{part.reason}. {with_options(part.remedy)}")
         for part in unavailable_parts
     ]
-    none = [] if missing else ["nothing is missing"]
-    _write_section(page, "Looked for and not found", missing, none)
+    none = [] if missing else ["none"]
+    _write_section(page, "Missing data", missing, none)
 
 
 def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw one page or more about a loop alone."""
+    """Draw the provenance of ``px4fuse loop``."""
     page = _start_page("Provenance", results)
     tracks = [("track", loop.odometry.trajectory), *(("reference", r) for r in loop.references)]
     file_facts = [
@@ -98,25 +98,25 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
         )
         for label, track in tracks
     ]
-    _write_section(page, "The files", file_facts)
-    _write_section(page, "Choices made on the way", plain=loop.notes or ["none"])
+    _write_section(page, "Files", file_facts)
+    _write_section(page, "Automatic choices", plain=loop.notes or ["none"])
     _write_methods(page, "methods_loop.md")
     yield page
 
 
 def _start_page(title: str, results: ComparisonResults | AidsResults | LoopResults) -> Page:
-    """A page that begins with what the report was made with."""
+    """Begin the page with command, versions and attached results."""
     page, student, versions = Page(title), results.student, results.provenance
     facts = {
         "command": versions.command,
         "px4fuse": f"{versions.px4fuse} on Python {versions.python}",
         "libraries": ", ".join(f"{name} {version}" for name, version in versions.libraries.items()),
-        "results": "attached inside this PDF as results.json",
+        "results": "attached to this PDF as results.json",
     }
     if fonts.missing_characters(student.name + student.id + student.notes):
         facts["fonts"] = (
-            f"{fonts.NO_GLYPH} replaces characters for which no font is installed on "
-            "this computer; results.json contains the original text"
+            f"{fonts.NO_GLYPH} replaces characters for which no font is installed on this "
+            "computer; results.json contains the original text"
         )
     _write_section(page, "Made with", facts.items())
     return page
@@ -125,7 +125,7 @@ def _start_page(title: str, results: ComparisonResults | AidsResults | LoopResul
 def _write_section(
     page: Page, title: str, labelled: Iterable[tuple[str, str]] = (), plain: Iterable[str] = ()
 ) -> None:
-    """Write labelled sentences and others in small letters; nothing where there are none."""
+    """Write a heading with labelled and plain texts in small print; nothing without texts."""
     labelled, plain = list(labelled), list(plain)
     if labelled or plain:
         page.heading(title, 9.5, above=9.0)
@@ -139,4 +139,4 @@ def _write_section(
 
 def _write_methods(page: Page, name: str) -> None:
     text = Path(__file__).with_name(name).read_text(encoding="utf-8")
-    _write_section(page, "How the numbers are made", plain=text.split("\n\n"))
+    _write_section(page, "Methods", plain=text.split("\n\n"))

@@ -1,9 +1,9 @@
-"""Lines on the terminal: words wrap at its width with a hanging indent, and nothing is cut.
+"""Output on the terminal: text wraps with a hanging indent and is never cut.
 
-In a pipe a paragraph is one line, however long, so that other programs find what they look for.
+In a pipe each paragraph is one line, so other programs can search it.
 
-Words are made without knowing where the log lies, and a report names no folder. So remedies say
-``px4fuse compare LOG --sigma-z 0.2``, and the terminal puts in what was typed.
+Reports contain no paths, so actions are written ``px4fuse compare LOG --sigma-z 0.2``. The
+terminal replaces LOG by the typed path and options.
 """
 
 import re
@@ -27,9 +27,9 @@ from px4fuse.request import (
     command_line,
 )
 
-INDENT = 9
-COLUMN_POINTS = 6.0  # points
-# Colours of paper that a screen has too; others stand for lines of panels, and are left out
+INDENT = 9  # columns
+COLUMN_POINTS = 6.0  # points of an indent on paper per terminal column
+# Terminal styles of text colours; the other colours belong to plots
 STYLES = {
     MUTED_COLOUR: "dim",
     SEVERITY_COLOURS["error"]: "bold red",
@@ -37,20 +37,20 @@ STYLES = {
     SEVERITY_COLOURS["info"]: "cyan",
     GOOD_COLOUR: "green",
 }
-# A value ends before the full stop of its sentence
+# The pattern of a value excludes the full stop at the end of a sentence
 _COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 _FIELDS = {option.name: field for field, option in OPTIONS.items()}
 
 
 def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
-    """Print the words and tables of a page.
+    """Print text and tables of a page.
 
     Parameters
     ----------
     console : Console
     blocks : iterable of Block
     request : Request, optional
-        As it was typed: commands in labelled sentences are printed so that they run.
+        Request as typed; with it, commands in labelled texts are printed ready to run.
     """
     for block in blocks:
         match block["kind"]:
@@ -78,35 +78,36 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
     labels = [line for line in lines if len(line) < INDENT]
     aside = "".join(f" ({line})" for line in lines if len(line) >= INDENT)
     for place, (label, part) in enumerate(zip_longest(labels, block["texts"])):
-        words, commands = Text() if part is None else _styled_text(part), list[str]()
+        text, commands = Text() if part is None else _styled_text(part), list[str]()
         if request is not None:
-            words.plain, commands = expand_commands(words.plain, request)
-        words.append("" if place else aside)
+            text.plain, commands = expand_commands(text.plain, request)
+        text.append("" if place else aside)
         print_paragraph(
-            console, words, _styled_text({**block["label"], "text": label or ""}), INDENT
+            console, text, _styled_text({**block["label"], "text": label or ""}), INDENT
         )
         for command in commands:
             print_line(console, "", command)
 
 
 def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
-    """A text with its commands cut down to what they change, and the commands in full.
+    """Shorten the commands in a text to the changed options; return it and the full commands.
 
     Parameters
     ----------
     text : str
     request : Request
-        What was typed: its files and options are those of the commands.
+        Request as typed; its files and options complete the commands.
 
     Examples
     --------
-    >>> expand_commands("px4fuse compare LOG --sigma-z 0.2: better.", ComparisonRequest(log="a b.ulg"))
+    >>> request = ComparisonRequest(log="a b.ulg")
+    >>> expand_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
     ('--sigma-z 0.2: better.', ["px4fuse compare 'a b.ulg' --sigma-z 0.2"])
     """
     commands = []
     for name, options in _COMMAND.findall(text):
-        words = options.split()
-        values = zip(words[::2], words[1::2], strict=True)
+        parts_of_options = options.split()
+        values = zip(parts_of_options[::2], parts_of_options[1::2], strict=True)
         changes = {_FIELDS[option]: float(value) for option, value in values}
         commands.append(rerun(request, name, changes))
     short_text = _COMMAND.sub(lambda found: found[2].strip() or f"px4fuse {found[1]}", text)
@@ -114,7 +115,7 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
 
 
 def rerun(request: Request, command: str, changes: Mapping[str, float]) -> str:
-    """A command on the files of a request, with its other options and some changed."""
+    """Return a command on the files of a request, with some options changed."""
     new_request = request
     if isinstance(request, ComparisonRequest):
         if command == "loop":
@@ -145,30 +146,30 @@ def print_paragraph(
     ----------
     console : Console
     text : str or Text
-        Its words wrap.
+        Wrapped at the width of the terminal.
     head : str or Text
-        What stands before its first line.
+        Label before the first line.
     indent : int
-        Columns before its other lines, and the width of the head.
+        Columns before the other lines, and minimum width of the head.
     """
-    words = Text(text) if isinstance(text, str) else text
+    body = Text(text) if isinstance(text, str) else text
     head = Text(head) if isinstance(head, str) else head.copy()
     head.pad_right(max(indent - head.cell_len, 0))
-    for line in words.wrap(console, max(console.width - indent, 1)):
+    for line in body.wrap(console, max(console.width - indent, 1)):
         line.rstrip()
         console.print(head.append_text(line), soft_wrap=True)
         head = Text(" " * indent)
 
 
 def print_line(console: Console, label: str, text: str, style: str = "bold cyan not dim") -> None:
-    """Print a command, or where something was written, on one line however long: to be copied."""
+    """Print a command or path on one line without wrapping, so it can be copied."""
     console.print(Text(f"{label:{INDENT}}", "bold").append(text, style), soft_wrap=True)
 
 
 def _rich_table(
     head: Sequence[str], rows: Iterable[Iterable[Cell]], right: Sequence[int], **_: object
 ) -> Table:
-    """A table without lines; of a head the lines are its group, name and unit."""
+    """Return a table without rules; a head may have several lines."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     vertical: Literal["bottom", "top"] = "bottom" if any("\n" in title for title in head) else "top"
     for index, title in enumerate(head):

@@ -1,4 +1,4 @@
-"""Appendix: what the knobs do. The ratio SIGMA_A/SIGMA_Z makes the track, their size the claims."""
+"""Appendix: sensitivity of KF to SIGMA_A and SIGMA_Z, with their log-likelihood map."""
 
 from collections.abc import Iterator
 
@@ -17,7 +17,7 @@ from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import KF_COLOUR, set_plain_ticks
 
 NOISE_FACTOR = 4.0
-# The chosen pair, and what is done to SIGMA_A and SIGMA_Z: two of them share each other gain
+# Label and factors on SIGMA_A and SIGMA_Z
 SETTINGS = (
     ("as chosen", 1.0, 1.0),
     ("SIGMA_A × 4", NOISE_FACTOR, 1.0),
@@ -25,26 +25,26 @@ SETTINGS = (
     ("SIGMA_A / 4", 1.0 / NOISE_FACTOR, 1.0),
     ("SIGMA_Z × 4", 1.0, NOISE_FACTOR),
 )
-# What two of them do alike, and where these stand
+# Pairs of SETTINGS (indices) with the same gain
 GAIN_GROUPS = (("larger gain", (1, 2)), ("smaller gain", (3, 4)))
-# ln of how much less likely a pair is than the best: the joint 95 % region, then powers of ten
+# nats below the maximum of the log-likelihood: joint 95 % region of both noises, then decades
 REGION_95 = float(-np.log(0.05))
 LEVELS = (0.0, REGION_95, 10.0, 100.0, 1000.0, 10_000.0)
 SHADES = ("#0b2a55", "#3f6aa8", "#86a7d3", "#c3d4ea", "#e6edf6")
 SHADE_LABELS = ("95 % region", "10 below", "100", "1,000", "10,000")
 COARSE_POINTS, FINE_POINTS = 14, 11
-# Beyond what has to be seen, as a factor; and how many intervals the fine points reach
+# Margin of the map (factor), and range of the fine grid as a multiple of the 95 % interval
 MAP_MARGIN, FINE_REACH = 1.3, 2.3
-MAP_HEIGHT, MAP_LEFT = 140.0, 40.0  # of the axes, and beside them, in points
+MAP_HEIGHT, MAP_LEFT = 140.0, 40.0  # points; height of the axes, margin left of them
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw one page; none where nothing was tuned, or the start is not forgotten."""
+    """Draw the page if the noises were estimated and the flight has enough measurements."""
     result, settings = analysis.main, analysis.settings
     if not analysis.tuning or len(result.replay.updates) < MIN_MEASUREMENTS:
         return
     page = Page(
-        "Appendix: what the knobs do",
+        "Appendix: sensitivity to SIGMA_A and SIGMA_Z",
         (
             "The KF gain depends only on the ratio SIGMA_A / SIGMA_Z. Their common "
             "scale changes the reported σ, S and NIS, but not the track. NIS determines "
@@ -61,16 +61,16 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _draw_map(page: Page, analysis: Analysis) -> None:
-    """Likelihood of every pair, with the lines on which the gain is the same."""
+    """Draw the log-likelihood over SIGMA_A and SIGMA_Z, with lines of constant gain."""
     from matplotlib.patches import Patch  # noqa: PLC0415
 
     tuning, settings = analysis.tuning, analysis.settings
     names = (HORIZONTAL, analysis.main.axis.name, *tuning)
     name = next(name for name in names if name in tuning)
     tuned_noises = tuning[name]
-    title = f"How likely the innovations are ({name})"
+    title = f"Log-likelihood over SIGMA_A and SIGMA_Z ({name})"
     if isinstance(tuned_noises, Unavailable):
-        page.write(f"{title}: no map, {tuned_noises.reason}.")
+        page.write(f"{title}: no map ({tuned_noises.reason}).")
         return
     axes = page.panel(title, _map_sentence(tuned_noises), MAP_HEIGHT, left=MAP_LEFT, above=14.0)
     chosen = settings.sigma_a_m_s2, settings.sigma_z_m
@@ -87,7 +87,7 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
         at = [scaled[SETTINGS[column][0]] for column in pair]
         axes.plot(*zip(*at, strict=True), marker, color=KF_COLOUR, ms=4.0, label=label)
     best = [_best_value(noise) for noise in noises]
-    axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="asked for")
+    axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="maximum")
     axes.plot(chosen[1], chosen[0], "X", color="black", mec="white", ms=8.0, label="chosen")
     axes.set(
         xscale="log",
@@ -108,7 +108,7 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
 
 
 def _noise_grid(chosen: float, noise: Noise) -> tuple[Array, tuple[float, float]]:
-    """Values of a knob, fine where it is likely, and the first and last that are shown."""
+    """Return a grid of a noise, fine near its estimate, and the limits of the map."""
     best = _best_value(noise)
     least, most = noise.low or best, noise.high or best
     needed = (chosen / NOISE_FACTOR, chosen * NOISE_FACTOR, best, least, most)
@@ -121,21 +121,22 @@ def _noise_grid(chosen: float, noise: Noise) -> tuple[Array, tuple[float, float]
 
 def _map_sentence(tuned_noises: AxisTuning) -> str:
     drop = format_number(max(tuned_noises.gain_nats * tuned_noises.count, 0.0), 2)
-    has_wander = tuned_noises.noises.walk_m > tuned_noises.noises.sigma_z_m
-    wander_note = " What the source wanders is not in them." if has_wander else ""
+    has_random_walk = tuned_noises.noises.walk_m > tuned_noises.noises.sigma_z_m
+    walk_note = " The random walk of the source is not included." if has_random_walk else ""
     return (
-        f"Asked for: SIGMA_A {format_noise(tuned_noises.filter_sigma_a, 'm/s²')}, SIGMA_Z "
-        f"{format_noise(tuned_noises.sigma_z, 'm')}. The chosen pair lies {drop} below (ln). Along a "
-        f"dotted line the gain is the same.{wander_note}"
+        "Maximum-likelihood estimate: SIGMA_A "
+        f"{format_noise(tuned_noises.filter_sigma_a, 'm/s²')}, SIGMA_Z "
+        f"{format_noise(tuned_noises.sigma_z, 'm')}. The chosen pair is {drop} nats below the "
+        f"maximum. Dotted lines: constant gain.{walk_note}"
     )
 
 
 def format_noise(noise: Noise, unit: str) -> str:
-    """A noise with its interval, or the bound that the data set where the search ended."""
+    """Format a noise with its 95 % interval, or the bounds if it has no estimate."""
     if noise.value is None:
         ends = (("at least", noise.low), ("at most", noise.high))
         known = [f"{word} {format_number(end)} {unit}" for word, end in ends if end is not None]
-        return " and ".join(known) or "not determined"
+        return " and ".join(known) or "unknown"
     low, high = (format_number(end or 0.0) for end in (noise.low, noise.high))
     within = "or more" if noise.high is None else f"({low} to {high})"
     return f"{format_number(noise.value)} {unit} {within}"
@@ -148,7 +149,7 @@ def _best_value(noise: Noise) -> float:
 def _log_likelihood_drop(
     comparison: Comparison, name: str, tuned_noises: AxisTuning, a: Array, z: Array
 ) -> Array:
-    """Ln of how much less likely each pair is than the best of them, shape (n, m)."""
+    """Log-likelihood of each pair below the maximum (nats), shape (n, m)."""
     axes = [
         one.axis
         for one in comparison.axes.values()
@@ -162,12 +163,12 @@ def _log_likelihood_drop(
 
 
 def _second_half_median(values: Array) -> Array:
-    """Median over the second half, when the start is forgotten."""
+    """Median over the second half, after the initial transient."""
     return np.asarray(np.median(values[len(values) // 2 :], axis=0))
 
 
 def _write_table(page: Page, result: AxisComparison, run: FilterStates, chosen: Array) -> None:
-    """What each setting claims, beside what it does."""
+    """Write the table of gain, reported σ, mean NIS and velocity RMSE per setting."""
     half = slice(len(run.gain) // 2, None)
     gains, sigmas, nis = (
         _second_half_median(run.gain),
@@ -178,8 +179,8 @@ def _write_table(page: Page, result: AxisComparison, run: FilterStates, chosen: 
     rows = []
     for at, (label, *scale) in enumerate(SETTINGS):
         noises = [format_number(value) for value in chosen * scale]
-        claims = [format_number(value) for value in (sigmas[at], nis[at])]
-        rows.append([label, *noises, f"{gains[at]:.2f}", *claims])
+        reported = [format_number(value) for value in (sigmas[at], nis[at])]
+        rows.append([label, *noises, f"{gains[at]:.2f}", *reported])
     if isinstance(result.truth, pd.DataFrame):
         true = result.truth["velocity_m_s"].dropna()
         if len(true):
@@ -189,14 +190,12 @@ def _write_table(page: Page, result: AxisComparison, run: FilterStates, chosen: 
             for row, rmse in zip(rows, np.sqrt((error**2).mean(axis=0)), strict=True):
                 row.append(f"{rmse:.3f}")
     smaller = ""
-    if nis[1] > 0.0:  # zero where the positions never change
-        smaller = (
-            f", and the NIS {format_factor(nis[2] / nis[1])} times smaller, about the same track"
-        )
-    page.heading("One track, two claims", above=10.0)
+    if nis[1] > 0.0:  # zero if the positions never change
+        smaller = f", and the NIS {format_factor(nis[2] / nis[1])} times smaller"
+    page.heading("Same track, different σ", above=10.0)
     page.write(
-        f"With SIGMA_A × 4, σ_p is {format_factor(sigmas[1] / sigmas[2])} times "
-        f"larger than with SIGMA_Z / 4{smaller}. Numbers of the second half of the "
-        "flight."
+        f"With SIGMA_A × 4, σ_p is {format_factor(sigmas[1] / sigmas[2])} times larger than with "
+        f"SIGMA_Z / 4{smaller}; the track is nearly the same. All numbers are of the second half "
+        "of the flight."
     )
     page.table(head, rows, right=range(1, len(head)))

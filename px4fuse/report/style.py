@@ -1,7 +1,7 @@
-"""Colours, lines and matplotlib's settings for the panels of reports and pictures.
+"""Colours, lines and matplotlib settings of all panels.
 
-Our filter is dark, solid and round; EKF2 is lighter, dashed and square; so that the two stay apart
-in grey. Text from outside (names, notes) is drawn as it is: no mathematics, no markup.
+KF is dark, solid and round, EKF2 lighter, dashed and square, so they remain distinct in grey. Text
+from outside (names, notes) is drawn literally, without mathematics or markup.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.colors import Colormap
-else:  # matplotlib costs a third of a second: not where words alone are shown
+else:  # importing matplotlib takes 0.3 s, which text-only commands save
     Artist = Axes = Colormap = Any
-__all__ = ["Artist", "Axes", "Colormap"]  # of matplotlib, for annotations
+__all__ = ["Artist", "Axes", "Colormap"]  # matplotlib types for annotations
 
 FONT = "DejaVu Sans"
 STYLE_SHEET = Path(__file__).with_name("report.mplstyle")
@@ -44,7 +44,7 @@ EKF2_LINE: dict[str, Any] = {"color": EKF2_COLOUR, "lw": 1.1, "ls": (0, (4, 1.6)
 TRUTH_LINE: dict[str, Any] = {"color": TRUTH_COLOUR, "lw": 0.7, "ls": (0, (1, 1.5))}
 KF_DOTS: dict[str, Any] = {"color": KF_COLOUR, "marker": "o", "ms": 2.0, "mew": 0, "ls": "none"}
 EKF2_DOTS: dict[str, Any] = {"color": EKF2_COLOUR, "marker": "s", "ms": 2.2, "mew": 0, "ls": "none"}
-# What EKF2 did not fuse is hollow everywhere
+# Samples that EKF2 did not fuse are hollow in all panels
 EKF2_REJECTED: dict[str, Any] = {
     "color": EKF2_COLOUR,
     "marker": "s",
@@ -60,26 +60,26 @@ MEASUREMENT_DOTS: dict[str, Any] = {
     "mew": 0,
     "ls": "none",
 }
-# By the names that a reader sees
-LINES = {"ours": KF_LINE, "EKF2": EKF2_LINE, "truth": TRUTH_LINE}
-DOTS = {"ours": KF_DOTS, "EKF2": EKF2_DOTS}
+# Styles by display name
+LINES = {"KF": KF_LINE, "EKF2": EKF2_LINE, "ground truth": TRUTH_LINE}
+DOTS = {"KF": KF_DOTS, "EKF2": EKF2_DOTS}
 
-# What the eye can see across a page, and across a third of it: longer series are thinned to their
-# extremes per bucket.
+# Drawn points of a series in wide and in narrow axes (limit in inches); longer series are reduced
+# to the extremes of each bucket
 MAX_POINTS, MAX_POINTS_NARROW, MIN_WIDE_INCHES = 1500, 500, 3.0
 
 
 @contextmanager
 def report_style() -> Iterator[None]:
-    """Matplotlib settings of the panels, for the duration of a block."""
-    import matplotlib as mpl  # noqa: PLC0415 - not where words alone are shown
+    """Apply the matplotlib settings of the panels within a with block."""
+    import matplotlib as mpl  # noqa: PLC0415 - slow import
 
     with mpl.rc_context({"font.family": [FONT]}, STYLE_SHEET):
         yield
 
 
 def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
-    """Draw a series over its index, with as many points as the eye can see in these axes."""
+    """Draw a series over its index, reduced to as many points as the axes can show."""
     axes.plot(
         *thin_series(values.index.to_numpy(), np.asarray(values, np.float64), _max_points(axes)),
         **style,
@@ -87,7 +87,7 @@ def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
 
 
 def draw_sigma_band(axes: Axes, middle: pd.Series[float], sigma: pd.Series[float]) -> None:
-    """Draw our ±2σ about a series."""
+    """Draw the ±2σ band of KF about a series."""
     time = middle.index.to_numpy()
     drawn_time, upper = thin_series(
         time, np.asarray(middle + 2.0 * sigma, np.float64), _max_points(axes)
@@ -101,7 +101,7 @@ def _max_points(axes: Axes) -> int:
 
 
 def set_log_scale(axes: Axes) -> None:
-    """Log scale of y with some room, and with plain numbers."""
+    """Set a log scale of y with a margin and plain numbers."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     axes.set_ylim(low / 1.15, high * 1.25)
@@ -109,7 +109,7 @@ def set_log_scale(axes: Axes) -> None:
 
 
 def set_plain_ticks(axis: Axis) -> None:
-    """Plain numbers on a log axis, at 1, 2 and 5 in each decade; of many decades at 1."""
+    """Set plain numbers on a log axis: at 1, 2, 5 or 1, 3 of a decade, at 1 for many decades."""
     from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
 
     low, high = axis.get_view_interval()
@@ -120,7 +120,7 @@ def set_plain_ticks(axis: Axis) -> None:
 
 
 def label_time_axis(axes: Axes, last: bool) -> None:
-    """Name an axis of time, or leave out its numbers where another below it shows them."""
+    """Label the time axis of the last panel; hide the tick labels of the panels above it."""
     if last:
         axes.set_xlabel(TIME_LABEL)
     else:
@@ -128,14 +128,14 @@ def label_time_axis(axes: Axes, last: bool) -> None:
 
 
 def set_map_axes(axes: Axes, right: str, up: str) -> None:
-    """Make both directions of the same scale, with a grid and their names (m)."""
+    """Set equal scales, a grid and the axis labels (m) of a map."""
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
     axes.grid(True, axis="both")
     axes.set(xlabel=f"{right} (m)", ylabel=f"{up} (m)")
 
 
 def thin_series(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:
-    """Thin a series to at most ``limit`` points, keeping the extremes of every bucket."""
+    """Reduce a series to at most ``limit`` points: the extremes of equal buckets."""
     if len(time) <= limit:
         return time, value
     bucket_size, larger_bucket_count = divmod(len(time), limit // 2)

@@ -1,4 +1,4 @@
-"""The summary on the terminal: what happened, what was compared with what, verdicts, findings."""
+"""Summary of a comparison on the terminal: result, inputs, verdicts and findings."""
 
 from typing import Any
 
@@ -13,20 +13,23 @@ from px4fuse.report.why import write_explanation
 from px4fuse.report.words import verdict_notes, write_errors
 
 MAX_FINDINGS = 4
-ERROR_LEGEND = "Apart: ours - EKF2, RMS of position and velocity. NIS in the band: consistent."
-# Of the facts on the cover those that fit on a screen
-SHOWN_FACTS = ("Filter", "Position", "Placed", "Segment")
+ERROR_LEGEND = (
+    "KF-EKF2: RMS difference of position and velocity. RMSE: against ground truth. Consistent: "
+    "mean NIS within its 95 % band."
+)
+# Facts of the cover that the terminal prints
+SHOWN_FACTS = ("Filter", "Position", "Aligned", "Segment")
 
 
 def summary(analysis: Analysis | AidsOnlyAnalysis, results: Any, report: object = None) -> Page:
-    """The summary of one comparison, or of the aids alone of a flight without a position source.
+    """Make the terminal page of a comparison, or of a flight without a position source.
 
     Parameters
     ----------
-    analysis : Analysis or AidsAlone
+    analysis : Analysis or AidsOnlyAnalysis
     results : ComparisonResults or AidsResults
     report : Path, optional
-        Where the report was written.
+        Path of the written report.
     """
     page = Page()
     log = analysis.flight.log
@@ -51,10 +54,12 @@ def summary(analysis: Analysis | AidsOnlyAnalysis, results: Any, report: object 
         write_explanation(page, why)
     write_appendix(page, analysis)
     if not results.findings:
-        page.write("No findings.")
+        page.write("Findings: none.")
     groups = by_root(results.findings)
     for group in groups[:MAX_FINDINGS]:
         write_finding(page, group)
     if (more_count := len(groups) - MAX_FINDINGS) > 0:
-        page.write(f"and {more_count} more in the report" if report else f"and {more_count} more")
+        where = " in the report" if report else ""
+        noun = "finding" if more_count == 1 else "findings"
+        page.write(f"{more_count} more {noun}{where}.")
     return page

@@ -1,4 +1,4 @@
-"""Terminal tables of ``px4fuse whatif``: EKF2 side by side, and a row per value of the sweep."""
+"""Terminal page of ``px4fuse whatif``: logged, replayed and changed EKF2, and the sweep."""
 
 import math
 from collections.abc import Callable
@@ -14,34 +14,34 @@ from px4fuse.plain import format_number
 from px4fuse.report.page import Page
 from px4fuse.report.why import format_agreement, write_explanation
 
-CHAOTIC = "chaotic"
+NOT_PREDICTABLE = "not predictable"
 Rows = tuple[tuple[str, Callable[[Any], str]], ...]
-# Of each EKF2 along an axis or by one of its aids
+# Label and cell text of each row: statistics of an axis or of an aid
 NIS_ROWS: Rows = (
     ("{}: mean NIS", lambda one: format_number(one.nis_mean)),
-    ("    consistent is", lambda one: "{:.2f} to {:.2f}".format(*one.nis_band)),
-    ("    std ν (m)", lambda one: _format_number(one.innovation_std_m)),
+    ("    expected", lambda one: "{:.2f} to {:.2f}".format(*one.nis_band)),
+    ("    std of ν (m)", lambda one: _format_number(one.innovation_std_m)),
 )
 AXIS_ROWS: Rows = (
     *NIS_ROWS,
-    ("    σ_p (m)", lambda axis: _format_number(axis.sigma_p_median_m)),
-    ("    RMSE to truth (m)", lambda axis: _format_number(axis.position_rmse_to_truth_m)),
+    ("    median σ_p (m)", lambda axis: _format_number(axis.sigma_p_median_m)),
+    ("    position RMSE (m)", lambda axis: _format_number(axis.position_rmse_to_truth_m)),
 )
 HEIGHT_ROWS: Rows = (*NIS_ROWS, ("    rejected", lambda height: f"{height.rejected_share:.1%}"))
-# and over all
+# statistics of the whole replay
 OVERALL_ROWS: Rows = (
     ("samples", lambda s: f"{s.samples}"),
     ("rejected", lambda s: f"{s.rejected_share:.1%}"),
-    ("longest without fusion (s)", lambda s: _format_number(s.longest_without_fusion_s, 2)),
+    ("longest time without fusion (s)", lambda s: _format_number(s.longest_without_fusion_s, 2)),
     ("position resets", lambda s: f"{s.resets}"),
 )
-# and where EKF2's heading and height follow what is changed
-HEADING_ROW = ("heading - truth (°)", lambda s: _format_number(s.heading_error_mean_deg, 1))
-HEIGHT_ROW = ("height: RMSE to truth (m)", lambda s: _format_number(s.height_rmse_to_truth_m))
+# only if the replay estimates heading and height itself
+HEADING_ROW = ("mean heading error (°)", lambda s: _format_number(s.heading_error_mean_deg, 1))
+HEIGHT_ROW = ("height RMSE (m)", lambda s: _format_number(s.height_rmse_to_truth_m))
 
 
 def column_heads(counterfactual: WhatIfAnalysis) -> list[str]:
-    """Heads of the columns of :func:`rows`."""
+    """Return the column heads of :func:`rows`."""
     change_texts = [
         f"{name} {format_number(value)} {PARAMETERS[name].unit}".rstrip()
         for name, value in counterfactual.changes.items()
@@ -50,12 +50,12 @@ def column_heads(counterfactual: WhatIfAnalysis) -> list[str]:
         f"without {name} from {since:g} s" for name, since in counterfactual.without.items()
     ]
     changed = ", ".join(change_texts)
-    ml_note = " (what the data ask for)" if counterfactual.asked else ""
-    return ["as logged", "replayed", *([f"what if {changed}{ml_note}"] if changed else [])]
+    ml_note = " (maximum-likelihood estimate)" if counterfactual.asked else ""
+    return ["logged", "replayed", *([f"replayed with {changed}{ml_note}"] if changed else [])]
 
 
 def rows(counterfactual: WhatIfAnalysis) -> list[list[str]]:
-    """Label and one cell per EKF2: as logged, as replayed, and with the changes."""
+    """Return table rows: a label, then the cells of the logged, replayed and changed EKF2."""
     whatif_result = counterfactual.whatif
     overall_rows, heights = list(OVERALL_ROWS), whatif_result.replayed.heights
     if isinstance(whatif_result.replayed.heading_error_mean_deg, float):
@@ -80,20 +80,20 @@ def rows(counterfactual: WhatIfAnalysis) -> list[list[str]]:
 
 
 def _format_cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str:
-    """Of one EKF2: along an axis, by one of its aids, or over all where the name is empty."""
+    """Format a statistic of an axis or aid; the name "" stands for the whole replay."""
     if not summary.steady:
-        return CHAOTIC
+        return NOT_PREDICTABLE
     part = {"": summary, **summary.axes, **summary.heights, **summary.others}.get(name)
     return "n/a" if part is None else cell(part)
 
 
 def sweep_table(counterfactual: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
-    """Heads, and a row per value of the sweep."""
+    """Return column heads and a row per value of the sweep."""
     name, rows = swept_parameter(counterfactual), []
     unit = PARAMETERS[name].unit
     (_, nis), _, _, (_, sigma), (_, rmse) = AXIS_ROWS
     for one in sweep_summaries(counterfactual):
-        cells = [CHAOTIC, *[""] * 5]
+        cells = [NOT_PREDICTABLE, *[""] * 5]
         if one.steady:
             per_axis_cells = ["/".join(map(cell, one.axes.values())) for cell in (nis, sigma, rmse)]
             cells = [
@@ -109,30 +109,30 @@ def sweep_table(counterfactual: WhatIfAnalysis) -> tuple[list[str], list[list[st
         "longest gap (s)",
         "resets",
         "σ_p N/E (m)",
-        "RMSE to truth N/E (m)",
+        "RMSE N/E (m)",
     ]
     return head, rows
 
 
 def sweep_summaries(counterfactual: WhatIfAnalysis) -> tuple[Summary, ...]:
-    """What the values of the sweep gave."""
+    """Return the summaries of the sweep."""
     return counterfactual.whatif.whatif[counterfactual.first :]
 
 
 def swept_parameter(counterfactual: WhatIfAnalysis) -> str:
-    """The parameter whose values are swept."""
+    """Return the name of the swept parameter."""
     (name,) = sweep_summaries(counterfactual)[0].changed.keys() - counterfactual.changes.keys()
     return name
 
 
 def reading(counterfactual: WhatIfAnalysis) -> list[str]:
-    """What to see: which value of the sweep is best by which measure, and what to keep in mind."""
+    """Return notes on the best values of the sweep and on the limits of the replay."""
     lines = []
     if summaries := [one for one in sweep_summaries(counterfactual) if one.steady]:
         name = swept_parameter(counterfactual)
         best = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         lines.append(
-            f"Mean NIS is nearest to 1 at {name} {format_number(best.changed[name])} "
+            f"The mean NIS is closest to 1 at {name} {format_number(best.changed[name])} "
             f"({format_number(best.nis_mean)})."
         )
         errors = {
@@ -161,14 +161,14 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 
 
 def summary(counterfactual: WhatIfAnalysis) -> Page:
-    """Terminal page: EKF2 as logged, as replayed and with other parameters, and the sweep."""
+    """Make the terminal page of ``px4fuse whatif``."""
     page = Page()
     if AISLE in counterfactual.why:
         write_explanation(page, counterfactual.why[AISLE])
     log, whatif_result = counterfactual.flight.log, counterfactual.whatif
     page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.judged)
-    page.labelled("Judged", spans)
+    page.labelled("Used", f"{spans} of the flight, in all columns")
     page.labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(counterfactual)]
     page.table(head, rows(counterfactual), right=range(1, len(head)))
@@ -176,5 +176,5 @@ def summary(counterfactual: WhatIfAnalysis) -> Page:
         page.table(*sweep_table(counterfactual), right=range(1, 7))
     for line in reading(counterfactual):
         page.write(line)
-    page.write("Replays use px4fuse's model of EKF2, not PX4's own code.")
+    page.write("Replays use px4fuse's model of EKF2, not PX4's code.")
     return page

@@ -1,4 +1,4 @@
-"""Why EKF2 differs: from our filter to the logged EKF2, one change at a time."""
+"""Page on the difference KF - EKF2: replays from KF to the logged EKF2, one change at a time."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -27,19 +27,15 @@ from px4fuse.report.style import (
     draw_curve,
 )
 
-TITLE = "Why EKF2 differs"
-ROW_HEIGHT, LABEL_WIDTH, COLUMN_GAP = (
-    12.0,
-    128.0,
-    14.0,
-)  # height of a bar, width of the names of steps
-NAMED_FRACTION = 0.62  # of the width: the bars that have the names of steps beside them
-TIME_HEIGHT = 105.0
-AWAY_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that lead away from EKF2
+TITLE = "Difference between KF and EKF2, step by step"
+ROW_HEIGHT, LABEL_WIDTH, COLUMN_GAP = 12.0, 128.0, 14.0  # points; bar, step names, columns
+NAMED_FRACTION = 0.62  # share of the page width for the left column, with the step names
+TIME_HEIGHT = 105.0  # points; height of the axes
+AWAY_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that increase the difference
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw as many pages as the axes need; none where nothing is concluded for any."""
+    """Draw the steps of each explained axis; no page if no axis is explained."""
     explanations = _explanations(analysis)
     if not any(isinstance(why, Why) for why in explanations.values()):
         return
@@ -53,33 +49,33 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     for name, why in explanations.items():
         if isinstance(why, Unavailable):
-            page.heading(f"{name}: nothing is concluded", 9.5, above=10.0)
+            page.heading(f"{name}: no result", 9.5, above=10.0)
             page.write(f"{capitalise_first(why.reason)}. {why.remedy}")
         else:
             _draw_axis(page, name, why, analysis)
-    replay = analysis.ekf2_replay  # without one nothing is concluded
-    assert isinstance(replay, Ekf2Replay)
+    replay = analysis.ekf2_replay
+    assert isinstance(replay, Ekf2Replay)  # the explanation was made from it
     assert replay.agreement is not None
-    page.numbers(f"Replay against log: {format_agreement(replay.agreement)}.")
+    page.numbers(f"EKF2 replay: {format_agreement(replay.agreement)}.")
     yield page
 
 
 def _explanations(analysis: Analysis) -> Mapping[str, Why | Unavailable]:
-    """Of the aisle, or else of every axis."""
+    """Return the explanation of the aisle axis, else those of all axes."""
     explanations = analysis.why
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
 
 def write_explanation(page: Page, why: Why | Unavailable) -> None:
-    """Write in one sentence why EKF2 differs."""
+    """Write the largest step of the difference KF - EKF2, or the reason why it is unknown."""
     if isinstance(why, Unavailable):
-        page.labelled("Why", f"EKF2 differs is not known: {why.reason}.")
+        page.labelled("KF-EKF2", f"Difference not explained: {why.reason}.")
     else:
-        page.labelled("Why", why.sentences[0])
+        page.labelled("KF-EKF2", why.sentences[0])
 
 
 def unexplained_note(analysis: Analysis) -> str:
-    """Why there is no such page, in a line; empty where there is one, or no EKF2 to explain."""
+    """Return the reason why the page is missing; "" if it exists or the log has no EKF2."""
     explanations = list(_explanations(analysis).values())
     if isinstance(analysis.flight.ekf2, Unavailable) or any(
         isinstance(why, Why) for why in explanations
@@ -88,11 +84,11 @@ def unexplained_note(analysis: Analysis) -> str:
     reasons = {
         f"{why.reason}. {why.remedy}": None for why in explanations if isinstance(why, Unavailable)
     }
-    return f"{TITLE}: nothing is concluded, {' '.join(reasons)}" if reasons else ""
+    return f"Difference KF - EKF2 not explained: {' '.join(reasons)}" if reasons else ""
 
 
 def format_agreement(agreement: Agreement) -> str:
-    """How well the replay as flown agrees with the log, in numbers and in a verdict."""
+    """Format the agreement of the EKF2 replay with the log: statistics and verdict."""
     axes = agreement.axes.items()
     correlation = ", ".join(f"{axis.innovation_correlation:.4f} ({name})" for name, axis in axes)
     ratio = ", ".join(
@@ -100,13 +96,12 @@ def format_agreement(agreement: Agreement) -> str:
         for _, axis in axes
     )
     return (
-        f"{agreement.samples} innovations correlate {correlation}; S is {ratio} times the logged "
-        f"one; rejected {agreement.rejected_share_replayed:.1%}, in the log "
-        f"{agreement.rejected_share_logged:.1%}. "
-        + ("It agrees: " if agreement.good else "It does not agree: ")
-        + agreement.reason
+        f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
+        f"Correlation of {agreement.samples} innovations {correlation}; S ratio replay/log "
+        f"{ratio}; rejected {agreement.rejected_share_replayed:.1%} (log "
+        f"{agreement.rejected_share_logged:.1%})"
         + "".join(
-            f". Not so the {AIDS[name].label}, of which nothing is concluded: {reason}"
+            f". The {AIDS[name].label} does not agree and is not used: {reason}"
             for name, reason in agreement.doubtful.items()
         )
     )
@@ -129,14 +124,14 @@ def _draw_axis(page: Page, name: str, why: Why, analysis: Analysis) -> None:
         steps = np.array([getattr(step, f"{quantity}_mean_square_{power}") for step in why.steps])
         unexplained = getattr(why, f"{quantity}_left_mean_square_{power}")
         title, height = (
-            f"{quantity}, {np.sqrt(total):.3f} {unit} rms",
+            f"{quantity} difference, {np.sqrt(total):.3f} {unit} RMS",
             ROW_HEIGHT * (len(names) + 2),
         )
         axes = column.panel(title, "", height, left=left)
         _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained / total)
     axes.set_yticklabels([])
     page.beside(*columns, gap=COLUMN_GAP)
-    title = "Position apart (m): ours - EKF2 (dark), and what the model leaves of it (light)"
+    title = "Position difference KF - EKF2 (m, dark) and unexplained part (light)"
     axes = marks.panel(
         page, analysis, title, _time_sentence(why), TIME_HEIGHT, axis=name, strip=True
     )
@@ -144,12 +139,12 @@ def _draw_axis(page: Page, name: str, why: Why, analysis: Analysis) -> None:
         pd.Series(v, why.times_s) for v in (why.kf_minus_ekf2_m, why.unexplained_m)
     )
     for start, end in why.spans_s:
-        draw_curve(axes, position_difference.loc[start:end], **LINES["ours"])
+        draw_curve(axes, position_difference.loc[start:end], **LINES["KF"])
         draw_curve(axes, remainder.loc[start:end], color=EKF2_COLOUR, lw=0.8)
 
 
 def _draw_waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None:
-    """Bars from the whole difference down to what is left, in per cent of the whole."""
+    """Draw bars from the total mean square down to the unexplained part (% of the total)."""
     before = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
     rows, farthest = len(names) + 2, max(100.0, float(before.max()))
     style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6, "color": KF_COLOUR}
@@ -163,7 +158,7 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, left: float) ->
     for row, number in enumerate((100.0, *shares, left)):
         digits = 1 if 0.05 <= abs(number) < 9.95 else 0
         axes.text(1.03 * farthest, row, f"{number:z.{digits}f} %", va="center", size=6.5)
-    axes.set_yticks(range(rows), ["ours to EKF2, all of it", *names, "left unexplained"])
+    axes.set_yticks(range(rows), ["KF - EKF2, total", *names, "unexplained"])
     axes.set_ylim(rows - 0.4, -0.6)
     axes.set_xlim(min(0.0, float(before.min())), 1.2 * farthest)
     axes.set_xlabel("% of the mean square")
@@ -171,9 +166,10 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, left: float) ->
 
 
 def _time_sentence(why: Why) -> str:
-    """What to see along the flight."""
-    farthest = int(np.argmax(np.abs(why.kf_minus_ekf2_m)))
+    """Caption of the time panel: largest difference and unexplained RMS."""
+    largest = int(np.argmax(np.abs(why.kf_minus_ekf2_m)))
     return (
-        f"Farthest apart at {why.times_s[farthest]:.1f} s, {abs(why.kf_minus_ekf2_m[farthest]):.2g} m; the "
-        f"model leaves {np.sqrt(np.mean(why.unexplained_m**2)):.2g} m RMS."
+        f"Largest difference {abs(why.kf_minus_ekf2_m[largest]):.2g} m at "
+        f"{why.times_s[largest]:.1f} s; unexplained RMS "
+        f"{np.sqrt(np.mean(why.unexplained_m**2)):.2g} m."
     )

@@ -1,4 +1,4 @@
-"""Phrases that the terminal and the PDF share."""
+"""Texts that the terminal and the PDF share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.flight import Alignment, Truth, Unavailable
-from px4fuse.plain import format_factor, format_number, format_p_value
+from px4fuse.plain import format_factor, format_number
 from px4fuse.recording import ClockMap
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
@@ -20,13 +20,18 @@ if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
     from px4fuse.report.page import Cell, Page
 
-# Below, "white" is wrong: of the eight verdicts of a flight one in a hundred by chance
+# p value of the Ljung-Box test below which innovations are reported as not white. It keeps the
+# false alarm rate of a flight's eight tests below 1 %
 MIN_WHITE_P = 0.001
+SIGMA_VERDICTS = {
+    "variance overstated": ("underconfident", "large"),
+    "variance understated": ("overconfident", "small"),
+}
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
 def format_settings(settings: Settings) -> str:
-    """The filter's settings in one phrase."""
+    """Format the KF settings on one line."""
     offset = f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     return (
         f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m, "
@@ -35,35 +40,44 @@ def format_settings(settings: Settings) -> str:
 
 
 def format_verdict(statement: Consistency | Unavailable) -> str:
-    """Verdict with its factor, or why there is none."""
+    """Format the verdict on a filter, "not logged" if its innovations are missing."""
     if isinstance(statement, Unavailable):
-        return "not available"
-    if statement.verdict == "consistent":
-        return "consistent"
-    side = statement.verdict.removeprefix("variance ")
-    return f"{side} {format_factor(statement.sigma_error_factor)}× in σ"
+        return "not logged"
+    return format_sigma_verdict(statement.verdict, statement.sigma_error_factor)
+
+
+def format_sigma_verdict(verdict: str, factor: float) -> str:
+    """Format a verdict of the results with the factor between reported and actual σ.
+
+    >>> format_sigma_verdict("variance understated", 2.41)
+    'overconfident, σ 2.4× too small'
+    """
+    if verdict not in SIGMA_VERDICTS:
+        return verdict
+    confidence, size = SIGMA_VERDICTS[verdict]
+    return f"{confidence}, σ {format_factor(factor)}× too {size}"
 
 
 def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
-    """Both filters of an axis by the names that a reader sees; ours alone where EKF2 is missing."""
-    known = {"ours": result.filters["kf"]}
+    """Return KF and EKF2 of an axis by their display names; KF only if EKF2 is not logged."""
+    known = {"KF": result.filters["kf"]}
     if not isinstance(result.ekf2_state, Unavailable):
         known["EKF2"] = result.filters["ekf2"]
     return known
 
 
-VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "innovation\nvariance")
+VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
 def verdict_rows(
     axes: Iterable[AxisComparison],
     extra_cells: Callable[[AxisComparison, str, FilterSummary | Unjudged], Sequence[str]],
 ) -> list[list[Cell]]:
-    """A row for each axis and filter: what :data:`VERDICT_HEAD` says, and more cells."""
+    """Return a table row per axis and filter: the cells of VERDICT_HEAD, then the extra cells."""
     rows: list[list[Cell]] = []
     for result in axes:
         for name, one in filters_by_name(result).items():
-            label = result.axis.name if name == "ours" else ""
+            label = result.axis.name if name == "KF" else ""
             nis, colour = ("", ""), MUTED_COLOUR
             if isinstance(one, Consistency):
                 nis = (format_number(one.nis_mean), "{:.2f} – {:.2f}".format(*one.nis_band))
@@ -75,35 +89,35 @@ def verdict_rows(
 
 
 def write_errors(page: Page, analysis: Analysis) -> None:
-    """Write verdicts and errors as a table, the main axis first.
+    """Write the table of verdicts and errors, main axis first.
 
-    Between both filters, and between each and the truth, where the flight has these.
+    RMS differences KF - EKF2 and RMSE against ground truth are columns if the log contains them.
     """
     axes = (analysis.main, *analysis.others)
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 
     def rms_cells(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
-        statistics: list[Any] = [result.difference if name == "ours" else None] if has_ekf2 else []
+        statistics: list[Any] = [result.difference if name == "KF" else None] if has_ekf2 else []
         statistics += [one.truth] if has_truth else []
         return [_format_rms(statistic, field) for statistic in statistics for field in RMSE_FIELDS]
 
-    head = [*VERDICT_HEAD, *(["apart\n(m)", "\n(m/s)"] if has_ekf2 else [])]
-    head += ["to truth\n(m)", "\n(m/s)"] if has_truth else []
+    head = [*VERDICT_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
+    head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
     page.table(head, verdict_rows(axes, rms_cells), right=(2, 3, 5, 6, 7, 8))
 
 
 def _format_rms(statistic: object, field: str) -> str:
-    """A root mean square of three digits; empty where there is none."""
+    """Format a field of a statistic with three decimals, "" if it is missing."""
     value = getattr(statistic, field, None)
     return "" if value is None else f"{value:.3f}"
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """What the verdicts mean where they could be misread, a sentence each.
+    """Explain verdicts that could be misread.
 
-    A source that may drift; factors that are too small for a finding; innovations of the right
-    size that are not white.
+    Notes on a source that may drift, on deviations too small for a finding, and on innovations
+    that are consistent but not white.
     """
     statements = [
         (result.axis.name, filter_name, statement)
@@ -118,38 +132,37 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "not with the true position. Check the error with ground truth or a loop."
         )
     small_deviations = [
-        f"{filter_name} {axis} {format_verdict(statement)}"
+        f"{filter_name} {axis} ({format_factor(statement.sigma_error_factor)}×)"
         for axis, filter_name, statement in statements
         if statement.verdict != "consistent" and statement.sigma_error_factor < SIGMA_FACTOR_FINDING
     ]
     if small_deviations:
         notes.append(
-            f"{', '.join(small_deviations)}: statistically significant, but below "
-            f"{SIGMA_FACTOR_FINDING:g}×, the limit for a finding."
+            f"Significant, but below the limit of {SIGMA_FACTOR_FINDING:g}× for a finding: "
+            f"{', '.join(small_deviations)}."
         )
     correlated = [
-        f"{filter_name} {axis} {format_p_value(statement.ljung_box_p)}, lag-1 "
-        f"{statement.lag1_autocorrelation:+.2f}"
+        f"{filter_name} {axis}, lag-1 autocorrelation {statement.lag1_autocorrelation:+.2f}"
         for axis, filter_name, statement in statements
         if statement.verdict == "consistent" and statement.ljung_box_p < MIN_WHITE_P
     ]
     if correlated:
         notes.append(
-            "Innovations not white, although their size is consistent (Ljung-Box test): "
-            f"{'; '.join(correlated)}. Positive lag-1 autocorrelation: the filter lags, "
-            "SIGMA_A may be too small. Negative: it follows the measurement noise, "
-            "SIGMA_A may be too large."
+            "Innovations not white, although their size is consistent (Ljung-Box test, p < "
+            f"{MIN_WHITE_P:g}): {'; '.join(correlated)}. Positive: the filter lags, SIGMA_A may "
+            "be too small. Negative: the filter follows the measurement noise, SIGMA_A may be too "
+            "large."
         )
     return notes
 
 
 def format_consequences(followers: Sequence[Finding]) -> str:
-    """What the same cause brings with it, each in one sentence."""
-    return "With it: " + " ".join(f"{finding.headline}." for finding in followers)
+    """Format findings that follow from the same cause, with their ids."""
+    return "Consequences: " + " ".join(f"{one.headline} [{one.id}]." for one in followers)
 
 
 def format_clock_map(clock: ClockMap) -> str:
-    """How one clock was mapped to the autopilot's, with its figures."""
+    """Format the mapping of a clock to the autopilot's boot clock."""
     is_note_sufficient = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
     if is_note_sufficient or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
@@ -161,7 +174,7 @@ def format_clock_map(clock: ClockMap) -> str:
 
 
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
-    """How a position file was placed into the flight: labels and sentences."""
+    """Return the alignment of a position file with the flight as labelled texts."""
     north, east, down = alignment.origin_m
     yaw = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
     sigma, residual = alignment.clock_offset_sigma_s, alignment.residual_rms_m
@@ -183,9 +196,9 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def tuning_advice(
     comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """What follows from tuning: the command to run again, PX4's parameter, and cautions.
+    """Return the actions after tuning as labelled texts: command, PX4 parameter and cautions.
 
-    Labels and sentences, with ``px4fuse compare LOG`` as in :mod:`px4fuse.report.commands`.
+    Commands are written as ``px4fuse compare LOG``; the terminal replaces LOG.
     """
     names = (HORIZONTAL, "aisle", *tuned)
     name = next((name for name in names if isinstance(tuned.get(name), AxisTuning)), "")
@@ -207,9 +220,9 @@ def tuning_advice(
     ]
     if options:
         command = f"px4fuse compare LOG{''.join(options)}"
-        advice["Re-run"] = f"with the noises of {name}: {command}"
+        advice["Action"] = f"Re-run with the estimates of {name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
-        advice["SIGMA_Z"] = f"is at least {sigma_z.low:.2g} m: is this a position source at all?"
+        advice["SIGMA_Z"] = f"at least {sigma_z.low:.2g} m. Check that this is a position source."
     elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = (
@@ -218,19 +231,19 @@ def tuning_advice(
         )
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
         px4_value = log.parameters.get("EKF2_EVP_NOISE")
-        current_value = "" if px4_value is None else f" (now {px4_value:g})"
-        advice["PX4"] = f"EKF2_EVP_NOISE {sigma_z.value:.3g}{current_value}"
+        current_value = "" if px4_value is None else f" (now {px4_value:g} m)"
+        advice["PX4"] = f"Set EKF2_EVP_NOISE to {sigma_z.value:.3g} m{current_value}."
     if sigma_a.value is None:
         advice["SIGMA_A"] = (
-            "is not determined by this flight: too little motion, or too short."
+            "cannot be estimated: too little motion, or the flight is too short."
             if sigma_a.low is None
-            else f"is at least {sigma_a.low:.2g} m/s²: the acceleration is wrong."
+            else f"at least {sigma_a.low:.2g} m/s²: the acceleration in the log is wrong."
         )
     elif found.biases_fitted and (alone := found.sigma_a.value or found.sigma_a.high) is not None:
         bound = "" if found.sigma_a.value is not None else "at most "
         advice["SIGMA_A"] = (
-            f"accelerometer noise alone is {bound}{alone:.2g} m/s². KF has no state for "
-            "accelerometer bias and tilt error; to cover them it needs "
+            f"Accelerometer noise alone is {bound}{alone:.2g} m/s². KF has no state for "
+            "accelerometer bias and tilt error. To cover them SIGMA_A must be "
             f"{sigma_a.value:.2g} m/s²."
         )
     if len(found.outlier_time_s):

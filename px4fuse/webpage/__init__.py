@@ -1,8 +1,7 @@
-"""Web pages in one file: what makes text from logs and students inert, and the table.
+"""Single-file web pages: a table page, and escaping of text from logs and students.
 
-Nothing from data can act: it is JSON in which an HTML parser finds nothing, which the page's
-one script puts into the page as text, and that script is allowed by its hash. Nothing is loaded
-from a network.
+Data cannot execute: they are JSON without HTML characters, which the page's script inserts as text
+nodes. The content security policy allows that script by its hash and no network access.
 """
 
 from __future__ import annotations

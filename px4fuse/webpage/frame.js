@@ -8,7 +8,7 @@
   const selects = [...document.querySelectorAll(".controls select")];
   const shownGroups = [...document.querySelectorAll("[data-group]")];
 
-  // Text from data only ever becomes a text node
+  // text from data becomes text nodes only, never HTML
   const make = (tag, text = "", kind = "") => {
     const node = document.createElement(tag);
     if (text) node.textContent = text;
@@ -43,7 +43,7 @@
   let first = 0;
   let current = null;
 
-  // ------------------------------------------------------------ what a row unfolds to
+  // ------------------------------------------------------------ parts of an unfolded row
 
   const list = (texts, warn) => {
     const made = make("ul", "", warn ? "warn" : "");
@@ -84,7 +84,7 @@
     }
     return made;
   };
-  // What is typed in boxes, by whom it is about and its name; it leaves the page as a download only
+  // input of the boxes by owner and name; it is exported only by the download
   const typed = new Map();
   let unsaved = false;
   const boxes = (owner, lines, kept) => {
@@ -106,7 +106,7 @@
         });
       }
     }
-    made.append(make("small", kept.length ? kept.length + " more in overrides.csv, kept" : ""));
+    made.append(make("small", kept.length ? kept.length + " other entries in overrides.csv are kept" : ""));
     return made;
   };
   const tableOfBoxes = () => {
@@ -126,7 +126,7 @@
     for (const [key, line] of typed) lines.set(key, line);
     const quoted = (cell) => {
       const text = String(cell);
-      // No cell begins a formula
+      // prevent formulas in spreadsheets
       return '"' + (/^[=+\-@\t\r]/.test(text) ? "'" : "") + text.replaceAll('"', '""') + '"';
     };
     const all = [["id", "item", "points", "comment"], ...lines.values()];
@@ -242,7 +242,7 @@
     frame.classList.remove("wide");
     const wide = whole.scrollWidth > frame.clientWidth;
     frame.classList.toggle("wide", wide);
-    // A region that scrolls must be reached by keyboard
+    // a scrolling region must be reachable with the keyboard
     frame.tabIndex = wide ? 0 : -1;
     frame.style.setProperty("--width", frame.clientWidth + "px");
   };
@@ -256,7 +256,7 @@
     order = order.slice().sort((one, other) => {
       const a = one.values[column];
       const b = other.values[column];
-      // What is absent comes last both ways
+      // missing values are last in both directions
       if (a === null || b === null) return (a === null) - (b === null);
       return sign * (numeric ? a - b : collator.compare(a, b));
     });

@@ -1,7 +1,7 @@
-"""One page with one table: sorted, searched, filtered and unfolded by the page's own script.
+"""Web page with one table that the page's script sorts, searches, filters and unfolds.
 
-Rows are JSON, and the script draws a hundred of them at a time, so that thousands stay fluid.
-Without scripts the page shows its first rows as a plain table.
+Rows are JSON; the script draws a hundred at a time, so thousands of rows remain fast. Without
+scripts the page shows its first rows as a plain table.
 """
 
 import math
@@ -11,23 +11,22 @@ from typing import Any, Literal
 
 from px4fuse.webpage.safe import clean_values, inert_json, part, policy_hash, template
 
-# Rows that the script draws at once, and that are there without it
-MAX_PAGE_ROWS = 100
-MAX_PLAIN_ROWS = 300
+MAX_PAGE_ROWS = 100  # rows drawn at a time
+MAX_PLAIN_ROWS = 300  # rows shown without scripts
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table.
+    """Column of the table.
 
     Attributes
     ----------
     kind : {"text", "line", "number", "rank"}
-        How it is sorted; a line is text that stays in one, a rank is text sorted by a number.
+        Sort order; "line" is text without line breaks, "rank" is text sorted by a number.
     group : str
-        Shown only while the box of this group is ticked; "" for always.
+        Group whose check box shows the column; "" for always.
     visible_from : {"always", "tablet", "desk"}
-        The smallest screen on which it is shown.
+        Smallest screen on which it is visible.
     """
 
     title: str
@@ -38,18 +37,18 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """What stands in a row under one column.
+    """Cell of a row.
 
     Attributes
     ----------
     value : float, str or None
-        By which it is sorted; None comes last both ways.
+        Sort key; None is sorted last in both directions.
     below : str
-        A second, small line.
+        Second line in small print.
     style_class : str
-        "" for text, "flags" for one flag per line, else the class of a chip.
+        "" for text, "flags" for one flag per line, else the CSS class of a label.
     bar : float or None
-        Length of a bar below the text, from 0 to 1.
+        Length of a bar below the text, 0 to 1.
     """
 
     text: str = ""
@@ -60,12 +59,12 @@ class Cell:
 
 
 def text_cell(text: str, below: str = "") -> Cell:
-    """A cell that is sorted by its text."""
+    """Return a cell sorted by its text."""
     return Cell(text, text or None, below)
 
 
 def number_cell(value: float | None, text: str | None = None, below: str = "") -> Cell:
-    """A cell that is sorted by a number; empty for what is absent or not finite."""
+    """Return a cell sorted by a number; empty if the value is None or not finite."""
     if value is None or not math.isfinite(value):
         return Cell()
     return Cell(f"{value:.4g}" if text is None else text, value, below)
@@ -76,17 +75,17 @@ Part = list[Any]
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table.
+    """Row of the table.
 
     Attributes
     ----------
     cells : tuple of Cell
-        One per column; the first names the row and unfolds it.
+        One per column; the first one names the row and unfolds it.
     tags : tuple of str
-        What filters look for.
+        Values that the filters select.
     details, side_parts : tuple of Part
-        What it unfolds to, and what stands at the right of it: of :func:`list_part` and the like;
-        those with nothing in them are left out.
+        Left and right column of the unfolded row, made by :func:`list_part` and the other
+        functions below; empty parts are omitted.
     """
 
     cells: tuple[Cell, ...]
@@ -95,21 +94,21 @@ class Row:
     side_parts: tuple[Part, ...] = ()
 
 
-# ------------------------------------------------------------------ what a row unfolds to
+# ------------------------------------------------------------------ parts of an unfolded row
 
 
 def list_part(title: str, texts: Sequence[str], warn: bool = False) -> Part:
-    """A list of sentences."""
+    """Return a part with a list of texts, marked as a warning if `warn`."""
     return ["list", title, texts, warn]
 
 
 def prose_part(title: str, text: str) -> Part:
-    """Text with its own lines."""
+    """Return a part with text that keeps its line breaks."""
     return ["prose", title, text]
 
 
 def pairs_part(title: str, rows: Sequence[tuple[str, str]]) -> Part:
-    """Names and what they are; those without a value are left out."""
+    """Return a part with names and values; rows without a value are omitted."""
     return ["pairs", title, [row for row in rows if row[1]]]
 
 
@@ -119,12 +118,12 @@ def table_part(
     rows: Sequence[Sequence[str]],
     numeric: Sequence[int] = (),
 ) -> Part:
-    """A small table; ``numeric`` are the columns that end flush."""
+    """Return a part with a small table; ``numeric`` are the right-aligned columns."""
     return ["table", title, heads, rows, list(numeric)]
 
 
 def links_part(title: str, rows: Sequence[tuple[str, str]]) -> Part:
-    """Words and where they lead: addresses of :func:`px4fuse.webpage.safe.local_link` only."""
+    """Return a part with link texts and addresses of :func:`px4fuse.webpage.safe.local_link`."""
     return ["links", title, [row for row in rows if row[1]]]
 
 
@@ -134,15 +133,15 @@ def boxes_part(
     rows: Sequence[tuple[str, float, float | None, str]],
     other_rows: Sequence[tuple[str, float | None, str]] = (),
 ) -> Part:
-    """Boxes for points and words, which the page gives as a table to download.
+    """Return a part with input boxes for points and comments, which the page exports as CSV.
 
     Parameters
     ----------
     owner : str
-        Whose they are, as the table says it.
-    rows : sequence of (name, most, points, words)
-    other_rows : sequence of (name, points, words)
-        What the table holds besides.
+        Id of the person in the exported table.
+    rows : sequence of (name, maximum, points, comment)
+    other_rows : sequence of (name, points, comment)
+        Further rows of the exported table, without boxes.
     """
     return ["boxes", title, owner, rows, other_rows]
 
@@ -163,27 +162,27 @@ def page(
     placeholder: str,
     full_table_note: str,
 ) -> str:
-    """Lay out a page.
+    """Make the page.
 
     Parameters
     ----------
     above : str
-        HTML above the table, of a :func:`~px4fuse.webpage.safe.template`.
+        HTML above the table, made with a :func:`~px4fuse.webpage.safe.template`.
     noun : (str, str)
-        What a row is, one and many.
-    filters : sequence of (label, ((tag, words), ...))
-        Rows that have the chosen tag are shown.
+        Name of a row, singular and plural.
+    filters : sequence of (label, ((tag, text), ...))
+        A selected tag limits the table to rows with it.
     groups : sequence of (group, label)
-        Boxes that show more columns.
+        Check boxes for groups of columns.
     placeholder : str
-        What one may search for.
+        Hint in the search field.
     full_table_note : str
-        Sentence: where all rows are for whom the page shows only some of them.
+        Sentence for readers without scripts: the file with all rows.
 
     Returns
     -------
     str
-        Write it as UTF-8. The same for the same input.
+        HTML, identical for the same input; write it as UTF-8.
     """
     style = part("base.css") + part("frame.css")
     script = part("frame.js")
@@ -221,7 +220,7 @@ def page(
 
 
 def _compact(cell: Cell) -> list[Any]:
-    """Its fields without those at the end that are empty; true stands for a value like its text."""
+    """Return the fields of a cell without empty ones at the end; True means value == text."""
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     bar = "" if cell.bar is None else round(cell.bar, 3)
     fields = [cell.text, value, cell.below, cell.style_class, bar]

@@ -1,4 +1,4 @@
-"""Text and numbers from data, so that they do nothing in a web page."""
+"""Escaping of text and numbers from data, so they cannot execute in a web page."""
 
 import base64
 import hashlib
@@ -13,14 +13,15 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 MAX_CHARACTERS = 20_000
-# Controls but for tab and line end, surrogates, and what turns the direction of all that follows
+# Control characters except tab and line feed, surrogates, and bidirectional overrides, which would
+# reverse the text after them
 HARMFUL_CHARACTERS = re.compile(
     "[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
 )
 
 
 def clean(text: str, max_length: int = MAX_CHARACTERS) -> str:
-    r"""Text without what HTML cannot hold and what turns the direction of others; cut when long.
+    r"""Replace harmful characters and shorten the text to `max_length` characters.
 
     >>> clean("a\x1b\u202eb", 10), clean("abcdef", 3)
     ('a��b', 'abc…')
@@ -30,7 +31,7 @@ def clean(text: str, max_length: int = MAX_CHARACTERS) -> str:
 
 
 def clean_values(value: Any, max_length: int = MAX_CHARACTERS) -> Any:
-    """The same with every text in it clean, and numbers of numpy as Python's."""
+    """Clean all texts in nested data, and convert numpy numbers to Python numbers."""
     if isinstance(value, str):
         return clean(value, max_length)
     if isinstance(value, dict):
@@ -44,18 +45,18 @@ def clean_values(value: Any, max_length: int = MAX_CHARACTERS) -> Any:
 
 
 def inert_json(value: object) -> str:
-    """JSON in which an HTML parser finds nothing: no <, > or &, and ASCII only."""
+    """Encode as JSON without <, > and & and with ASCII only, so HTML parsers find no markup."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 
 
 def policy_hash(text: str) -> str:
-    """What a content security policy allows: this very script or style."""
+    """Return the SHA-256 hash with which a content security policy allows a script or style."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def local_link(path: str) -> str:
-    r"""A path relative to the page as a link, and "" for any other: nothing that data could call.
+    r"""Return a relative path as a URL, "" for an absolute one, so data cannot add other links.
 
     >>> local_link("results/a b.json"), local_link("javascript:alert(1)")
     ('results/a%20b.json', 'javascript%3Aalert%281%29')
@@ -69,7 +70,7 @@ def local_link(path: str) -> str:
 
 @cache
 def template(name: str) -> Template:
-    """A template of the package: text from data is clean and escaped in it, whatever it is."""
+    """Load a template of the package; it cleans and escapes all inserted text."""
     environment = Environment(
         loader=PackageLoader("px4fuse", ""),
         autoescape=True,
@@ -81,5 +82,5 @@ def template(name: str) -> Template:
 
 
 def part(name: str, package: str = "px4fuse.webpage") -> str:
-    """A file of a package, by default what all pages share."""
+    """Read a text file of a package, by default of the files shared by all pages."""
     return files(package).joinpath(name).read_text(encoding="utf-8")
