@@ -1,8 +1,7 @@
-"""The form that a student fills in about a flight: ``answers.toml``.
+"""Answer form of a flight, ``answers.toml``: its questions, and reading a completed form.
 
-What it asks stands in ``form.toml``: the mistakes a flight can have, with the units of their sizes;
-what EKF2 can have done; the panels that show something; what can be done about it. Reading checks
-the form's grammar, never whether it is right.
+``form.toml`` lists the choices: mistakes with the units of their sizes, behaviour of EKF2, panels
+of the report, corrections. Reading checks the grammar of a form, not whether answers are right.
 """
 
 import hashlib
@@ -20,7 +19,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 from px4fuse.record import Record, Sha256, table
 
-# tomllib takes seconds and gigabytes for one dotted key of 64 kB
+# characters; tomllib takes seconds and gigabytes for one dotted key of 64 kB
 MAX_BYTES, MAX_LINE = 20_000, 500
 MOST_MISTAKES = 20
 NONE = "none"
@@ -28,58 +27,58 @@ BLANK = "\u2013"
 
 
 class NamedMistake(Record, frozen=True, rename={"sized_in": "in"}):
-    """What may be wrong, in words; sizes beyond ``range``, in the first unit, are nonsense."""
+    """Kind of mistake: description, quantity of its size, and accepted sizes in the first unit."""
 
-    words: str
+    description: str
     sized_in: str = ""
     range: tuple[float, float] = (-1e6, 1e6)
 
     @property
     def units(self) -> Mapping[str, float]:
-        """Of its size, with what one of each is in the first of them; none: it has no size."""
+        """Units of the size, with their size in the first unit; empty: no size."""
         return _UNITS[self.sized_in]
 
 
 class Form(Record, frozen=True):
-    """The tables of ``form.toml``."""
+    """Tables of ``form.toml``."""
 
     did: tuple[str, ...]
     panels: tuple[str, ...]
     units: dict[str, dict[str, float]]
     mistakes: dict[str, NamedMistake]
     cures: dict[str, str]
-    questions: dict[str, str]
+    renamed: dict[str, str]
 
 
 _FORM = table(__file__, "form.toml", Form)
 _UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_FORM.units}
 MISTAKES, EKF2_DID, PANELS = _FORM.mistakes, _FORM.did, _FORM.panels
-# What can be done about a mistake, with the units of its value (none: it takes no number)
+# corrections of mistakes, with the units of their value (empty: no value)
 CURES = {name: _UNITS[units] for name, units in _FORM.cures.items()}
-VERDICTS = ("consistent", "overstated", "understated")
+VERDICTS = ("consistent", "overconfident", "underconfident")
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
-VerdictWord = Literal["", "consistent", "overstated", "understated"]
-# A number, or the updates of a list, as they are asked for; None is left blank
+VerdictWord = Literal["", "consistent", "overconfident", "underconfident"]
+# a number, or a list of updates; None: left blank
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
 class ClaimedMistake(Record, frozen=True):
-    """One mistake that a student names.
+    """Mistake that a student names in the form.
 
     Attributes
     ----------
     kind : str
         One of :data:`MISTAKES`.
     size : float or None
-        In ``unit``, one of those of the kind; with its sign.
+        With sign, in ``unit``, which is a unit of the kind.
     when : str
-        "whole flight", or empty where ``from_s`` and ``until_s`` (since the first data) say it.
+        "whole flight", or empty if ``from_s`` and ``until_s`` (s since the first data) are given.
     parameter : str
-        One of :data:`CURES`, with its ``value`` in ``value_unit``.
+        Correction, one of :data:`CURES`, with its ``value`` in ``value_unit``.
     panel : str
-        One of :data:`PANELS`: where it was seen.
+        Part of the report that shows the mistake, one of :data:`PANELS`.
     """
 
     kind: str
@@ -94,7 +93,7 @@ class ClaimedMistake(Record, frozen=True):
     panel: str = ""
 
     def size_in_first_unit(self) -> float | None:
-        """The size in the kind's first unit; a length's factor as what it is beyond 1."""
+        """Return the size in the first unit of the kind; a scale factor of 1.05 is 5 %."""
         units = MISTAKES[self.kind].units
         if self.size is None or not units:
             return None
@@ -103,7 +102,7 @@ class ClaimedMistake(Record, frozen=True):
         return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
 
     def value_in_first_unit(self) -> float | None:
-        """The value in the parameter's first unit."""
+        """Return the value of the correction in the first unit of its parameter."""
         units = CURES.get(self.parameter, {})
         if self.value is None or not units:
             return self.value
@@ -111,16 +110,16 @@ class ClaimedMistake(Record, frozen=True):
 
 
 class Answers(Record, frozen=True, kw_only=True):
-    """A form as it was filled in; what was left blank is not there.
+    """Completed answer form; blank answers are absent.
 
     Attributes
     ----------
     log_sha256 : str
-        Of the log that the form was made for.
+        SHA-256 of the log of the form.
     verdict_ours, verdict_ekf2 : str
-        On the innovation variance, one of :data:`VERDICTS`.
+        Verdict on the reported σ of KF and EKF2, one of :data:`VERDICTS`.
     quantities : tuple of (float, tuple of float, or None)
-        In the order of :func:`draw_questions`; a tuple where a list of updates was asked for.
+        In the order of :func:`draw_questions`; a tuple answers a question about several updates.
     """
 
     log_sha256: Sha256
@@ -132,12 +131,12 @@ class Answers(Record, frozen=True, kw_only=True):
 
     @property
     def claims_no_mistake(self) -> bool:
-        """Whether it says that nothing is wrong."""
+        """Return True if the form states that the flight has no mistake."""
         return [claim.kind for claim in self.mistakes] == [NONE]
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "silence", "gate"]
-# One of each pair is asked
+# one question is drawn from each pair
 _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
@@ -146,18 +145,18 @@ _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 
 
 class FormQuestion(Record, frozen=True):
-    """A number that no report prints, asked at settings of each log's own.
+    """Question about a number that no report prints, with settings that depend on the log.
 
     Attributes
     ----------
     kind : str
-        What is asked, along the aisle.
+        Quantity, along the aisle.
     update : int
-        Counted from 1, as rows of ``replay(...).updates``: the first measurement is no update.
+        Number of the update, from 1; the first measurement sets the state and is not counted.
     sigma_a_m_s2, sigma_z_m : float
-        Settings of our filter.
+        Settings of KF.
     extra : float
-        Seconds of silence, or the gate in standard deviations.
+        Prediction time without measurement (s), or the gate (in √S).
     """
 
     kind: QuestionKind
@@ -167,18 +166,27 @@ class FormQuestion(Record, frozen=True):
     extra: float = 0.0
 
     @property
-    def words(self) -> str:
-        """The question."""
-        what = _FORM.questions[self.kind].format(question=self, last=self.update + GATE_UPDATES)
-        return f"{what}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
+    def text(self) -> str:
+        """Question as printed in the form."""
+        update, extra = self.update, f"{self.extra:g}"
+        quantity = {
+            "gain": f"position gain of update {update}",
+            "variance": f"position variance after update {update} (m²)",
+            "innovation": f"innovation of update {update} (m)",
+            "nis": f"NIS of update {update}",
+            "silence": f"position sigma {extra} s after update {update}, without measurement (m)",
+            "gate": f"list of the updates {update} to {update + GATE_UPDATES} with an innovation "
+            f"outside {extra} sqrt(S); KF uses these updates, too",
+        }[self.kind]
+        return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# Updates that a question about the gate goes over
+# number of updates in a question about the gate
 GATE_UPDATES = 20
 
 
 def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
-    """Three quantities, which follow from the log and differ between logs."""
+    """Draw three questions from the SHA-256 of the log, so that they differ between logs."""
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
     def between(low: float, high: float, decimals: int) -> float:
@@ -195,30 +203,27 @@ def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
 
 def read_answers(path: Path) -> Answers:
-    """Read a form and check its grammar.
+    """Read an answer form and check its grammar.
 
     Raises
     ------
     SettingsError
-        It is not a form, or a field does not say what can be said there: which, and what can.
+        The file is not an answer form, or a field has a value that is not allowed.
     """
     text = read_text(path, SettingsError, MAX_BYTES, name=str(path))
     if any(len(line) > MAX_LINE for line in text.splitlines()):
-        raise SettingsError(f"{path}: has a line of more than {MAX_LINE} characters.")
+        raise SettingsError(f"{path}: a line has more than {MAX_LINE} characters.")
     try:
         answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
         check(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        raise SettingsError(f"{path}: {error}", "Correct it there.") from error
+        raise SettingsError(f"{path}: {error}", "Correct the form.") from error
     return answers
 
 
 def _as_record(form: dict[str, Any]) -> dict[str, Any]:
-    """The file's own shape as that of :class:`Answers`: what is blank is left out.
-
-    Claims stand under "mistake", and numbers under the names of their questions.
-    """
-    filled_form = _without_blanks(form)
+    """Rearrange the TOML file as :class:`Answers`, without blank answers."""
+    filled_form = _without_blanks(update_values(form))
     claims = filled_form.pop("mistake", ())
     numbers = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
     names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
@@ -231,6 +236,15 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def update_values(value: Any) -> Any:
+    """Replace the values of forms and answer keys from before schema 4 by the present ones."""
+    if isinstance(value, dict):
+        return {key: update_values(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [update_values(part) for part in value]
+    return _FORM.renamed.get(value, value) if isinstance(value, str) else value
+
+
 def _without_blanks(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_blanks(part) for key, part in value.items() if part != ""}
@@ -240,20 +254,20 @@ def _without_blanks(value: Any) -> Any:
 
 
 def check(answers: Answers) -> None:
-    """Check the grammar beyond types, as far as tables say it.
+    """Check choices, ranges and duplicates of a form.
 
     Raises
     ------
     ValueError
-        A word that cannot stand there, a number out of range, a claim twice.
+        A value that is not a choice, a number out of range, or a mistake named twice.
     """
     kinds = [claim.kind for claim in answers.mistakes]
     for name in kinds:
         _one_of("kind", name, MISTAKES)
         if kinds.count(name) > 1:
-            raise ValueError(f"kind {name!r} stands there twice: give each mistake once")
+            raise ValueError(f"kind {name!r} is given twice; give each mistake once")
     if NONE in kinds and len(kinds) > 1:
-        raise ValueError('kind "none" stands beside a mistake: give one or the other')
+        raise ValueError('kind "none" is given together with a mistake; give only one of them')
     for behaviour in answers.ekf2_did:
         _one_of("ekf2_did", behaviour, EKF2_DID)
     for claim in answers.mistakes:
@@ -266,25 +280,25 @@ def check(answers: Answers) -> None:
         ):
             value = getattr(claim, field)
             if value and known is not None:
-                _one_of(f"of {claim.kind}: {field}", value, known)
+                _one_of(f"{claim.kind}: {field}", value, known)
         low, high = mistake.range
         size = claim.size_in_first_unit()
         if size is not None and not low <= size <= high:
             unit = next(iter(mistake.units))
             raise ValueError(
-                f"of {claim.kind}: size {size:g} {unit} is none that it can have: "
-                f"{low:g} to {high:g} {unit}"
+                f"{claim.kind}: size {size:g} {unit} is out of range ({low:g} to {high:g} {unit})"
             )
 
 
 def _one_of(field: str, value: str, known: Any) -> None:
+    if not known:
+        raise ValueError(f"{field} {value!r} has no choices; leave it empty")
     if value not in known:
-        allowed = ", ".join(f'"{name}"' for name in known) or "none: leave it empty"
-        raise ValueError(f"{field} {value!r} is not one of {allowed}")
+        raise ValueError(f"{field} {value!r} is not one of {_quoted(known)}")
 
 
 def form_name(log_name: str) -> str:
-    """What the form of a log is called.
+    """Return the file name of the answer form of a log.
 
     >>> form_name("s07.ulg")
     's07.answers.toml'
@@ -293,13 +307,13 @@ def form_name(log_name: str) -> str:
 
 
 def form_text(log_name: str, log_sha256: str) -> str:
-    """An empty form for a log, with everything that can be said in it explained."""
+    """Return an empty answer form for a log, with comments that list all choices."""
     template = Template(files("px4fuse").joinpath("answers.toml").read_text(encoding="utf-8"))
     questions = [
-        f'# {one.words}\nq{number} = ""{"    # such as [61, 64]" * (one.kind == "gate")}'
+        f'# {one.text}\nq{number} = ""{"    # such as [61, 64]" * (one.kind == "gate")}'
         for number, one in enumerate(draw_questions(log_sha256), start=1)
     ]
-    kinds = (f"{name:13} {one.words}{_units(one.units)}" for name, one in MISTAKES.items())
+    kinds = (f"{name:13} {one.description}{_units(one.units)}" for name, one in MISTAKES.items())
     return template.substitute(
         log=log_name,
         form=form_name(log_name),
@@ -314,10 +328,10 @@ def form_text(log_name: str, log_sha256: str) -> str:
 
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
-    """A filled form as names and values, for pages."""
-    yield "Variance of our filter", answers.verdict_ours or BLANK
-    yield "Variance of EKF2", answers.verdict_ekf2 or BLANK
-    yield "What EKF2 did", ", ".join(answers.ekf2_did) or BLANK
+    """Yield names and values of a completed form, for the report and the class page."""
+    yield "Verdict on KF", answers.verdict_ours or BLANK
+    yield "Verdict on EKF2", answers.verdict_ekf2 or BLANK
+    yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or BLANK
     for claim in answers.mistakes:
         time_limits = (("from", claim.from_s), ("until", claim.until_s))
         value = _format_number_with_unit(
@@ -329,7 +343,7 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
             ),
             claim.when
             or " ".join(f"{name} {at:g} s" for name, at in time_limits if at is not None),
-            f"seen in {claim.panel}" if claim.panel else "",
+            f"shown in {claim.panel}" if claim.panel else "",
             f"{claim.parameter} {value}".strip(),
         )
         yield claim.kind, "; ".join(filter(None, details)) or BLANK
@@ -343,7 +357,7 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
             if quantity_answer is None
             else [quantity_answer]
         )
-        yield quantity.words, ", ".join(f"{number:g}" for number in numbers) or BLANK
+        yield quantity.text, ", ".join(f"{number:g}" for number in numbers) or BLANK
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:
@@ -356,7 +370,6 @@ def _units(units: Mapping[str, float]) -> str:
 
 
 def _block(lines: Iterable[str]) -> str:
-    """Lines of a comment."""
     return "\n".join(f"#     {line}" for line in lines)
 
 

@@ -1,1 +1,1 @@
-"""A flight per student, and its answer key."""
+"""Assignments: individual simulated flights for a class, and the answer key."""

@@ -1,4 +1,4 @@
-"""A flight of one's own for every student of a class, with an answer key for the instructor."""
+"""Individual simulated flights for a class, with an answer key for the instructor."""
 
 import hashlib
 import secrets
@@ -18,7 +18,7 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.writing import write_all
 
-# Of the numbers that only the instructor knows
+# numbers of the simulation that the answer key contains
 TRUTH = (
     "duration_s",
     "sigma_z_m",
@@ -33,7 +33,7 @@ TRUTH = (
 def fly(
     secret: bytes, student: Person, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
-    """One student's log, and the answer to it."""
+    """Simulate the flight of one student; return its log (ULog) and its answer."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.typed))
     log = flights.to_ulog(simulation)
@@ -53,19 +53,19 @@ def fly(
 
 
 def key_path(folder: Path, key_option: Path | None) -> Path:
-    """Where the answer key goes: beside the students' folder, never into it.
+    """Return the path of the answer key, by default beside the students' folder.
 
     Raises
     ------
     OutputError
-        It would be among the students' files.
+        The path is inside the students' folder.
     """
     resolved_folder = folder.resolve()
     path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
     if resolved_folder in (path.resolve(), *path.resolve().parents):
         raise OutputError(
-            f"{path} is in the students' folder, where students would find it. Choose "
-            "another place with --answer."
+            f"{path} is in the students' folder, so students could read the answer key. "
+            "Choose another place with --answer."
         )
     return path
 
@@ -80,35 +80,35 @@ def assign(
     truth: bool = True,
     step: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[AnswerKey, int]:
-    """Write everyone's log and form into a folder, and the answer key.
+    """Write log and form of each student into a folder, and the answer key.
 
-    Each student's answer is written before log and form, so that a run that is interrupted can go
-    on. What is there already is never replaced: a log must be the same to the byte, and a key may
-    only gain students.
+    The key is written before log and form of a student, so that an interrupted run can continue.
+    Existing files are never replaced: an existing log must be identical, and a key may only gain
+    students.
 
     Parameters
     ----------
     secret : bytes or None
-        None takes that of the key that is there already, or makes one up.
+        None uses the secret of an existing key, or generates one.
     count : int, optional
-        Mistakes per flight; None draws it.
+        Number of mistakes per flight; drawn by default.
     truth : bool
-        Whether logs of an aisle hold the truth.
+        Logs of aisle flights contain the ground truth.
     step : callable
-        Told after every flight how many are made, and of how many.
+        Called after each flight with the number of finished flights and of all.
 
     Returns
     -------
     AnswerKey
     int
-        How many logs were written; the others were there, as they should be.
+        Number of logs that were written; the others existed already.
 
     Raises
     ------
     SettingsError
-        So many mistakes cannot be in one flight.
+        One flight cannot have this many mistakes.
     OutputError
-        A file is there already with other content, or cannot be written.
+        A file exists with other content, or cannot be written.
     """
     with own_files():
         key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
@@ -134,9 +134,9 @@ def assign(
             path: content for path, content in contents.items() if not _is_written(path, content)
         }
         key = AnswerKey(kind, tuple(answers.values()), new_secret)
-        # the key first: it contains the secret, without which a run that was ended cannot go on
+        # the key first: an interrupted run needs its secret to continue
         write_all({key_file: key_text(key).encode()})
-        key_file.chmod(0o600)  # for the instructor only
+        key_file.chmod(0o600)  # readable only for the instructor
         write_all(new)
         written += folder / student.file in new
         step(done, len(students))
@@ -150,14 +150,14 @@ def preview(
     kind: Kinds,
     count: int | None = None,
 ) -> list[AssignedFlight]:
-    """What :func:`assign` would draw for each, without a flight and without a file.
+    """Draw the flights of :func:`assign` without simulating them or writing files.
 
     Raises
     ------
     SettingsError
-        So many mistakes cannot be in one flight, or there is no secret to draw from.
+        One flight cannot have this many mistakes, or there is no secret.
     OutputError
-        The key that is there was made by an earlier px4fuse.
+        The existing key was made by an earlier px4fuse.
     """
     if secret is None:
         before = read_key(key_file) if key_file.exists() else None
@@ -171,20 +171,20 @@ def preview(
 
 
 def _is_written(target: Path, log: bytes) -> bool:
-    """Whether a log is there already; another one in its place is not replaced."""
+    """Return True if the file exists with this content; OutputError if it differs."""
     if not target.exists() and not target.is_symlink():
         return False
     if target.is_file() and target.stat().st_size == len(log) and target.read_bytes() == log:
         return True
     raise OutputError(
-        f"{target} already exists and contains another flight. It was not "
+        f"{target} already exists with other content. It was not "
         "overwritten. Use the same secret and options as before, or another folder "
         "(-o)."
     )
 
 
 def _check_extends(key_file: Path, same: bool) -> None:
-    """A key that is there already must be part of the new one."""
+    """Raise OutputError if an existing answer key is not part of the new one."""
     if not same:
         raise OutputError(
             f"{key_file} is the answer key of other flights. It was not overwritten. Use "

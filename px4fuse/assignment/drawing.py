@@ -1,7 +1,7 @@
-"""What is drawn for a student: which flight, which mistakes, of which sizes.
+"""Random assignment: draw flight, mistakes and sizes of each student.
 
-It follows from the instructor's secret and the student's id by HMAC (RFC 2104), so that nobody
-without the secret can guess another's, and a second run gives the same.
+Numbers are drawn by HMAC (RFC 2104) from the secret of the instructor and the id of the student:
+without the secret they cannot be predicted, and a second run gives the same flights.
 """
 
 from __future__ import annotations
@@ -20,42 +20,42 @@ from px4fuse.errors import SettingsError
 from px4fuse.record import Record, table
 from px4fuse.simulation.scenario import Kind, Scenario, make_scenario
 
-# Of a class: one kind of flight for all, or drawn for each
+# kind of flight of a class; mixed: drawn for each student
 Kinds = Literal["aisle", "loop", "mixed"]
 
-MIN_SECRET = 8
-# Named in every draw: another text gives other flights, and keys of another text cannot be extended
+MIN_SECRET = 8  # characters
+# part of every draw: if it changes, the flights change, and existing keys cannot be extended
 DRAW_LABEL = "px4fuse assignment 2"
-# Shares of flights with so many mistakes, where the number is not given. The loop has one mistake
-# to offer; with fewer flights without it, "false closure" would be a safe guess.
+# fractions of flights with 0, 1, 2 mistakes if --mistakes is not given. A loop has only one
+# possible mistake; with fewer flights without a mistake, "open-end" would be a safe guess
 COUNTS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
-# Of a class of both kinds
+# fraction of loops in a mixed class
 LOOP_SHARE = 1 / 3
-# Of the smallest size of a mistake that px4fuse finds in 19 of 20 flights, over the size in the
-# flight: between these everyone's lies
+# range of the difficulty: the smallest size that px4fuse detects in 19 of 20 flights, divided by
+# the size in the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 
 
 class AssignableMistake(Record, frozen=True):
-    """A mistake that may be drawn, at sizes at which it is found.
+    """Mistake that may be drawn, with detectable sizes.
 
     Attributes
     ----------
     mistake : str
         Name in :data:`px4fuse.simulation.mistakes.MISTAKES`.
     group : str
-        Of two of the same group, one would hide the other.
+        Mistakes of the same group are not combined: one would hide the other.
     limit : float or None
-        The smallest size, in ``unit``, from which on it is found in 19 of
-        20 flights (tests/studies/rates.csv); None for a mistake without a size.
+        Smallest size, in ``unit``, that px4fuse detects in 19 of 20 flights
+        (tests/studies/rates.csv); None for a mistake without a size.
     unit : str
-        As it is typed.
+        Unit as in ``--mistake``.
     less_is_plainer : bool
-        Whether a smaller number is the larger mistake.
+        A smaller number is a larger mistake.
     at_s : (float, float) or None
-        When it begins, where that can be said.
+        Range of the start time (s), for a mistake that has one.
     hides : tuple of str
-        Other groups whose mistakes this one hides, or whose mistakes hide it.
+        Groups that are not combined with this mistake.
     """
 
     mistake: str
@@ -68,15 +68,15 @@ class AssignableMistake(Record, frozen=True):
     hides: tuple[str, ...] = ()
 
     def goes_with(self, other: AssignableMistake) -> bool:
-        """Whether both are found in one flight."""
+        """Return True if both mistakes can be detected in one flight."""
         return not (
             self.group == other.group or self.group in other.hides or other.group in self.hides
         )
 
     def typed(self, difficulty: float, sign: float = 1.0, at: float = 0.5) -> str:
-        """As ``px4fuse simulate --mistake`` takes it, of the size that is as difficult.
+        """Format the mistake for ``px4fuse simulate --mistake``, with the size of a difficulty.
 
-        ``at``: when it begins, as a share of the span in which it may.
+        ``at``: start time, as fraction of its range.
         """
         if self.limit is None:
             return self.mistake
@@ -89,7 +89,7 @@ class AssignableMistake(Record, frozen=True):
 
 
 class DrawingRules(Record, frozen=True):
-    """What may be drawn for a kind of flight: numbers of the scenario, and mistakes.
+    """Rules for one kind of flight: possible mistakes, and numbers of the scenario.
 
     Numbers are (low, high, decimals), by field.
     """
@@ -104,16 +104,15 @@ ASSIGNABLE_MISTAKES = {kind: of.mistakes for kind, of in _OF_KIND.items()}
 
 @dataclass(frozen=True)
 class AssignedFlight:
-    """What was drawn for a student.
+    """Flight that was drawn for a student.
 
     Attributes
     ----------
     typed : tuple of str
-        The mistakes, as they are typed.
+        Mistakes, as ``--mistake`` reads them.
     difficulty : float
-        That of the hardest mistake; what has no size cannot be missed for being small. Only a
-        student who has looked for the smallest can say that there is none: such a flight is among
-        the hardest.
+        Difficulty of the hardest mistake. Mistakes without a size do not count. A flight without
+        mistakes has the highest difficulty: excluding all mistakes requires the most work.
     """
 
     scenario: Scenario
@@ -122,7 +121,7 @@ class AssignedFlight:
 
 
 def uniform(secret: bytes, student_id: str, kind: Kinds, label: str) -> float:
-    """A number in [0, 1) that only those who know the secret can tell."""
+    """Return a reproducible number in [0, 1); without the secret it cannot be predicted."""
     message = "\0".join((DRAW_LABEL, kind, normalise_text(student_id), label))
     digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
     return int.from_bytes(digest[:7], "big") / 2**56
@@ -131,30 +130,28 @@ def uniform(secret: bytes, student_id: str, kind: Kinds, label: str) -> float:
 def draw(
     secret: bytes, student_id: str, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> AssignedFlight:
-    """Draw one student's flight.
+    """Draw the flight of one student.
 
     Parameters
     ----------
     kind : {"aisle", "loop", "mixed"}
-        "mixed" draws which of the two.
+        "mixed" draws aisle or loop.
     count : int, optional
-        Of mistakes; None draws it.
+        Number of mistakes; drawn by default.
     truth : bool
-        Whether an aisle's log holds the truth. A loop's does not: it would tell where it landed.
+        The log of an aisle contains the ground truth. Logs of loops never do: ground truth
+        contains the landing place.
 
     Raises
     ------
     SettingsError
-        So many mistakes cannot be in one flight.
+        One flight cannot have this many mistakes.
     """
-    most = (
-        min(len(COUNTS[draw_number]) for draw_number in (COUNTS if kind == "mixed" else (kind,)))
-        - 1
-    )
-    if count is not None and not 0 <= count <= most:
+    max_count = min(len(COUNTS[k]) for k in (COUNTS if kind == "mixed" else (kind,))) - 1
+    if count is not None and not 0 <= count <= max_count:
         raise SettingsError(
-            f"--mistakes {count} is out of range: a flight of kind {kind} can have 0 to "
-            f"{most} mistakes that are all detectable."
+            f"--mistakes {count} is out of range: a flight of kind {kind} has 0 to "
+            f"{max_count} detectable mistakes."
         )
     if kind == "mixed":
         kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOP_SHARE else "aisle"
@@ -188,20 +185,18 @@ def draw(
 
 
 def encode_secret(text: str, where: str) -> bytes:
-    """A secret as bytes, from an option or a file.
+    """Return a secret as bytes; ``where`` names its option or file in errors.
 
     Raises
     ------
     SettingsError
-        It is too short to be one.
+        The secret is shorter than MIN_SECRET.
     """
     stripped = text.strip()
     if len(stripped) < MIN_SECRET:
         raise SettingsError(
-            (f"{where}: the secret has only {len(stripped)} characters and can be guessed."),
-            (
-                f"Use {MIN_SECRET} or more, or omit it: px4fuse then generates one and "
-                "stores it in the answer key."
-            ),
+            f"{where}: the secret has only {len(stripped)} characters and can be guessed.",
+            f"Use {MIN_SECRET} or more, or omit it: px4fuse then generates one and "
+            "stores it in the answer key.",
         )
     return stripped.encode(errors="replace")

@@ -1,4 +1,4 @@
-"""The answer key of an assignment: which flight each student was given, and what is wrong in it."""
+"""Answer key of an assignment: flight and mistakes of each student."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -6,16 +6,17 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from px4fuse.answers import update_values
 from px4fuse.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
 from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 
-# A thousand students take two million
+# bytes; a key of 1000 students has two million
 MAX_KEY_BYTES = 20_000_000
 NOTE = (
-    "For the instructor only: it says what is wrong in every student's flight. Do not hand it out "
-    "and do not put it into the students' folder."
+    "For the instructor only: this file lists the mistakes of every student's flight. Do not hand "
+    "it out, and do not put it into the students' folder."
 )
 _Text = Annotated[str, Meta(max_length=1000)]
 _Number = Annotated[float, Meta(gt=-1e12, lt=1e12)]
@@ -25,25 +26,25 @@ _Texts = Annotated[
 
 
 class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
-    """One student's flight.
+    """Flight of one student, with the right answers.
 
     Attributes
     ----------
     student_id, name : str
-        As in the roster.
+        As in the class list.
     file, sha256 : str
-        Of the log that was handed out.
+        File name and SHA-256 of the student's log.
     scenario : dict
-        What was flown: the fields of :class:`px4fuse.simulation.scenario.Scenario`.
+        Fields of :class:`px4fuse.simulation.scenario.Scenario`.
     mistakes : tuple of str
-        As ``px4fuse simulate --mistake`` takes them; empty for a flight without one.
+        As ``px4fuse simulate --mistake`` reads them; empty for a flight without a mistake.
     truth : dict
-        Numbers that the log does not say: ``sigma_z_m``, ``sigma_a_m_s2`` and
-        ``clock_offset_to_add_s`` among them.
+        Numbers that the log does not contain, such as ``sigma_z_m``, ``sigma_a_m_s2`` and
+        ``clock_offset_to_add_s``.
     difficulty : float or None
         See :class:`px4fuse.assignment.drawing.AssignedFlight`.
     form : FormTruth or None
-        The right answers to the form.
+        Right answers to the form.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -63,14 +64,14 @@ class _Schema(msgspec.Struct, frozen=True):
 
 
 class AnswerKey(msgspec.Struct, frozen=True):
-    """The answers of a class, as they are written.
+    """Answers of a class, as stored in the JSON file.
 
     Attributes
     ----------
     kind : str
-        Of the flights.
+        Kind of the flights.
     secret : str
-        From which the flights were drawn, where it was made up; else "".
+        Secret from which the flights were drawn, if px4fuse generated it; else "".
     """
 
     kind: _Text
@@ -81,23 +82,23 @@ class AnswerKey(msgspec.Struct, frozen=True):
     schema: _Schema = _Schema()
     note: str = NOTE
 
-    def __repr__(self) -> str:  # without the secret
+    def __repr__(self) -> str:  # hides the secret
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> Answer | None:
-        """The answer for an id, as a :class:`Register` knows it."""
+        """Return the answer for a student id, compared as in :class:`Register`."""
         student_index = Register(Person(a.student_id) for a in self.answers).student_index(
             Person(student_id)
         )
         return None if student_index is None else self.answers[student_index]
 
     def of_log(self, sha256: str) -> Answer | None:
-        """The answer for a log."""
+        """Return the answer for the SHA-256 of a log."""
         return next((a for a in self.answers if sha256 and a.sha256 == sha256), None)
 
 
 def key_text(key: AnswerKey) -> str:
-    """The key as JSON, for :func:`read_key`."""
+    """Format the answer key as JSON, for :func:`read_key`."""
     return msgspec.json.format(msgspec.json.encode(key), indent=1).decode() + "\n"
 
 
@@ -107,11 +108,11 @@ def read_key(path: Path) -> AnswerKey:
     Raises
     ------
     SettingsError
-        It cannot be read, or is not what ``px4fuse simulate --assignment`` wrote.
+        The file cannot be read, or was not written by ``px4fuse simulate --assignment``.
     """
     text = read_text(path, SettingsError, MAX_KEY_BYTES, name=str(path))
     try:
-        key = msgspec.json.decode(text, type=AnswerKey)
+        key = msgspec.convert(update_values(msgspec.json.decode(text)), AnswerKey)
         if len({normalise_text(answer.student_id) for answer in key.answers}) < len(key.answers):
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""The class list that a learning platform exports: who is in the class, and who somebody is."""
+"""Class list of a learning platform: students, and their identification."""
 
 import re
 import unicodedata
@@ -16,30 +16,30 @@ from px4fuse.results.reading import one_line
 
 MAX_NAME = 200
 MAX_STUDENTS = 1000
-# A file system takes 255 bytes, and a character up to 4
+# characters; a file name may have 255 bytes, and a character has up to 4
 MAX_STEM = 48
 RESERVED = {"con", "prn", "aux", "nul"} | {f"{n}{i}" for n in ("com", "lpt") for i in range(10)}
 COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
-# What another list may know besides
+# fields that a second list may add
 ADDED = ("name", "email", "login", "submitted")
-# Of Canvas, above the students
+# rows of Canvas that are not students
 NOT_STUDENTS = ("pointspossible", "studenttest")
 
 
 @dataclass(frozen=True)
 class Person:
-    """One of the class.
+    """Student of the class.
 
     Attributes
     ----------
     student_id, name, email : str
-        As the roster says.
+        As in the class list.
     login : str
-        By which Blackboard and ILIAS know the student.
+        Login on Blackboard or ILIAS.
     numbers : mapping
-        Platform to the number that it gave the student.
+        Number of the student on each platform, by platform.
     submitted : str
-        When Moodle's worksheet says that the student handed in, in its words.
+        Submission time as text, from Moodle's worksheet.
     """
 
     student_id: str
@@ -51,21 +51,21 @@ class Person:
 
     @property
     def file(self) -> str:
-        """Name of the student's log: the id, as far as a file system takes it."""
+        """File name of the student's log, made from the id."""
         return f"{file_stem(self.student_id)}.ulg"
 
 
 def read_people(sheet: Sheet) -> tuple[Person, ...]:
-    """The class list that a learning platform exports, or any table with a column of ids or names.
+    """Read the students from a class list, worksheet or gradebook.
 
     Columns are found by their titles: id (Student ID, ID number, Matrikelnummer, SIS User ID),
     login (Username, SIS Login ID), email, name (or first and last name). Worksheets of Moodle and
-    gradebooks of Canvas are class lists too.
+    gradebooks of Canvas are accepted.
 
     Raises
     ------
     SettingsError
-        No column tells who somebody is, or two rows have the same id.
+        No column identifies the students, or two rows have the same id.
     """
     if all(sheet.column(titles) is None for titles in COLUMNS.values()):
         raise SettingsError(
@@ -80,10 +80,8 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
         wanted = normalise_text(person.student_id)
         if wanted and rows.setdefault(wanted, number) != number:
             raise SettingsError(
-                (
-                    f"{sheet.path}: rows {rows[wanted]} and {number} have the same id "
-                    f"{one_line(person.student_id, 40)!r}."
-                ),
+                f"{sheet.path}: rows {rows[wanted]} and {number} have the same id "
+                f"{one_line(person.student_id, 40)!r}.",
                 "Give each student a unique id.",
             )
         people.append(person)
@@ -91,17 +89,19 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
 
 
 def read_roster(path: Path) -> tuple[Person, ...]:
-    """The class list from which an assignment is made: everyone has an id of its own.
+    """Read the class list of an assignment, in which each student has a unique id.
 
     Raises
     ------
     SettingsError
-        From :func:`~px4fuse.assignment.sheet.read_sheet` and :func:`read_people`, or no file
-        can be named after an id.
+        From :func:`~px4fuse.assignment.sheet.read_sheet` and :func:`read_people`, or an id cannot
+        be used as a file name.
     """
     people = read_people(read_sheet(path))
     if not people or len(people) > MAX_STUDENTS:
-        raise SettingsError(f"{path}: {len(people)} students", f"Give 1 to {MAX_STUDENTS}.")
+        raise SettingsError(
+            f"{path}: {len(people)} students.", f"A class list has 1 to {MAX_STUDENTS} students."
+        )
     stems: dict[str, Person] = {}
     for person in people:
         stem = file_stem(person.student_id)
@@ -115,7 +115,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
 
 
 def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
-    """The student in a row of a table; None for a row without one."""
+    """Read the student in a row of a table; None for a row without a student."""
     cells = {what: one_line(sheet.cell(row, titles), MAX_NAME) for what, titles in COLUMNS.items()}
     name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
     if re.sub(r"\W", "", name.casefold()) in NOT_STUDENTS:
@@ -133,11 +133,11 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
 
 
 class Register:
-    """The class, to be asked who somebody is; without people where nothing says who is in it."""
+    """Students of the class, with search by number, id, email, login or name."""
 
     def __init__(self, people: Iterable[Person] = (), *lists: Iterable[Person]) -> None:
         self.people = list(people)
-        # what other lists know of the same people; who is not among them is left out
+        # add fields from the other lists; people outside of the class are ignored
         for other in chain.from_iterable(lists):
             if (student_index := self.student_index(other)) is not None:
                 known_person = self.people[student_index]
@@ -150,33 +150,33 @@ class Register:
                 )
 
     def student_index(self, other: Person) -> int | None:
-        """Where somebody stands of whom another list knows: by number, id, email, login or name.
+        """Find a person of another list in the class; None if the match is not unique.
 
-        By the first of these that exactly one of the class has. Leading zeros, which spreadsheets
-        take away from ids, may be missing.
+        Criteria in this order: number, id, email, login, name. The first that matches exactly one
+        student decides. Leading zeros of ids may be missing, because spreadsheets remove them.
         """
         numbers = other.numbers.items()
         criteria: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
             *(
-                (_is_same_text, lambda one, at=at: one.numbers.get(at, ""), value)
+                (_is_same_text, lambda person, at=at: person.numbers.get(at, ""), value)
                 for at, value in numbers
             ),
             (_is_same_text, attrgetter("student_id"), other.student_id),
             (is_same_id, attrgetter("student_id"), other.student_id),
             (_is_same_text, attrgetter("email"), other.email),
-            # Blackboard's user name and ILIAS's login are ids where the roster has no other
-            (_is_same_text, lambda one: one.login or one.student_id, other.login),
+            # without a login in the class list, compare its id
+            (_is_same_text, lambda person: person.login or person.student_id, other.login),
             (is_same_name, attrgetter("name"), other.name),
         )
-        for same, known_person, value in criteria:
-            places = [at for at, one in enumerate(self.people) if same(known_person(one), value)]
+        for same, field_of, value in criteria:
+            places = [at for at, person in enumerate(self.people) if same(field_of(person), value)]
             if len(places) == 1:
                 return places[0]
         return None
 
 
 def normalise_text(text: str) -> str:
-    """Id or name for comparison: one spelling per character, case and outer spaces ignored."""
+    """Normalise an id or name for comparison: NFKC, without case and outer blanks."""
     return unicodedata.normalize("NFKC", text).strip().casefold()
 
 
@@ -185,7 +185,7 @@ def _is_same_text(known: str, other: str) -> bool:
 
 
 def is_same_id(one: str, other: str) -> bool:
-    """Whether two ids are the same; spreadsheets take away leading zeros.
+    """Return True if two ids are equal except for case and leading zeros.
 
     >>> is_same_id("0042", "42"), is_same_id("S1", "s1 "), is_same_id("00", "0")
     (True, True, False)
@@ -194,7 +194,7 @@ def is_same_id(one: str, other: str) -> bool:
 
 
 def is_same_name(one: str, other: str) -> bool:
-    """Whether two names have the same words in any order, or run together as Canvas has them.
+    """Return True if two names have the same words in any order, or joined as by Canvas.
 
     >>> is_same_name("Ada Lovelace", "Lovelace, Ada"), is_same_name("Ada Lovelace", "lovelaceada")
     (True, True)
@@ -209,7 +209,7 @@ def is_same_name(one: str, other: str) -> bool:
 
 
 def file_stem(student_id: str) -> str | None:
-    """An id as the name of a file on any system; None where nothing of it is left.
+    """Convert an id to a file name valid on all systems; None if no character remains.
 
     >>> file_stem("s01/2026"), file_stem("../../x"), file_stem("nul"), file_stem("=;")
     ('s01_2026', '_.._x', '_nul', None)
@@ -225,7 +225,7 @@ def file_stem(student_id: str) -> str | None:
 
 
 def make_unique(names: Iterable[str], form: str = "{} ({})") -> list[str]:
-    """Names with a number behind those that came before, however they are capitalised.
+    """Make names unique, ignoring case, by a number after repeated names.
 
     >>> make_unique(["notes", "cover", "Notes"])
     ['notes', 'cover', 'Notes (2)']
@@ -242,5 +242,5 @@ def make_unique(names: Iterable[str], form: str = "{} ({})") -> list[str]:
 
 
 def file_names(stems: Iterable[str]) -> list[str]:
-    """A name for each one's files on any system, unique ignoring case."""
+    """Make file names that are valid on all systems and unique, ignoring case."""
     return make_unique((file_stem(stem) or "report" for stem in stems), "{}-{}")

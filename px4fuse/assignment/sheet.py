@@ -1,8 +1,7 @@
-"""Tables that a learning platform or a person wrote, read so that they can be given back.
+"""Tables (CSV) of learning platforms and users: reading, and writing with changed cells.
 
-Spreadsheets and platforms differ in encoding (UTF-8 with and without a byte order mark, UTF-16,
-Windows-1252) and separator. What is filled in and given back says what the platform gave, but for
-the cells that are filled.
+Encodings (UTF-8 with and without byte order mark, UTF-16, Windows-1252) and separators are
+detected. A written table keeps the encoding and all cells that were not changed.
 """
 
 import codecs
@@ -23,14 +22,14 @@ SEPARATORS = ",;\t|"
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table with a header.
+    """Table with a header.
 
     Attributes
     ----------
     head : tuple of str
         Titles of the columns.
     rows : tuple of tuple of str
-        Each as long as ``head``, or longer.
+        Cells; each row has at least the length of ``head``.
     """
 
     path: Path
@@ -40,35 +39,35 @@ class Sheet:
     separator: str = ","
 
     def column(self, titles: Sequence[str]) -> int | None:
-        """Place of the first of these titles that is there, letters and digits compared."""
+        """Return the index of the first of these titles that exists, or None."""
         plain_titles = [normalise_title(title) for title in self.head]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
-        """What stands in a row under the first of these titles; "" where there is none."""
+        """Return the cell of a row under the first of these titles that exists; else ""."""
         column_index = self.column(titles)
         return "" if column_index is None else row[column_index].strip()
 
     @property
     def text(self) -> str:
-        """The table as CSV (RFC 4180), with its own separator."""
+        """Table as CSV (RFC 4180), with its original separator."""
         out = io.StringIO()
         csv.writer(out, delimiter=self.separator).writerows((self.head, *self.rows))
         return out.getvalue()
 
     def content(self) -> bytes:
-        """The file again, in its own encoding."""
+        """Encode the table in its original encoding."""
         try:
             return self.text.encode(self.encoding)
-        except UnicodeEncodeError:  # feedback holds more signs than a Windows code page
+        except UnicodeEncodeError:  # feedback may have characters outside of Windows-1252
             return self.text.encode("utf-8-sig")
 
 
 def normalise_title(title: str) -> str:
-    """A column title for comparison.
+    """Normalise a column title for comparison: lower-case letters and digits.
 
-    >>> normalise_title("SIS User ID"), normalise_title("Last modified (grade)"), normalise_title("E-Mail-Adresse")
-    ('sisuserid', 'lastmodifiedgrade', 'emailadresse')
+    >>> normalise_title("Last modified (grade)"), normalise_title("E-Mail-Adresse")
+    ('lastmodifiedgrade', 'emailadresse')
     """
     return "".join(filter(str.isalnum, title.casefold()))
 
@@ -79,39 +78,39 @@ def read_sheet(path: Path) -> Sheet:
     Raises
     ------
     SettingsError
-        It cannot be read, is not text, or has no header.
+        The file cannot be read, is not text, or has no header.
     """
     content = read_bytes_limited(
         path, SettingsError, MAX_BYTES, name=str(path), size_remedy="Give a CSV file of one class"
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
-        raise SettingsError(f"{path}: a spreadsheet", "Save it as CSV.")
+        raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save it as CSV.")
     encoding = "utf-8-sig" if content.startswith(codecs.BOM_UTF8) else "utf-8"
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = "utf-16"
     try:
         text = content.decode(encoding)
-    except UnicodeDecodeError:  # as spreadsheets on Windows save it
+    except UnicodeDecodeError:  # encoding of spreadsheets on Windows
         encoding = "cp1252"
         text = content.decode(encoding, errors="replace")
     if "\0" in text:
-        raise SettingsError(f"{path}: not text", "Give a CSV file with a header.")
+        raise SettingsError(f"{path} is not a text file.", "Give a CSV file with a header.")
     header = next((line for line in text.splitlines() if line.strip()), "")
-    # quoted cells may hold any of them
+    # quoted cells may contain separators
     separator = max(SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
     except csv.Error as error:
-        raise SettingsError(f"{path}: not a CSV file ({error}).") from error
+        raise SettingsError(f"{path} is not a CSV file ({error}).") from error
     head, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
     if not head:
-        raise SettingsError(f"{path}: empty", "Give a CSV file with a header.")
+        raise SettingsError(f"{path} is empty.", "Give a CSV file with a header.")
     padded_rows = (tuple(cells + [""] * (len(head) - len(cells))) for cells in rows)
     return Sheet(path, tuple(head), tuple(padded_rows), encoding, separator)
 
 
 def number(value: float | None) -> str:
-    """A number as spreadsheets read it; nothing for what is absent or not finite.
+    """Format a number for spreadsheets; "" if it is absent or not finite.
 
     >>> number(7.0), number(0.1 + 0.2), number(float("nan"))
     ('7', '0.3', '')
@@ -120,7 +119,7 @@ def number(value: float | None) -> str:
 
 
 def decimal(text: str) -> float | None:
-    """A number as people type it in tables, also with a comma; None for anything else.
+    """Parse a number with decimal point or comma; None if the text is not a number.
 
     >>> decimal("12,5"), decimal("1_5"), decimal("nan")
     (12.5, None, None)

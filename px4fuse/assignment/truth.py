@@ -1,4 +1,4 @@
-"""What the right answers to a simulated flight are: the key to its form."""
+"""Right answers to the form of a simulated flight."""
 
 import math
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.answers import GATE_UPDATES, FormQuestion, draw_questions
+from px4fuse.answers import GATE_UPDATES, FormQuestion, draw_questions, update_values
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
@@ -22,26 +22,27 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
-# A size may be off by this share and is right
+# relative error up to which a size is right
 TOLERANCE = 0.15
-# How closely a closure error can be read off
+# m; error up to which a closure error is right
 CLOSURE_WITHIN_M = 0.3
-# EKF2 has rejected samples from this share on
+# fraction of rejected samples from which the form must name rejection
 MIN_REJECTED_SHARE = 0.005
-# A reset of position that is seen, after EKF2 has found its first position
+# m, s; smallest position reset that counts, and time until EKF2 has its first position
 MIN_RESET_M, SETTLED_S = 0.2, 5.0
 EKF2_BEHAVIOUR = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
 class TrueMistake(Record, frozen=True):
-    """One mistake of a flight.
+    """Mistake of a simulated flight, with the range of right answers.
 
     Attributes
     ----------
     size : float or None
-        In the first unit of :data:`px4fuse.answers.MISTAKES`; from ``low`` to ``high`` is right.
+        In the first unit of :data:`px4fuse.answers.MISTAKES`; answers from ``low`` to ``high`` are
+        right.
     from_s, until_s : float or None
-        Since the first data; both None for the whole flight.
+        Time (s) since the first data; both None: the whole flight.
     """
 
     kind: str
@@ -53,23 +54,23 @@ class TrueMistake(Record, frozen=True):
 
 
 class VerdictTruth(Record, frozen=True):
-    """What the report says of a filter's innovation variance, and its factor in σ; or ""."""
+    """Verdict of the report on a filter's reported σ, and its factor in σ; "" without a verdict."""
 
     verdict: str
     factor: float | None = None
 
 
 class FormTruth(Record, frozen=True):
-    """The right answers to the form of one flight.
+    """Right answers to the form of one flight.
 
     Attributes
     ----------
     sigma_z_m : float
-        Of the source as it is.
+        True position noise of the source (1 σ).
     ekf2_did, ekf2_did_also : tuple of str
-        What has to be said, and what may be.
+        Behaviour of EKF2 that must be named, and that may be named.
     quantities : tuple
-        As :func:`px4fuse.answers.draw_questions` asks them; None where the flight is too short.
+        Answers to :func:`px4fuse.answers.draw_questions`; None if the flight is too short.
     """
 
     mistakes: tuple[TrueMistake, ...]
@@ -82,7 +83,7 @@ class FormTruth(Record, frozen=True):
 
 
 def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
-    """The right answers, from what was simulated and from the report as it comes."""
+    """Return the right answers, from the simulation and a comparison with default settings."""
     known = flights.answer(simulation)
     comparison = compare(flights.to_flight(simulation), Settings())
     mistakes = tuple(
@@ -107,12 +108,12 @@ def _true_mistake(
     if not sizes:
         return TrueMistake(name)
     size, tolerance = values[sizes[0]], TOLERANCE * abs(values[sizes[0]])
-    if name == "open-end":  # the log tells it with the drift of the odometry in it
+    if name == "open-end":  # the measurable size includes the odometry drift
         odometry = trajectory_of(comparison.flight, "vio")
         measured = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
         size, tolerance = measured if isinstance(measured, float) else size, CLOSURE_WITHIN_M
     low, high = size - tolerance, size + tolerance
-    if name == "clock-offset":  # what an ideal analysis of the log can tell
+    if name == "clock-offset":  # the 95 % interval of the estimated time offset is right, too
         _, found = noises_and_clock(comparison)
         if isinstance(found, ClockOffset) and found.determinable:
             low, high = min(low, -found.interval_s[1]), max(high, -found.interval_s[0])
@@ -134,47 +135,46 @@ def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
     filter_summary = comparison.main.filters[which]
     if not isinstance(filter_summary, FilterSummary):
         return VerdictTruth("")
-    word = filter_summary.verdict.removeprefix("variance ")
-    return VerdictTruth(word, None if word == "consistent" else filter_summary.sigma_error_factor)
+    verdict = update_values(filter_summary.verdict.removeprefix("variance "))
+    is_consistent = verdict == "consistent"
+    return VerdictTruth(verdict, None if is_consistent else filter_summary.sigma_error_factor)
 
 
 def _ekf2_behaviour(
     comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What EKF2 did in this flight: by what is wrong with it, and by what the log shows."""
+    """Return the behaviour of EKF2 that must be named and that may be named."""
     size_of = {wrong.kind: wrong.size or 0.0 for wrong in mistakes}
     required, allowed = (
         [behaviour for behaviour, kinds in EKF2_BEHAVIOUR[which].items() if kinds & size_of.keys()]
         for which in ("does", "may_do")
     )
     if size_of.get("ekf2-noise", 0.0) > sigma_z_m:
-        required.append("trusted the positions too little")
+        required.append("weighted the positions too little")
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
         has_bad_samples = "nlos" in size_of or "jump" in size_of
         if (innovations["rejected"] > 0).mean() > MIN_REJECTED_SHARE:
-            required.append(
-                "rejected the bad samples" if has_bad_samples else "rejected good samples"
-            )
+            required.append("rejected outliers" if has_bad_samples else "rejected good samples")
     ekf2 = comparison.flight.ekf2
     since_s = comparison.segment.start_s + SETTLED_S
     for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
         is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
         if is_large and reset.time_s > since_s:
-            required.append("coasted, then reset")
+            required.append("dead-reckoned, then reset")
     if not required:
-        required, allowed = ["nothing unusual"], ["followed the positions", *allowed]
+        required, allowed = ["normal"], ["followed the positions", *allowed]
     return tuple(dict.fromkeys(required)), tuple(
-        one for one in dict.fromkeys(allowed) if one not in required
+        behaviour for behaviour in dict.fromkeys(allowed) if behaviour not in required
     )
 
 
 def quantity_truth(
     result: AxisComparison, quantity: FormQuestion
 ) -> float | tuple[float, ...] | None:
-    """The answer to a question, from a replay with its settings; None where it never comes so far.
+    """Answer a question by a replay of KF with its settings; None if the flight is too short.
 
-    "silence" is the variance after the update, taken on by F and Q for so long (DT steps).
+    "silence": σ of the position after predictions by F and Q (steps of DT), without update.
     """
     settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
     run = replay(result.axis, settings)

@@ -1,5 +1,5 @@
-"""The instructor's side: reports that prove themselves, and a class graded.
+"""Grading of a class: verification and points of the reports that students hand in.
 
-What a student hands in is never trusted: it is read in bounded time and memory, nothing in it is
-executed, and no path, formula or markup of it reaches the file system or a table live.
+Handed-in files are not trusted: reading is bounded in time and memory, nothing in them is executed,
+and their paths, formulas and markup have no effect on the file system, tables or pages.
 """

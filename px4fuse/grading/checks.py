@@ -1,8 +1,7 @@
-"""The checks that a rubric can ask for: each is a kind of item, whose fields are its parameters.
+"""Checks of a rubric: each check is a class of items; its fields are the parameters.
 
-A check looks at the :class:`Evidence`. Three groups: of the report as such, of the filter
-(settings, consistency, the clocks that it rests on), and of a loop. A check is its class here, and
-an item of rubric.toml that explains it.
+A check scores the :class:`Evidence` of a report. ``rubric.toml`` describes each check: the report
+(verified, numbers, form, text), the filter (settings, consistency, time offset) and the loop.
 """
 
 from __future__ import annotations
@@ -41,29 +40,29 @@ from px4fuse.verification.verification import flatten, is_number, log_sha256
 
 MAX_QUOTE = 160
 NEEDS_BOTH_AXES = " (it needs the axes north and east: leave --axis out)"
-# What stands on one line
+# regular expression: no control characters
 _PLAIN = r"[^\x00-\x1f\x7f]"
 Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*$")]
 Title = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*[^\s\x00-\x1f\x7f]{_PLAIN}*$")]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
-# Share of the points, and why
+# share of the points (0 to 1), and its reason
 Scored = tuple[float, str]
 
 
 class RubricItem(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
 ):
-    """One part of the grade; each check is a kind of item, whose fields are its parameters.
+    """Part of the grade; subclasses implement the checks.
 
     Attributes
     ----------
     points : float
-        The most that it gives.
+        Maximum points.
     report : {"any", "compare", "loop"}
-        The reports that it is for; in others it is left out.
+        Command whose reports have this item.
     needs_key, by_hand : bool
-        Whether it takes an answer key, and whether only the instructor can score it.
+        The item needs an answer key; the item is scored by the instructor.
     """
 
     needs_key: ClassVar[bool] = False
@@ -74,16 +73,16 @@ class RubricItem(
     report: Literal["any", "compare", "loop"] = "any"
 
     def score(self, evidence: Evidence) -> Scored:
-        """Share of the points from 0 to 1, and a sentence that says why."""
+        """Return the share of the points (0 to 1), and a sentence with the reason."""
         raise NotImplementedError
 
     def applies(self, kind: str, key: AnswerKey | None) -> bool:
-        """Whether reports of this kind have it."""
+        """Return True if reports of this command have the item."""
         return self.report in ("any", kind) and (key is not None or not self.needs_key)
 
 
 def falling_share(off: float, factor: float) -> float:
-    """Share for what is off by a factor: 1 where it is not, 0 from ``factor`` on, by logarithms.
+    """Return the share for a deviation by a factor: 1 at 1, 0 from ``factor``, log scale.
 
     >>> [round(falling_share(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
@@ -95,9 +94,9 @@ def falling_share(off: float, factor: float) -> float:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a check may look at: a report's results, the verdict on them, and the answer key.
+    """Data for the checks: results of a report, verification verdict, and answer key.
 
-    ``owner_id`` is who handed it in by what a platform says, whatever the report says.
+    ``owner_id`` is the student id according to the learning platform.
     """
 
     results: Reported
@@ -107,22 +106,22 @@ class Evidence:
 
     @property
     def comparison(self) -> ComparisonResults | None:
-        """The results where they compare filters."""
+        """Results of compare; None for a loop report."""
         return None if isinstance(self.results, LoopResults) else self.results
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """What the results hold, for paths that a rubric names."""
+        """Values of the results, by path (keys joined by dots)."""
         return dict(flatten(to_plain(self.results)))
 
     @cached_property
     def answer(self) -> Answer | None:
-        """What is wrong with this log, where it is one of the answer key."""
+        """Answer for the log of the report; None if the log is not in the answer key."""
         return None if self.key is None else self.key.of_log(log_sha256(self.results))
 
     @cached_property
     def assigned_answer(self) -> Answer | None:
-        """What the answer key gave to this student; the platform knows better who that is."""
+        """Answer for the student, by the id of the platform, else of the report."""
         if self.key is None:
             return None
         claimed = self.key.of_student(text_of(self.results.student.id))
@@ -130,7 +129,7 @@ class Evidence:
 
     @cached_property
     def is_own_log(self) -> bool:
-        """Whether the answer key gave this log to this student; without a key nobody knows."""
+        """True if the log was given to this student, or without an answer key."""
         assigned_answer = self.assigned_answer
         return self.key is None or (
             assigned_answer is not None and assigned_answer.sha256 == log_sha256(self.results)
@@ -138,10 +137,10 @@ class Evidence:
 
     @cached_property
     def form(self) -> Answers | str:
-        """The form about this log, or why there is none."""
+        """Form about this log, or the reason why it is missing."""
         answers = self.results.student.answers
         if not isinstance(answers, Answers):
-            return "your form is not in your report: make it with --answers answers.toml"
+            return "your report contains no form: make the report with --answers FORM.toml"
         try:
             check(answers)
         except ValueError as error:
@@ -152,35 +151,35 @@ class Evidence:
 
     @cached_property
     def form_points(self) -> FormPoints | str:
-        """What the form is worth, or why nothing."""
+        """Points of the form, or the reason why it has none."""
         if self.answer is None or (self.assigned_answer and not self.is_own_log):
             assigned_answer = (
                 f" ({text_of(self.assigned_answer.file)})" if self.assigned_answer else ""
             )
             return (
-                f"this report is not about the log that you were given{assigned_answer}: make it of that "
-                "log, with your --id"
+                f"this report is not about the log that you were given{assigned_answer}; make a "
+                "report of that log, with your --id"
             )
         if isinstance(self.form, str):
             return self.form
         answer_key_form = self.answer.form
         return (
-            "the answer key has no answers"
+            "the answer key contains no answers to the form"
             if answer_key_form is None
             else form_points(self.form, answer_key_form)
         )
 
     def names_mistake(self, *kinds: str) -> bool:
-        """Whether the form names one of these mistakes."""
+        """Return True if the form names one of these kinds of mistakes."""
         form = self.form
         return isinstance(form, Answers) and any(one.kind in kinds for one in form.mistakes)
 
     def has_finding(self, finding: str) -> bool:
-        """Whether the report lists a finding."""
+        """Return True if the report contains a finding with this id."""
         return any(one.id == finding for one in self.results.findings)
 
     def missing_reason(self, path: str) -> str:
-        """Why there is nothing at a path, in brackets, as far as the results say it."""
+        """Format the reason for a missing value in brackets, if the results state it."""
         steps = path.split(".")
         for end in range(len(steps), 0, -1):
             for _, reason in values_at(self.values, ".".join((*steps[:end], "reason"))):
@@ -189,7 +188,7 @@ class Evidence:
 
 
 def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
-    """Paths and values where a path leads; ``*`` is every key, quotes may enclose names with dots.
+    """Return paths and values that match a path; ``*`` is any key, quotes enclose dots.
 
     >>> values_at({"a.b.c.0": 1, "a.b.c.d.0": 2}, 'a."b.c".*')
     [('a.b.c.0', 1)]
@@ -199,12 +198,12 @@ def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
 
 
 def text_of(value: str) -> str:
-    """One line of text, without control characters and not too long to be quoted."""
+    """Format a text on one line, without control characters, at most MAX_QUOTE characters."""
     return one_line(value, MAX_QUOTE)
 
 
 def in_brackets(reason: str) -> str:
-    """A reason behind what it is the reason of."""
+    """Format a reason in brackets, with a leading blank; "" without a reason."""
     text = text_of(reason).rstrip(".")
     return f" ({text})" if text else ""
 
@@ -212,23 +211,23 @@ def in_brackets(reason: str) -> str:
 # ------------------------------------------------------------------ the report
 
 
-NO_COMPARISON: Scored = (0.0, "Your report compares no filters.")
+NO_COMPARISON: Scored = (0.0, "Your report is not a compare report.")
 
 
 class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
-    """The numbers were computed again and agree."""
+    """Check that the numbers agree with a new run of the analysis on the log."""
 
     def score(self, evidence: Evidence) -> Scored:
-        """All or nothing."""
+        """Return 1 for a verified report, else 0."""
         verdict = evidence.verdict
         why = in_brackets("".join(verdict.reasons[:1]))
-        return float(verdict.status == "verified"), f"Verification says: {verdict.status}{why}."
+        return float(verdict.status == "verified"), f"Verification: {verdict.status}{why}."
 
 
 class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
-    """A number of the report is between bounds; where ``path`` has several the worst counts.
+    """Check that a number is within bounds; of several numbers on ``path`` the worst counts.
 
-    ``zero_at`` says from where on there are no points; without it there are none out of bounds.
+    Points decrease to zero at ``zero_at``; without ``zero_at`` there are none out of bounds.
     """
 
     path: Text
@@ -242,10 +241,12 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
     def __post_init__(self) -> None:
         bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
         if not bounded or self.at_least > self.at_most or self._width() < 0.0:
-            raise ValueError("give at_least, at_most or both, in this order, and zero_at beyond")
+            raise ValueError(
+                "give at_least, at_most or both (at_least <= at_most), and zero_at outside of them"
+            )
 
     def _width(self) -> float:
-        """How far beyond a bound there are no points any more."""
+        """Return the distance from a bound to ``zero_at``."""
         zero = self.zero_at
         return 0.0 if zero is None else max(self.at_least - zero, zero - self.at_most)
 
@@ -256,9 +257,9 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
         return max(1.0 - excess / self._width(), 0.0) if self._width() > 0.0 else 0.0
 
     def score(self, evidence: Evidence) -> Scored:
-        """1 within the bounds, falling to 0 at ``zero_at``."""
+        """Return 1 within the bounds, decreasing to 0 at ``zero_at``."""
         values = values_at(evidence.values, self.path)
-        values_by_path = {name: float(one) for name, one in values if is_number(one)}
+        values_by_path = {name: float(value) for name, value in values if is_number(value)}
         if not values_by_path:
             label = self.name or f"the number {self.path}"
             return (
@@ -271,16 +272,16 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
         limits = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
         statement = f"{capitalise_first(label)} is {f'{number:.4g} {self.unit}'.strip()}"
         advice = f" {self.advice}" if share < 1.0 and self.advice else ""
-        return share, f"{statement}; {' and '.join(limits)} was asked for.{advice}"
+        return share, f"{statement}; required: {' and '.join(limits)}.{advice}"
 
 
 class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
-    """The form about the flight, by the answer key."""
+    """Check the form about the flight against the answer key."""
 
     needs_key: ClassVar[bool] = True
 
     def score(self, evidence: Evidence) -> Scored:
-        """Share of the points of :mod:`px4fuse.grading.form_points`."""
+        """Return the share of the points of :mod:`px4fuse.grading.form_points`."""
         form_result = evidence.form_points
         if isinstance(form_result, str):
             return 0.0, f"{capitalise_first(form_result)}."
@@ -291,30 +292,31 @@ class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
         ]
         return (
             form_result.share,
-            f"Of 100: {', '.join(points_by_part)}. {capitalise_first('; '.join(form_result.feedback))}.",
+            f"Points of 100: {', '.join(points_by_part)}. "
+            f"{capitalise_first('; '.join(form_result.feedback))}.",
         )
 
 
 class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):
-    """The student's own text, which nobody but the instructor scores."""
+    """Text of the student, scored by the instructor."""
 
     needs_key: ClassVar[bool] = True
     by_hand: ClassVar[bool] = True
 
     def score(self, evidence: Evidence) -> Scored:
-        """Nothing, until the instructor says it."""
+        """Return 0, until the instructor gives points."""
         if not evidence.results.student.notes.strip():
-            return 0.0, "Your report has no text of your own; write one and add it with --notes."
+            return 0.0, "Your report has no text. Write a text and add it with --notes."
         return 0.0, "Your instructor reads your text and gives points for it."
 
 
 # ------------------------------------------------------------------ the filter
 
 
-# Findings about stamps for which no single offset is right
+# findings on timestamps that no constant offset corrects
 CHANGING_CLOCK_FINDINGS = ("source_clock_changes", "source_stamps_of_arrival")
 Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
-# How each noise is called, its unit, and its option
+# name in messages, unit and option of each noise
 NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
     "sigma_z_m": ("SIGMA_Z", "m", "--sigma-z"),
     "sigma_a_m_s2": ("SIGMA_A", "m/s²", "--sigma-a"),
@@ -322,13 +324,13 @@ NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
 
 
 class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
-    """A chosen noise is what the data ask for; none of the points from ``factor`` off."""
+    """Check that a noise fits its maximum-likelihood estimate; zero points from ``factor``."""
 
     setting: Sigma
     factor: Factor = 2.0
 
     def score(self, evidence: Evidence) -> Scored:
-        """1 in the interval, falling to 0 at ``factor`` from its end."""
+        """Return 1 within the 95 % interval, decreasing to 0 at ``factor`` from its end."""
         if evidence.comparison is None:
             return NO_COMPARISON
         return _score_tuning(evidence, evidence.comparison, self.setting, self.factor)
@@ -343,23 +345,26 @@ def _score_tuning(
     interval = getattr(tuned, f"{TUNED_FIELDS[name]}_interval", None)
     if interval is None or interval[1] is None:
         why = evidence.missing_reason(f"tuning.{HORIZONTAL}")
-        return 0.0, f"Your report has no interval for {label}{why}."
+        return 0.0, f"Your report has no 95 % interval for {label}{why}."
     low, high = interval
     if name == "sigma_z_m" and evidence.has_finding("source_may_drift"):
-        # small innovations do not make a drifting source trustworthy: up to its error is right
+        # innovations do not show the error of a drifting source: values up to this error are right
         high = max(high, _error_m(comparison))
     factor_off = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
     side = "within" if factor_off == 1.0 else "above" if chosen_value > high else "below"
-    statement = f"Your {label} {chosen_value:.3g} {unit} is {side} what the data ask for"
-    advice = f", by a factor of {format_factor(factor_off)}: try a value between with {option}"
-    ml_interval_text = f"({low:.3g} to {high:.3g} {unit})"
-    return falling_share(
-        factor_off, factor
-    ), f"{statement} {ml_interval_text}{advice * (factor_off != 1.0)}."
+    statement = (
+        f"Your {label} {chosen_value:.3g} {unit} is {side} the 95 % interval of the "
+        f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit})"
+    )
+    if factor_off != 1.0:
+        statement += (
+            f" by a factor of {format_factor(factor_off)}. Set {option} within this interval"
+        )
+    return falling_share(factor_off, factor), f"{statement}."
 
 
 def _error_m(comparison: ComparisonResults) -> float:
-    """How wrong a source that drifts is, as far as a loop or the truth tells; 0 where neither."""
+    """Return the largest known error (m) of the source, by ground truth or loop; else 0."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
     errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
     if isinstance(comparison.loop, LoopResult):
@@ -368,99 +373,101 @@ def _error_m(comparison: ComparisonResults) -> float:
 
 
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
-    """The filter is consistent, or no setting makes it so; no points from ``factor`` in σ on."""
+    """Check that KF is consistent, or that no setting makes it so; zero from ``factor`` in σ."""
 
     factor: Factor = SIGMA_FACTOR_FINDING
 
     def score(self, evidence: Evidence) -> Scored:
-        """By the verdict on both horizontal axes together."""
+        """Score the NIS verdict on north and east together."""
         comparison = evidence.comparison
         if comparison is None:
             return NO_COMPARISON
         nis_result = comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
             why = evidence.missing_reason(f"{HORIZONTAL}.kf")
-            return 0.0, f"There is no verdict on your filter{why}."
+            return 0.0, f"Your report has no verdict on KF{why}."
         if nis_result.verdict == "consistent":
-            return 1.0, "Your filter is consistent."
-        statement = f"{capitalise_first(nis_result.verdict)} {format_factor(nis_result.sigma_error_factor)} times in σ"
+            return 1.0, "KF is consistent."
+        side = "small" if nis_result.nis_mean > 1.0 else "large"
+        factor_text = format_factor(nis_result.sigma_error_factor)
+        statement = f"The reported σ of KF is {factor_text} times too {side}"
         if all(_score_tuning(evidence, comparison, name)[0] == 1.0 for name in NOISE_SETTINGS):
             return 1.0, (
-                f"{statement}, with the noises that the data ask for: what is left no setting fixes."
+                f"{statement}, although both noises fit the data: no setting corrects the rest."
             )
         return falling_share(nis_result.sigma_error_factor, self.factor), (
-            f"{statement}: look at what the tuning page asks for, and for what the model does not "
-            "explain."
+            f"{statement}. Compare your noises with the tuning page, and look for errors that the "
+            "noise model does not contain."
         )
 
 
 class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
-    """The clock offset that was applied is what the data ask for.
+    """Check that the applied time offset agrees with the estimated one.
 
-    ``undeterminable`` is the share of the points where the flight does not tell; of a flight that
-    was handed out, which the student did not choose, all of them.
+    ``undeterminable``: share of the points if the flight does not determine the offset. For a
+    handed-out log, which the student did not choose, all points are given.
     """
 
     margin_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.03
     undeterminable: Share = 0.5
 
     def score(self, evidence: Evidence) -> Scored:
-        """All or nothing, ``undeterminable`` where the flight does not tell."""
+        """Return 1 or 0; ``undeterminable`` if the offset cannot be estimated."""
         if evidence.comparison is None:
             return NO_COMPARISON
         clock = evidence.comparison.clock
         if not isinstance(clock, Clock) or not clock.determinable:
             share = self.undeterminable if isinstance(clock, Clock) else 0.0
             why = in_brackets(clock.reason or "")
-            statement = f"Your flight does not determine the clock offset{why}."
+            statement = f"The time offset cannot be estimated from your flight{why}."
             return 1.0 if evidence.answer is not None else share, statement
         (low, high), applied = clock.interval_s, clock.applied_s
-        statement = f"You applied a clock offset of {applied:.3f} s"
+        statement = f"You applied a time offset of {applied:.3f} s"
         if low - self.margin_s <= applied <= high + self.margin_s:
-            return 1.0, f"{statement}, which is what the data ask for ({low:.3f} to {high:.3f} s)."
+            return 1.0, f"{statement}; the estimate is {low:.3f} to {high:.3f} s (95 %)."
         if any(map(evidence.has_finding, CHANGING_CLOCK_FINDINGS)):
-            statement = "The offset of the position stamps changes in your flight"
+            statement = "The time offset changes in your flight"
             known = evidence.names_mistake("clock-jump", "clock-drift")
-            advice = ", as your form says" if known else "; say in your form from when on it holds"
+            advice = ", as your form states" if known else "; state its time in your form"
             return 1.0 if known else self.undeterminable, f"{statement}{advice}."
         return (
             0.0,
-            f"{statement} where the data ask for {low:.3f} to {high:.3f} s: --clock-offset auto.",
+            f"{statement}, but the estimate is {low:.3f} to {high:.3f} s (95 %). "
+            "Use --clock-offset auto.",
         )
 
 
 # ------------------------------------------------------------------ a loop
 
 
-# Distance of landing and take-off up to which a loop is closed (m): the accuracy of a tape
+# m; distance of landing and take-off up to which a loop is closed (accuracy of a measuring tape)
 CLOSED_M = 0.5
-# Share of the last quarter for a corrected path without a reference, which has no ATE
+# share of the last quarter for a corrected path without a reference (no ATE)
 NO_REFERENCE_SHARE = 0.5
 
 
 class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
-    """Quarters: closure error measured, closure accepted, path corrected, ATE reduced.
+    """Check a loop; a quarter each: error measured, closure accepted, path corrected, ATE reduced.
 
-    A flight that by the answer key ended elsewhere has all of them for a path without an accepted
-    closure.
+    If the vehicle landed elsewhere (answer key), a path without an accepted closure has all points.
     """
 
     def score(self, evidence: Evidence) -> Scored:
-        """Return the quarters, and a sentence with closure error and ATE."""
+        """Return the share of the four quarters, and a sentence with closure error and ATE."""
         loop = evidence.results.loop
         accepted = isinstance(loop, LoopResult) and any(one.accepted for one in loop.closures)
         landed_m = evidence.answer.truth.get("closure_error_m") if evidence.answer else None
         if landed_m is not None and landed_m > CLOSED_M and not accepted:
             landed = format_length(landed_m)
-            return 1.0, f"Your vehicle landed {landed} from the take-off: the path stays as it is."
+            return 1.0, f"Your vehicle landed {landed} from take-off: no correction is right."
         if not isinstance(loop, LoopResult) or loop.closure_error_m is None:
             missing = loop.known_end if isinstance(loop, LoopResult) else loop
             why = in_brackets(getattr(missing, "reason", ""))
-            return 0.0, f"Your report measures no loop{why}."
+            return 0.0, f"Your report contains no loop closure error{why}."
         if loop.absolute:
-            return 0.0, "Your loop is on a track that does not drift; measure it on odometry."
+            return 0.0, "The track of your loop does not drift. Measure the loop on odometry."
         error_text, path = format_length(loop.closure_error_m), format_length(loop.path_length_m)
-        statement = f"You measured a closure error of {error_text} in {path}"
+        statement = f"You measured a loop closure error of {error_text} after {path}"
         if not accepted:
             return 0.25, f"{statement}; no closure was accepted."
         corrected, comment = _score_corrections(loop.corrections)
@@ -468,11 +475,11 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
 
 
 def _score_corrections(corrections: Mapping[Way, OrUnavailable[Correction]]) -> Scored:
-    """One for a corrected path and one for an ATE below the uncorrected one."""
+    """Return 1 for a corrected path, plus 1 for an ATE below the uncorrected one."""
     ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
     corrected_paths = [one for one in map(corrections.get, ways) if isinstance(one, Correction)]
     if not corrected_paths:
-        return 0.0, ", but the path is not corrected."
+        return 0.0, ", but the path was not corrected."
     before = _ate_by_reference(corrections.get("uncorrected"))
     pairs = [
         (before[name], after_m)
@@ -482,18 +489,17 @@ def _score_corrections(corrections: Mapping[Way, OrUnavailable[Correction]]) -> 
     ]
     if not pairs:
         return 1.0 + NO_REFERENCE_SHARE, (
-            ", and corrected the path, but not against a reference: with --reference its error "
-            "would show."
+            " and the path corrected. Without a reference its error is unknown; use --reference."
         )
     before_m, after_m = min(pairs, key=lambda pair: pair[1] / pair[0])
-    changed = f", and corrected the path, whose ATE went from {before_m:.3g} m to {after_m:.3g} m"
+    changed = f" and the path corrected. Its ATE changed from {before_m:.3g} m to {after_m:.3g} m"
     if after_m < before_m:
         return 2.0, f"{changed}."
-    return 1.0, f"{changed}: explain why the correction makes it worse."
+    return 1.0, f"{changed}. Explain why the correction increases the error."
 
 
 def _ate_by_reference(correction: object) -> dict[str, float]:
-    """ATE (m) of a correction by the reference that it was scored against."""
+    """Return the ATE (m) of a correction, by reference."""
     scores = correction.scores if isinstance(correction, Correction) else {}
     return {
         name: one.ate.translation_m.rmse for name, one in scores.items() if isinstance(one, Score)

@@ -1,7 +1,7 @@
-"""A class as one web page: a student per row, and on top what an instructor asks.
+"""Class page: one web page with a row per student, and statistics of the class above.
 
-Nothing that a student wrote can act: see :mod:`px4fuse.webpage`. The redrawn PDFs stand in a
-folder beside the page.
+Texts of students cannot act as HTML or scripts: see :mod:`px4fuse.webpage`. The redrawn PDFs are in
+a folder beside the page.
 """
 
 import math
@@ -21,8 +21,8 @@ from px4fuse.webpage.frame import Cell, Column, Part, Row
 from px4fuse.webpage.safe import local_link, template
 
 BINS = 10
-MISSING = "nothing handed in"
-# How each status looks, and its sign, from the best to what says nothing
+MISSING = "no submission"
+# style and symbol of each status, from best to undecided
 STATUS_STYLES: dict[str, tuple[str, str]] = {
     "verified": ("good", "✓"),
     "numbers differ": ("bad", "≠"),
@@ -32,11 +32,11 @@ STATUS_STYLES: dict[str, tuple[str, str]] = {
     MISSING: ("open", "–"),
 }
 STATUSES = tuple(STATUS_STYLES)
-FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "said by you")
+FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "set by instructor")
 
 
 def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
-    """Lay out a class as one HTML file.
+    """Format a class as one HTML file.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
     Returns
     -------
     str
-        Write it as UTF-8. The same for the same input: no dates of today.
+        HTML, to be written as UTF-8; equal for equal input (no current date).
     """
     items, numbers = columns(entries)
     counts = Counter(tag for entry in entries for tag in _tags(entry))
@@ -79,7 +79,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
 
 
 def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
-    """What stands above the table: counts, the points of all, and those of each item."""
+    """Format the part above the table: counts, points of the class and of each item."""
     totals = [entry.total for entry in entries if entry.total is not None]
     most = max((entry.of for entry in entries if entry.of > 0.0), default=1.0)
     graded = [one for entry in entries if (one := entry.counting)]
@@ -96,7 +96,7 @@ def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
 
 
 def _items(graded: Sequence[GradedReport]) -> Iterator[tuple[Any, ...]]:
-    """Distribution of points per item, as they count: a row of the table each."""
+    """Yield title and distribution of the points of each item."""
     items_by_title: dict[str, list[Item]] = defaultdict(list)
     for one in graded:
         for item in () if one.pending else one.items:
@@ -109,7 +109,7 @@ def _items(graded: Sequence[GradedReport]) -> Iterator[tuple[Any, ...]]:
 
 
 def tenths(values: Sequence[float], most: float) -> list[tuple[int, str]]:
-    """How many values lie in each tenth from 0 to ``most``, and where it begins, in words.
+    """Count the values in each tenth from 0 to ``most``; return counts and lower edges.
 
     >>> tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
@@ -126,11 +126,10 @@ def _tags(entry: Entry) -> list[str]:
     if one:
         tags += ["pending"] * bool(one.pending) + ["to read"] * one.awaits_points
         tags += [f"missed: {mistake}" for mistake, is_named in one.mistakes.items() if not is_named]
-    return tags + ["said by you"] * bool(entry.overrides or entry.comment)
+    return tags + ["set by instructor"] * bool(entry.overrides or entry.comment)
 
 
 def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
-    """One student."""
     one = entry.counting
     status = one.status if one else MISSING
     style, sign = STATUS_STYLES[status]
@@ -152,19 +151,19 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
         *(frame.number_cell(points.get(name)) for name in items),
         *(frame.number_cell(number_values.get(name)) for name in numbers),
     )
-    # who has neither id nor file cannot be named in overrides.csv
+    # overrides.csv identifies students by id or file
     box_parts = (_point_boxes(entry),) if entry.student_id or file else ()
-    # the name of the file may name its student
-    report = [("Drawn again from the log (PDF)", local_link(one.redrawn_name))] if one else []
-    report_parts = (frame.links_part("The report", report),)
+    # not for pseudonyms: the file name may contain the student's name
+    report = [("Redrawn from the log (PDF)", local_link(one.redrawn_name))] if one else []
+    report_parts = (frame.links_part("Report", report),)
     return Row(cells, tuple(_tags(entry)), (*_details(entry), *box_parts), report_parts)
 
 
 def _details(entry: Entry) -> Iterator[Part]:
-    """What a row unfolds to, as long as nobody is to be hidden."""
+    """Yield the unfolded details of a row; without names for pseudonyms."""
     one, comment = entry.counting, frame.prose_part("Your comment", entry.comment)
     if one is None:
-        yield frame.list_part("Missing", ["Nothing was handed in."])
+        yield frame.list_part("Missing", ["No submission."])
         yield comment
         return
     verdict = one.verdict
@@ -176,19 +175,19 @@ def _details(entry: Entry) -> Iterator[Part]:
     attempts = [f"{other.submission}: {other.status}" for other in entry.others]
     yield frame.list_part("Flags", entry.flags, warn=True)
     yield frame.list_part(
-        "Pending: what you can do", [one.pending] if one.pending else [], warn=True
+        "Pending: action required", [one.pending] if one.pending else [], warn=True
     )
     yield frame.list_part("Verification", verdict.reasons)
-    heads = ("Where", "Report", "New run") if differ else ()
-    yield frame.table_part("The first numbers that differ", heads, differ)
+    heads = ("Value", "Report", "New run") if differ else ()
+    yield frame.table_part("First differing numbers", heads, differ)
     title = "Points (proposed)" if one.pending else "Points"
     yield frame.table_part(
         title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2)
     )
     yield comment
     yield frame.list_part("Mistakes of this flight", named_texts)
-    yield frame.pairs_part("The form", [*form_rows(one.form)] if one.form else [])
-    yield frame.prose_part("The student's own words", one.notes)
+    yield frame.pairs_part("Answer form", [*form_rows(one.form)] if one.form else [])
+    yield frame.prose_part("Text of the student", one.notes)
     yield frame.list_part("Other attempts", attempts)
 
 
@@ -198,16 +197,18 @@ def _points_cell(entry: Entry) -> Cell:
         proposed = f"{number(one.points)} proposed" if one and one.counted is None else ""
         return Cell("pending" if proposed else "–", None, proposed)
     share = min(max(entry.total / entry.of, 0.0), 1.0) if entry.of > 0.0 else None
-    notes = [f"{number(entry.deduction)} off for being late"] * bool(entry.deduction)
-    notes += ["said by you"] * any(each.points is not None for each in entry.overrides.values())
+    notes = [f"{number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
+    notes += ["set by instructor"] * any(
+        each.points is not None for each in entry.overrides.values()
+    )
     text = f"{number(entry.total)} / {number(entry.of)}"
     return Cell(text, entry.total, ", ".join(notes), "", share)
 
 
 def _point_boxes(entry: Entry) -> Part:
-    """Points and a comment for what only the instructor scores, and for the whole.
+    """Input boxes for the items that the instructor scores, and for the total.
 
-    With all else that overrides.csv says, since the download takes its place.
+    Other rows of overrides.csv are included, because the download replaces the file.
     """
     one = entry.counting
     by_hand = {item.title: item.of for item in (one.items if one else ()) if item.by_hand}
@@ -222,4 +223,4 @@ def _point_boxes(entry: Entry) -> Part:
         if title not in by_hand
     ]
     owner = entry.student_id or (one.submission if one else "")
-    return frame.boxes_part("Your points and words", owner, rows, other_rows)
+    return frame.boxes_part("Your points and comments", owner, rows, other_rows)

@@ -1,10 +1,8 @@
-"""From what was handed in to one row per student: which attempt counts, and what it is worth.
+"""Rows of a class: the attempt that counts for each student, its deduction, and overrides.
 
-The instructor's word, ``overrides.csv``, counts instead of the rules.
-
-Points are taken off for every started day (or hour) after the due time: so many per cent of the
-most points that there are to have, never more than the limit that the rule names, and never below
-zero points.
+``overrides.csv`` of the instructor takes precedence over the rules. A late deduction is a
+percentage of the maximum points for each started day (or hour) after the due time. It is limited by
+the maximum that the rule states, and the total is never negative.
 """
 
 import math
@@ -29,36 +27,38 @@ from px4fuse.grading.rubric import Rubric
 from px4fuse.results.reading import clean_text, one_line
 
 TIME_FORMAT = "%Y-%m-%d %H:%M"
-# What the instructor says instead of the rules: a table that is read and never written over
+# table of points and comments by the instructor; never overwritten
 OVERRIDES_NAME = "overrides.csv"
 OVERRIDE_TITLES = ("id", "item", "points", "comment")
 OVERRIDES_TEMPLATE = "\ufeff" + ",".join(OVERRIDE_TITLES) + "\r\n"
 MAX_OVERRIDE_POINTS = 1e6
 MAX_COMMENT_LENGTH = 10_000
 
-# Id as it was typed, to item as it was typed ("" for all of it), to what is said
+# override by student id and item as typed ("": the whole report)
 Overrides = Mapping[str, Mapping[str, Override]]
-# What being late costs, as it is typed
+# format of --late
 _RULE = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
     r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
 )
-# Moodle's strftimedaydatetime in English, with hours of twelve and of twenty-four
+# Moodle's strftimedaydatetime in English, with 12 and 24 hours
 _MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
 
 
 @dataclass(frozen=True)
 class LateRule:
-    """What late hand-ins cost.
+    """Deduction for late submissions.
 
     Attributes
     ----------
     share : float
-        Of the most points, for every started unit.
+        Fraction of the maximum points, per started unit.
+    unit_s : float
+        Length of the unit (s).
     max_share : float
-        Share that is never exceeded.
+        Maximum fraction.
     text : str
-        As it was given.
+        Rule as typed.
     """
 
     share: float
@@ -67,7 +67,7 @@ class LateRule:
     text: str
 
     def deduction(self, late_s: float, of: float) -> float:
-        """Points that are taken off.
+        """Compute the points that are deducted.
 
         >>> late_rule("10%/day").deduction(86_401.0, 50.0)
         10.0
@@ -80,31 +80,31 @@ class LateRule:
 
 @dataclass(frozen=True)
 class Course:
-    """What is known of a class besides what it handed in, and its rules.
+    """Class and grading rules, without the submissions.
 
     Attributes
     ----------
     rubric : Rubric
     key : AnswerKey or None
-        Which mistakes each student's flight has.
+        Mistakes of each student's flight.
     logs : sequence of Path
-        Flight logs and folders of them; a report names its log by SHA-256.
+        Flight logs and folders of them; the log of a report is found by SHA-256.
     title : str
-        Of the class page; by default the rubric's.
+        Title of the class page; by default that of the rubric.
     roster : tuple of Person or None
-        Without one the students of the answer key, else those of the worksheets.
+        Class list; by default the students of the answer key, else of the worksheets.
     worksheets : tuple of Sheet
-        Tables of learning platforms, to be filled in.
+        Tables of learning platforms that receive the grades.
     column : str
-        Of the worksheets, for the grade; "" where there is only one.
+        Title of their grade column; "" if there is only one.
     attempt : {"latest", "best", "first"}
-        Which one counts of several.
+        Attempt that counts.
     due : datetime or None
-        With a time zone.
+        Due time, with time zone.
     include_pending : bool
-        Whether points that wait for the instructor are entered as they are proposed.
+        Enter pending points as proposed.
     anonymous : bool
-        Whether the class page shows pseudonyms.
+        Show pseudonyms on the class page.
     """
 
     rubric: Rubric
@@ -122,17 +122,16 @@ class Course:
 
     @cached_property
     def register(self) -> Register:
-        """Who is in the class, with what all worksheets know of them."""
+        """Students of the class, with the fields of all worksheets."""
         people_by_sheet = [read_people(sheet) for sheet in self.worksheets]
         handed_out_flights = self.key.answers if self.key else ()
-        handed_out = tuple(Person(one.student_id, one.name) for one in handed_out_flights)
+        handed_out = tuple(Person(answer.student_id, answer.name) for answer in handed_out_flights)
         return Register(
             self.roster or handed_out or next(iter(people_by_sheet), ()), *people_by_sheet
         )
 
 
-# When it came and when it was packed, by which attempts are ordered; the file; and the row that it
-# would make alone
+# sort key (submission time, zip time); graded file; row of the student with this file only
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
@@ -142,22 +141,22 @@ def class_entries(
     course: Course,
     overrides: Overrides,
 ) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
-    """Lay out a class: everyone in the register, then what belongs to nobody in it.
+    """Make the rows of a class: all students, then the reports of unknown students.
 
-    A file belongs to whom the platform says; where it says nothing that the register knows, to
-    whom the report names, by id, then by name. Without a register every student that the reports
-    or the platform name has a row.
+    A file belongs to the student that the platform names. If the class list does not contain this
+    student, it belongs to the student in the report, by id, then by name. Without a class list each
+    student that a report or platform names has a row.
 
     Parameters
     ----------
     graded, submissions : sequences
-        Of every file, in one order.
+        All files, in the same order.
 
     Returns
     -------
     entries : tuple of Entry
     notes : tuple of str
-        On overrides that fit nobody.
+        Overrides that match no student or item.
     """
     everyone = course.register if course.register.people else _people_named(graded, submissions)
     attempts: dict[int | None, list[Attempt]] = defaultdict(list)
@@ -173,8 +172,8 @@ def class_entries(
         else Entry(person.name, person.student_id, None, of=max_points)
         for at, person in enumerate(everyone.people)
     ]
-    nobody = "Neither the report nor the platform names anyone."
-    note = "Not in the roster." if course.register.people else nobody
+    no_name = "Neither the report nor the platform names a student."
+    note = "Not in the class list." if course.register.people else no_name
     class_rows += [replace(entry, flags=(note, *entry.flags)) for *_, entry in attempts[None]]
     overrides_by_entry, notes = match_overrides(overrides, class_rows)
     common_flags = class_flags([entry.counting for entry in class_rows if entry.counting])
@@ -186,7 +185,7 @@ def class_entries(
 
 
 def _people_named(graded: Sequence[GradedReport], submissions: Sequence[Submission]) -> Register:
-    """Without a roster: everyone whom a platform, else a report, names; each once."""
+    """Return each student that a platform or report names, once, if there is no class list."""
     register = Register()
     for one, submission in zip(graded, submissions, strict=True):
         person = submission.origin.person
@@ -194,7 +193,7 @@ def _people_named(graded: Sequence[GradedReport], submissions: Sequence[Submissi
         if person.numbers or person.login:
             if register.student_index(person) is not None:
                 continue
-            # two students may not hand in under one id: the second is known by the platform alone
+            # an id belongs to one student: a second one is identified by the platform only
             student_id = person.student_id or ("" if claimed is not None else one.student_id)
             name = one_line(one.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
@@ -211,7 +210,7 @@ def _attempt(
     student_index: int | None,
     register: Register,
 ) -> Attempt:
-    """One file as if it were the only one of its student."""
+    """Make the row of a student from one file."""
     origin, due = submission.origin, course.due
     platform = origin.platform.capitalize()
     person = Person(graded.student_id) if student_index is None else register.people[student_index]
@@ -220,23 +219,25 @@ def _attempt(
     late_s = None
     flags = []
     if due is not None and time is not None:
-        # not their difference: in one zone Python takes the clock's, also over a change of it
+        # timestamps, because Python's difference in one time zone ignores daylight saving
         late_s = max(time.timestamp() - due.timestamp(), 0.0)
     elif origin.late:
-        flags.append(f"{platform} marks it as late and not by how much: nothing was taken off.")
+        flags.append(f"{platform} marks the file as late, without a time: no points deducted.")
     elif course.late and due and packed and packed.timestamp() > due.timestamp():
         flags.append(
-            f"The zip file dates it {packed.strftime(TIME_FORMAT)}, after the due time; that may be when "
-            "it was downloaded, so nothing was taken off."
+            f"Time in the zip file: {packed.strftime(TIME_FORMAT)}, after the due time. It may be "
+            "the time of the download, so no points were deducted."
         )
     if origin.is_imitated:
-        flags.append(f"Its name has more of a platform's than {platform or 'none'} writes.")
+        flags.append(
+            f"The file name imitates the names of a platform (found: {platform or 'none'})."
+        )
     claimed = register.student_index(Person(graded.student_id)) if origin.platform else None
     if claimed is not None and student_index is not None and claimed != student_index:
         other = register.people[claimed]
         flags.append(
-            f"The report gives the id of {other.student_id} ({other.name or 'no name'}), but "
-            f"{platform} says who handed it in."
+            f"The id in the report is that of {other.student_id} ({other.name or 'no name'}), but "
+            f"{platform} names another student."
         )
     entry = Entry(
         person.name or one_line(graded.student or origin.person.name, 200),
@@ -254,40 +255,41 @@ def _attempt(
 
 
 def _points_after_deduction(attempt: Attempt) -> float:
-    """For the best of several: what it gives without what the instructor has still to say."""
+    """Points minus deduction, for comparing attempts; pending points as proposed."""
     _, one, entry = attempt
     return max(one.points - entry.deduction, 0.0)
 
 
 def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
-    """The attempt that counts, with the others and what that needs said."""
-    # by time, of one submission the better file later
+    """Choose the attempt that counts, and flag ambiguities."""
+    # by time; several files of one submission by points
     ordered = sorted(
         attempts, key=lambda one: (one[0], _points_after_deduction(one), one[1].submission)
     )
-    # what is pending, such as another's report under this id, or no report counts only where there
-    # is nothing else
-    reports = [one for one in ordered if one[1].version]
-    eligible = [one for one in reports if not one[1].pending] or reports or ordered
+    # pending reports and files that are not reports count only if there are no others
+    reports = [attempt for attempt in ordered if attempt[1].version]
+    eligible = [attempt for attempt in reports if not attempt[1].pending] or reports or ordered
     attempts_by_rule = {
         "latest": eligible[-1],
-        # several files of one submission: the best
-        "first": [one for one in eligible if one[0] == eligible[0][0]][-1],
+        # of several files of one submission the best
+        "first": [attempt for attempt in eligible if attempt[0] == eligible[0][0]][-1],
         "best": max(reversed(eligible), key=_points_after_deduction),
     }[course.attempt]
     stamps, graded, entry = attempts_by_rule
     flags = list(entry.flags)
     others = tuple(one for _, one, _ in ordered if one is not graded)
     simultaneous = [one for stamp, one, _ in eligible if stamp == stamps]
-    if course.attempt != "best" and len({one.form for one in simultaneous}) > 1:  # a guess in each
-        question = f"Ask which of {len(simultaneous)} reports is meant: their forms differ."
+    if (
+        course.attempt != "best" and len({one.form for one in simultaneous}) > 1
+    ):  # different guesses
+        question = f"Ask which of {len(simultaneous)} reports counts: their forms differ."
         graded = replace(graded, pending=question)
     elif len(simultaneous) > 1 and any(stamps):
-        flags.append(f"{len(simultaneous)} reports came at the same time; the best of them counts.")
+        flags.append(f"{len(simultaneous)} reports have the same time; the best one counts.")
     for stamp, one, _ in ordered:
         if one in others and stamp >= stamps and (one.pending or not one.version):
-            why = "is pending" if one.version else "cannot be read as a report"
-            flags.append(f"{one_line(one.submission, 80)} {why}, so that another file counts.")
+            why = "is pending" if one.version else "is not a report"
+            flags.append(f"{one_line(one.submission, 80)} {why}, so another file counts.")
     return replace(entry, counting=graded, others=others, flags=tuple(flags))
 
 
@@ -297,7 +299,7 @@ def _apply_overrides(
     common_flags: Mapping[str, Sequence[str]],
     course: Course,
 ) -> Entry:
-    """With the instructor's word on items and on all of it, the total that follows, and flags."""
+    """Apply the overrides of the instructor; compute the total and collect the flags."""
     one, total, flags = entry.counting, None, entry.flags
     if one is not None:
         items = (_override_item(item, own_overrides.get(item.title)) for item in one.items)
@@ -317,7 +319,7 @@ def _apply_overrides(
 
 
 def _override_item(item: Item, override: Override | None) -> Item:
-    """An item with the instructor's points and comment in place of, or behind, the rules'."""
+    """Replace the points of an item by those of the instructor, and append the comment."""
     if override is None:
         return item
     comment = (
@@ -330,19 +332,19 @@ def _override_item(item: Item, override: Override | None) -> Item:
     return replace(item, points=override.points, comment=comment, awaits_points=False)
 
 
-# ------------------------------------------------------------------ the instructor's word
+# ------------------------------------------------------------------ overrides
 
 
 def read_overrides(path: Path) -> Overrides:
-    """Read ``overrides.csv``; nothing where it is not there.
+    """Read ``overrides.csv``; empty if the file does not exist.
 
-    Its columns are id (as in class.csv, or the file's name), item (a title of the rubric, "total",
-    or empty for a comment on all of it), points and comment.
+    Columns: id (as in class.csv, or the file name), item (a title of the rubric, "total", or empty
+    for a comment on the whole report), points, comment.
 
     Raises
     ------
     SettingsError
-        A column is missing, or a row says no number of points where it should.
+        A column is missing, or points are not a valid number.
     """
     if not path.exists():
         return {}
@@ -350,8 +352,8 @@ def read_overrides(path: Path) -> Overrides:
     missing = [title for title in OVERRIDE_TITLES if sheet.column((title,)) is None]
     if missing:
         raise SettingsError(
-            f"{path}: no column {', '.join(missing)}",
-            f"Its columns are {', '.join(OVERRIDE_TITLES)}.",
+            f"{path}: no column {', '.join(missing)}.",
+            f"Required columns: {', '.join(OVERRIDE_TITLES)}.",
         )
     overrides: dict[str, dict[str, Override]] = defaultdict(dict)
     for at, row in enumerate(sheet.rows, start=2):
@@ -361,10 +363,10 @@ def read_overrides(path: Path) -> Overrides:
         value = decimal(points)
         problem = ""
         if item in overrides[student]:
-            problem = f"{one_line(student, 40)}, {one_line(item, 40) or 'all'} stands there twice"
+            problem = f"{one_line(student, 40)}, {one_line(item, 40) or 'all'} is given twice"
         elif points and (value is None or not 0.0 <= value <= MAX_OVERRIDE_POINTS or not item):
             points_text = one_line(points, 20)
-            problem = f"points {points_text!r}: give a number from 0 up, and an item or total"
+            problem = f"points {points_text!r}: give a number from 0, and an item or total"
         if problem:
             raise SettingsError(f"{path}: row {at}: {problem}.")
         overrides[student][item] = Override(value, clean_text(comment[:MAX_COMMENT_LENGTH]))
@@ -374,12 +376,12 @@ def read_overrides(path: Path) -> Overrides:
 def match_overrides(
     overrides: Overrides, entries: Sequence[Entry]
 ) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
-    """What is said of whom, and a sentence for every row that fits nobody, or no item.
+    """Match overrides with entries; return a note for each override without student or item.
 
     Returns
     -------
     matched_overrides : list of dict
-        For each entry, by the title of an item, "total", or "" for all of it.
+        For each entry, by the title of an item, "total", or "" (the whole report).
     notes : tuple of str
     """
     matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
@@ -392,11 +394,11 @@ def match_overrides(
     )
     notes = []
     for student, rows in overrides.items():
-        # by the very id, the id but for leading zeros, or the file's name
+        # by id (with or without leading zeros) or file name
         student_index = people.student_index(Person(student, login=student))
         if student_index is None:
             notes.append(
-                f"{OVERRIDES_NAME}: nobody has the id {one_line(student, 40) or '(empty)'}."
+                f"{OVERRIDES_NAME}: no student has the id {one_line(student, 40) or '(empty)'}."
             )
             continue
         one = entries[student_index].counting
@@ -408,44 +410,45 @@ def match_overrides(
             if title is None:
                 problem = f"has no item {one_line(item, 60)!r}"
             elif title in matched_overrides[student_index]:
-                problem = f"has {title or 'a comment on all'!r} from another row already"
+                problem = f"has two rows for {title or 'a comment on the whole report'!r}"
             elif (override.points or 0.0) > max_by_title[title]:
-                problem = f"cannot have more than {max_by_title[title]:g} points of {one_line(title, 60)!r}"
+                limit = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
+                problem = f"cannot have more than {limit}"
             else:
                 matched_overrides[student_index][title] = override
             notes += [f"{OVERRIDES_NAME}: {one_line(student, 40)} {problem}."] if problem else []
     return matched_overrides, tuple(notes)
 
 
-# ------------------------------------------------------------------ when it was due
+# ------------------------------------------------------------------ due time
 
 
 def late_rule(text: str) -> LateRule:
-    """Read ``10%/day`` or ``10%/day up to 50%``.
+    """Read a late rule such as ``10%/day`` or ``10%/day up to 50%``.
 
     Raises
     ------
     SettingsError
-        It is not such a rule.
+        The text is not a late rule.
     """
     match = _RULE.fullmatch(text.strip())
     if match is None or not 0.0 <= float(match["rate"]) <= 100.0:
-        raise SettingsError(f"--late {text!r}: give a rule such as 10%/day or 10%/day up to 50%.")
+        raise SettingsError(f"--late {text!r} is not a rule. Use 10%/day or 10%/day up to 50%.")
     unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
     max_share = min(float(match["most"] or 100.0) / 100.0, 1.0)
     return LateRule(float(match["rate"]) / 100.0, unit_s, max_share, text.strip())
 
 
 def due_time(text: str) -> datetime:
-    """Read a due time: ``2026-11-20 23:59``, with a zone ``+01:00`` or ``Europe/Berlin`` behind it.
+    """Read a due time: ``2026-11-20 23:59``, optionally with ``+01:00`` or ``Europe/Berlin``.
 
-    Without a zone it is that of this computer. A date alone means the end of that day, and a time
-    without seconds the end of that minute.
+    The default time zone is that of this computer. A date without time is the end of the day, and a
+    time without seconds the end of the minute.
 
     Raises
     ------
     SettingsError
-        It is not such a time.
+        The text is not a valid time.
     """
     words = text.split()
     try:
@@ -465,14 +468,14 @@ def due_time(text: str) -> datetime:
 
 
 def in_zone_of(time: datetime, due: datetime | None) -> datetime:
-    """A platform's time, which is in the zone of the due time where it says none."""
+    """Add a time zone to a platform's time: that of the due time, unless it has one."""
     if time.tzinfo is not None:
         return time
     return time.replace(tzinfo=due.tzinfo) if due is not None else time.astimezone()
 
 
 def moodle_time(text: str) -> datetime | None:
-    """When Moodle's worksheet says that something was handed in; None where it cannot be read.
+    """Read the submission time of Moodle's worksheet; None if it cannot be read.
 
     >>> moodle_time("Friday, 20 November 2026, 11:58 PM").isoformat()
     '2026-11-20T23:58:00'

@@ -1,7 +1,7 @@
-"""What an instructor should look at: sentences, never points.
+"""Flags: sentences on suspicious reports for the instructor. They do not change points.
 
-A flag is not a proof. Two students may fly one flight together, and advice that px4fuse prints
-leads everyone to the same number.
+A flag is not a proof. Two students may share a flight, and following the advice of px4fuse leads to
+the same settings.
 """
 
 from collections import defaultdict
@@ -21,35 +21,35 @@ from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
 from px4fuse.verification.model import Verdict
 
-# Numbers of a form that two students do not have in common by chance, also where one of them has
-# changed each a little
+# number of equal values in two forms that is not a coincidence, and relative tolerance for copies
+# with small changes
 SAME_NUMBERS, MAX_NUMBER_DIFFERENCE = 3, 0.02
-# A hand-picked part of the flight below this share leaves most of it out
+# fraction of the log below which a segment chosen by hand is flagged
 MIN_CHOSEN_SHARE = 0.5
-# A setting so many times larger or smaller than what the data ask for has another reason
+# factor between a setting and its maximum-likelihood estimate above which the setting is flagged
 MAX_SETTING_FACTOR = 30.0
-# Factor on the usual drift (px4fuse loop's defaults) from which on a stated drift is flagged
+# factor between the stated drift and the default of px4fuse loop above which the drift is flagged
 FAR_OFF = 4.0
 MAX_SHOWN = 4
-# Two reports with something in common
+# pairs of reports with equal contents
 Pairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
 def page_flags(verdict: Verdict) -> Iterator[str]:
-    """Flag a PDF that is not what px4fuse draws from the log, with the first difference."""
+    """Flag a PDF that differs from the redrawn report, with the first difference."""
     if verdict.pages:
         first, *others = verdict.pages
         more_text = f" {len(others)} more differences." if others else ""
         yield (
-            "The PDF that was handed in is not what px4fuse draws from the log. "
+            "The PDF differs from the report that px4fuse draws from the log. "
             f"{capitalise_first(first.sentence)}.{more_text} Read the redrawn report."
         )
 
 
 def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
-    """What stands out in one report by itself.
+    """Flag unusual settings of one report.
 
-    ``handed_out``: there is an answer key, so that logs are simulated for a reason.
+    ``handed_out``: an answer key exists, so that simulated logs are expected.
     """
     if isinstance(results, LoopResults):
         yield from _drift_flags(results.request)
@@ -59,9 +59,9 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
     chosen = (results.request.start_s, results.request.end_s) != (None, None)
     if chosen and share < MIN_CHOSEN_SHARE:
         yield (
-            f"The analysed part was chosen by hand and is {share:.0%} of the log "
-            f"({settings.start_s:.1f} to {settings.end_s:.1f} s of {whole_s:.1f} s): ask why the "
-            "rest was left out."
+            f"The segment was chosen by hand and covers {share:.0%} of the log "
+            f"({settings.start_s:.1f} to {settings.end_s:.1f} s of {whole_s:.1f} s). Ask for the "
+            "reason."
         )
     if not {"north", "east", "aisle"} & set(results.axes):
         yield "Only the vertical axis was analysed (--axis)."
@@ -69,11 +69,13 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
     if settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
     source = results.source
-    tracks_as_received = [one.name for one in source.available if one.passage == "as it arrived"]
+    tracks_as_received = [
+        track.name for track in source.available if track.passage == "as it arrived"
+    ]
     if tracks_as_received and source.passage != "as it arrived":
         yield (
-            f"The positions are not those that arrived ({tracks_as_received[0]}) but {source.name} "
-            f"({source.passage})."
+            f"The position source is {source.name} ({source.passage}), not "
+            f"{tracks_as_received[0]}, the positions as received by PX4."
         )
     for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
         chosen = getattr(settings, name)
@@ -82,15 +84,18 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
         if ml_values and not min(
             ml_values
         ) / MAX_SETTING_FACTOR < chosen < MAX_SETTING_FACTOR * max(ml_values):
-            yield f"{label} {chosen:g} is far from what the data ask for ({ml_values[0]:.3g})."
+            yield (
+                f"{label} {chosen:g} is far from its maximum-likelihood estimate "
+                f"({ml_values[0]:.3g})."
+            )
     if results.log.hardware == flights.HARDWARE and not handed_out:
-        yield "The log was made by px4fuse simulate: no vehicle flew."
+        yield "The log is simulated (px4fuse simulate), not a real flight."
 
 
 def _drift_flags(request: LoopRequest) -> Iterator[str]:
-    """Flag a stated drift that is more than FAR_OFF times the usual one, or less than 1/FAR_OFF.
+    """Flag a stated drift that differs from the default by more than the factor FAR_OFF.
 
-    The closure is accepted or rejected by the stated drift.
+    The stated drift decides whether a loop closure is accepted.
     """
     usual = LoopRequest(source="")
     for option, unit, stated, default in (
@@ -99,13 +104,13 @@ def _drift_flags(request: LoopRequest) -> Iterator[str]:
     ):
         if not default / FAR_OFF <= stated <= default * FAR_OFF:
             yield (
-                f"{option} is {stated:g} {unit} per 100 m; usual is {default:g} {unit}. Ask for "
-                "the reason: the closure is accepted or rejected by it."
+                f"{option} is {stated:g} {unit} per 100 m (default {default:g} {unit}). It decides "
+                "whether the loop closure is accepted. Ask for the reason."
             )
 
 
 def _form_numbers(one: GradedReport) -> dict[tuple[str, str], float]:
-    """Sizes, values and quantities of a form by where they stand."""
+    """Return sizes, values and quantities of a form, by their place."""
     if one.form is None:
         return {}
     values_by_place: dict[tuple[str, str], object] = {
@@ -118,7 +123,7 @@ def _form_numbers(one: GradedReport) -> dict[tuple[str, str], float]:
 
 
 def _same_numbers(one: Mapping[Any, float], other: Mapping[Any, float]) -> int:
-    """How many numbers nearly agree that nobody types by chance; a value follows from its size."""
+    """Count nearly equal numbers with more than one digit; values of corrections must be equal."""
     return sum(
         _digits(number) > 1
         and abs(number - other[key]) <= (key[1] != "value") * MAX_NUMBER_DIFFERENCE * abs(number)
@@ -131,8 +136,8 @@ def _student_key(one: GradedReport) -> str:
     return normalise_text(one.student_id) or normalise_text(one.student) or one.submission
 
 
-# What no two reports should have in common: the sentence, what it is (empty for nothing to
-# compare), and whose it has to be to count: two reports of one student may be on one log
+# contents that two reports must not share: sentence, content (empty: not compared), and owner;
+# pairs with the same owner are not flagged, such as two reports of a student on one log
 COMMON_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
@@ -144,7 +149,7 @@ COMMON_CHECKS: tuple[
     ),
     ("The same log as {}.", attrgetter("log_sha256"), _student_key),
     (
-        "The same numbers to the last digit, from a log of another hash, as {}: a copy of the log.",
+        "The same numbers as {}, from a log with another SHA-256: a copy of the log.",
         lambda one: (
             one.verdict.status == "verified"
             and len(one.numbers) >= SAME_NUMBERS
@@ -156,14 +161,14 @@ COMMON_CHECKS: tuple[
 
 
 def class_flags(graded: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
-    """What stands out between the reports of a class: sentences, by names of submissions."""
+    """Return flags on equal contents of several reports, by submission name."""
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
     for sentence, pairs in (
         *(
             (sentence, _same_pairs(graded, key_of, owner_of))
             for sentence, key_of, owner_of in COMMON_CHECKS
         ),
-        ("The form has the numbers of {}.", _copied_forms(graded)),
+        ("The answer form has the same numbers as {}.", _copied_forms(graded)),
     ):
         others: dict[str, list[str]] = defaultdict(list)
         for first, second in pairs:
@@ -190,7 +195,7 @@ def _same_pairs(
 
 
 def _copied_forms(graded: Sequence[GradedReport]) -> Pairs:
-    """Whose forms have the same numbers, though the flights are others."""
+    """Yield pairs of reports of different students with the same numbers in the form."""
     numbers = [(one, _form_numbers(one)) for one in graded]
     for (one, form_numbers), (other, other_numbers) in combinations(numbers, 2):
         if _same_numbers(form_numbers, other_numbers) >= SAME_NUMBERS and _student_key(
@@ -200,11 +205,11 @@ def _copied_forms(graded: Sequence[GradedReport]) -> Pairs:
 
 
 def _name(one: GradedReport) -> str:
-    """A student in a sentence."""
+    """Format the student of a report for a sentence."""
     names = filter(None, (one.student.strip(), one.student_id.strip()))
     return one_line(", ".join(names) or one.submission, 80)
 
 
 def _digits(number: float) -> int:
-    """Significant digits of a number as typed."""
+    """Count the significant digits of a number."""
     return len(Decimal(repr(abs(number))).normalize().as_tuple().digits) if number else 0

@@ -1,8 +1,8 @@
-"""Points for a form, by the answer key: of 100.
+"""Points of an answer form (of 100), by comparison with the answer key.
 
-The weights and shares are those by which forms were judged by hand. A guess does not pay: each
-claim that is not true costs, and what needs no measurement counts only with the size.
-``form_points.toml`` has the rows.
+The weights and shares reproduce grading by hand. Guessing does not pay: each mistake that the
+flight does not have costs points, and what can be guessed without measurement counts only with the
+right size. ``form_points.toml`` contains the tables.
 """
 
 import math
@@ -18,8 +18,8 @@ from px4fuse.record import table
 
 FALSE_CLAIM_POINTS, MAX_FALSE_CLAIMS = 10.0, 3
 NEIGHBOUR_SHARE, SAME_NUMBER_SHARE, EFFECT_SHARE = 0.4, 2.0 / 3.0, 0.15
-# What needs no measurement: it counts only where the size is right, and close is not enough, since
-# the sizes that are drawn lie close to each other
+# mistakes that can be guessed without measurement count only with the right size; a close size is
+# not enough, because the drawn sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
 ANY_VALUE = (-math.inf, math.inf)
 TIME_TOLERANCE_S, TIME_TOLERANCE_SHARE = 2.0, 0.05
@@ -29,7 +29,7 @@ HALF_SIZE_TOLERANCE = 0.4
 
 @dataclass(frozen=True)
 class _Cure:
-    """A row of the cures: ``to`` are bounds, or how they follow from the mistake."""
+    """Correction of mistakes; ``to``: bounds of right values, or a rule of :func:`cures`."""
 
     parameter: str
     of: Mapping[str, float]
@@ -45,16 +45,18 @@ PART_NAMES = tuple(TABLE["weights"])
 
 @dataclass(frozen=True)
 class FormPoints:
-    """What a form is worth.
+    """Points of a form.
 
     Attributes
     ----------
     points_by_part : mapping
-        Points by the name of the part, of :attr:`of`.
+        Points of each part.
+    of : mapping
+        Maximum points of each part.
     feedback : tuple of str
-        What was right and what was not, for the student.
+        Right and wrong mistakes, for the student.
     named : mapping
-        The flight's mistakes, and whether the form names each.
+        Mistakes of the flight; True if the form names them.
     """
 
     points_by_part: Mapping[str, float]
@@ -64,12 +66,12 @@ class FormPoints:
 
     @property
     def share(self) -> float:
-        """Of all points."""
+        """Fraction of all points."""
         return sum(self.points_by_part.values()) / sum(self.of.values())
 
 
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
-    """Points for a form about a flight whose truth is known."""
+    """Compute the points of a form for a flight with known answers."""
     is_claimed_clean = not truth.mistakes and answers.claims_no_mistake
     weights = TABLE["weights_clean" if is_claimed_clean else "weights"]
     shares = dict.fromkeys(PART_NAMES, 0.0)
@@ -77,13 +79,13 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     if truth.mistakes and len(false_claims) < MAX_FALSE_CLAIMS:
         shares |= _mistake_shares(matches, truth)
     shares["quantities"] = computed = _quantities_share(answers, truth)
-    # on many flights the verdicts are the same: who computed nothing may have guessed them
+    # half if no number was computed: many flights have the same verdicts, which can be guessed
     shares["verdicts"] = _verdicts_share(answers, truth) * (1.0 if computed else 0.5)
     points_by_part = {name: weights[name] * share for name, share in shares.items()}
     if is_claimed_clean:
         points_by_part["kinds"] = weights["kinds"]
     elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
-        points_by_part["kinds"] += weights["sizes"] * shares["kinds"]  # there is nothing to size
+        points_by_part["kinds"] += weights["sizes"] * shares["kinds"]  # no mistake has a size
     points_by_part["kinds"] = max(
         points_by_part["kinds"] - FALSE_CLAIM_POINTS * len(false_claims), 0.0
     )
@@ -103,15 +105,15 @@ Match = tuple[TrueMistake, ClaimedMistake | None, float]
 def _mistake_feedback(
     matches: list[Match], false_claims: list[ClaimedMistake], is_claimed_clean: bool
 ) -> Iterator[str]:
-    """What of the mistakes was found, in words."""
+    """Yield a phrase for each right, missed or wrong mistake."""
     if not matches:
-        yield f"your flight has no mistake{', as you say' * is_claimed_clean}"
+        yield f"your flight has no mistake{', as your form states' * is_claimed_clean}"
     for mistake, claim, _ in matches:
-        mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].words})"
+        mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
         if claim is None:
             yield f"you missed {mistake_text}"
         elif claim.kind != mistake.kind:
-            yield f"you named {claim.kind} where it is {mistake_text}"
+            yield f"you named {claim.kind} instead of {mistake_text}"
         else:
             yield f"you found {mistake.kind}"
     if false_claims:
@@ -119,9 +121,9 @@ def _mistake_feedback(
 
 
 def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[ClaimedMistake]]:
-    """Each mistake with the claim that stands for it and its share of the kind; false claims.
+    """Match each mistake with a claim and its share; also return the unmatched (false) claims.
 
-    The best match is taken first: the kind itself, then its neighbours, then what it causes.
+    The best matches are taken first: the same kind, then related mistakes, then consequences.
     """
     unmatched = [claim for claim in answers.mistakes if claim.kind != "none"]
     claim_by_kind: dict[str, tuple[ClaimedMistake, float]] = {}
@@ -130,7 +132,7 @@ def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list
         for mistake in truth.mistakes
         for claim in unmatched
     ]
-    for share, kind, claim in sorted(candidates, key=lambda one: -one[0]):
+    for share, kind, claim in sorted(candidates, key=lambda candidate: -candidate[0]):
         if share and kind not in claim_by_kind and claim in unmatched:
             claim_by_kind[kind] = claim, share
             unmatched.remove(claim)
@@ -140,7 +142,7 @@ def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list
 
 
 def kind_share(kind: str, claimed: str) -> float:
-    """What naming one kind is worth where it is another."""
+    """Return the share of the points for naming ``claimed`` instead of ``kind``."""
     if kind == claimed:
         return 1.0
     if (kind, claimed) == ("r-scale", "ekf2-noise"):
@@ -151,7 +153,7 @@ def kind_share(kind: str, claimed: str) -> float:
 
 
 def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Shares of kinds, sizes, when and cure, each the mean over the mistakes."""
+    """Return the shares of kinds, sizes, when and cure: means over the mistakes."""
     sized = sum(mistake.size is not None for mistake, _, _ in matches)
     shares = dict.fromkeys(("kinds", "sizes", "when", "cure"), 0.0)
     for mistake, claim, share in matches:
@@ -169,7 +171,7 @@ def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
 
 
 def size_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
-    """What a size is worth: in full, half, or a third with the wrong sign or for a neighbour."""
+    """Return the share for a size: 1, 1/2 (close), or 1/3 (wrong sign, or related mistake)."""
     size = claim.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
         return 0.0
@@ -183,7 +185,7 @@ def size_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
 
 
 def when_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
-    """Half for the time, half for a panel that can show it."""
+    """Return the share for time and panel: one half each."""
     if mistake.from_s is None and mistake.until_s is None:
         is_time_right = claim.when == "whole flight"
     else:
@@ -200,12 +202,12 @@ def when_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
 
 
 def panels(kind: str) -> list[str]:
-    """The panels that can show a kind of mistake."""
+    """Return the panels of the report that can show a kind of mistake."""
     return [*(panel for panel, kinds in TABLE["shows"].items() if kind in kinds), "cover"]
 
 
 def cure_share(mistake: TrueMistake, claim: ClaimedMistake, truth: FormTruth) -> float:
-    """What the parameter and its value are worth, by what they do to this flight."""
+    """Return the share for a correction and its value."""
     value = claim.value_in_first_unit()
     worth = [
         share
@@ -218,7 +220,7 @@ def cure_share(mistake: TrueMistake, claim: ClaimedMistake, truth: FormTruth) ->
 
 
 def _value_share(value: float, low: float, high: float, fallback: float) -> float:
-    """All for what is right, a third for the wrong sign."""
+    """Return 1 for a value within bounds, 1/3 with the wrong sign, else ``fallback``."""
     if low <= value <= high:
         return 1.0
     return 1.0 / 3.0 if low <= -value <= high else fallback
@@ -228,9 +230,9 @@ Cure = tuple[str, tuple[float, float], float]
 
 
 def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
-    """Parameters that act on a mistake, from which value to which they cure it, and their share."""
+    """Return the corrections of a mistake: parameter, bounds of right values, share of points."""
     size, low, high = (
-        0.0 if one is None else one for one in (mistake.size, mistake.low, mistake.high)
+        0.0 if value is None else value for value in (mistake.size, mistake.low, mistake.high)
     )
     from_s = 0.0 if mistake.from_s is None else mistake.from_s
     until_s = from_s if mistake.until_s is None else mistake.until_s
@@ -256,11 +258,11 @@ def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
 
 
 def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
-    """Mean share of the verdicts on both filters and of what EKF2 did."""
+    """Return the mean share for both verdicts and the behaviour of EKF2."""
     shares = [_ekf2_behaviour_share(answers, truth)]
     for answer, known in ((answers.verdict_ours, truth.ours), (answers.verdict_ekf2, truth.ekf2)):
         is_right = answer and answer == known.verdict
-        # a factor so small can be taken for none
+        # "consistent" is half right for a small factor
         is_nearly_right = (
             known.factor is not None
             and known.factor < SIGMA_FACTOR_FINDING
@@ -271,7 +273,7 @@ def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
 
 
 def _ekf2_behaviour_share(answers: Answers, truth: FormTruth) -> float:
-    """What EKF2 did: full for all of it and nothing false, half for some."""
+    """Return 1 for the complete behaviour of EKF2 without a false one; 1/2 for a part."""
     claimed, required = set(answers.ekf2_did), set(truth.ekf2_did)
     allowed = required | set(truth.ekf2_did_also)
     false_count, right_count = len(claimed - allowed), len(claimed & allowed)
@@ -284,9 +286,9 @@ def _ekf2_behaviour_share(answers: Answers, truth: FormTruth) -> float:
 
 
 def _quantities_share(answers: Answers, truth: FormTruth) -> float:
-    """Mean share of the numbers that can be known."""
-    # an empty list is right on most flights of some kinds, and says nothing
-    known = sum(one not in (None, ()) for one in truth.quantities)
+    """Return the mean share for the numbers that the flight determines."""
+    # an empty list is not counted: it is right on most flights
+    known = sum(value not in (None, ()) for value in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)
     return sum(_quantity_share(*pair) for pair in pairs) / max(known, 1)
 

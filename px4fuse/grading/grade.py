@@ -1,4 +1,4 @@
-"""Submissions become a class: in parallel, within bounds, and quick where nothing has changed."""
+"""Grading of a class: submissions are verified in parallel and within limits."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -19,21 +19,23 @@ from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.reading import one_line
 from px4fuse.workers import JobFailure, run_bounded
 
-FAILED = "Do not open it: ask for the report as px4fuse wrote it."
+FAILED = "Do not open the file. Ask for the PDF that px4fuse wrote."
 
 
 @dataclass(frozen=True)
 class GradeOutcome:
-    """What grading a class gave.
+    """Result of grading a class.
 
     Attributes
     ----------
     entries : tuple of Entry
-        Everyone in the roster, then who is not in it; without redrawn reports.
+        Students of the class list, then others; without redrawn reports.
     notes : tuple of str
-        What was passed over.
+        Ignored files and other remarks.
     reused : int
-        How many reports were not verified again, since nothing of theirs has changed.
+        Number of reports whose stored verification was used, because nothing changed.
+    written : tuple of Path
+        Files and folders that were written.
     """
 
     entries: tuple[Entry, ...]
@@ -43,7 +45,7 @@ class GradeOutcome:
 
     @property
     def graded(self) -> tuple[GradedReport, ...]:
-        """Every file that was handed in, those that count first, in the order of the entries."""
+        """All files, those that count first, in the order of the entries."""
         return tuple(one for entry in self.entries for one in entry.files)
 
 
@@ -55,7 +57,7 @@ def grade(
     processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> GradeOutcome:
-    """Grade everything that was handed in.
+    """Grade all submissions of a class.
 
     Parameters
     ----------
@@ -63,17 +65,17 @@ def grade(
         PDFs, folders and zip files.
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
-        ``feedback/``, ``grades/`` for learning platforms, and the records that
-        make a second run quick. Its ``overrides.csv`` is read.
+        ``feedback/``, ``grades/`` for learning platforms, and stored verifications, which make a
+        second run fast. Its ``overrides.csv`` is read.
     processes : int, optional
-        By default as many as there are cores.
+        Number of processes; by default that of the cores.
     progress : callable
-        Told how many submissions are done, and of how many.
+        Called with the number of finished submissions and of all.
 
     Raises
     ------
     SettingsError
-        Nothing was handed in, or a table that was given is not what it should be.
+        No submission was found, or a table is not valid.
     OutputError
         The folder cannot be written.
     """
@@ -84,7 +86,8 @@ def grade(
         one.name for one in output.glob("overrides*") if one.name != OVERRIDES_NAME
     )
     unread_notes = [
-        f"{one_line(name, 80)}: not read; only {OVERRIDES_NAME} is." for name in unread_names
+        f"{one_line(name, 80)} was not read; only {OVERRIDES_NAME} is read."
+        for name in unread_names
     ]
     found_files, notes = submissions.find_submissions(paths)
     jobs = []
@@ -94,23 +97,23 @@ def grade(
         jobs.append((submission, owner))
     rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
     scored = partial(grade_one, *rules, logs, output / RECORDS, max_log_bytes.get())
-    made: dict[int, GradedReport] = {}
+    graded_by_index: dict[int, GradedReport] = {}
     reused = 0
     progress(0, len(found_files))
     with closing(run_bounded(scored, jobs, processes=processes)) as work:
         for index, result in work:
             if isinstance(result, JobFailure):
-                one = refused_report(*rules, f"Grading it failed: {result.reason}", FAILED)
+                one = refused_report(*rules, f"grading failed: {result.reason}", FAILED)
                 recalled = False
             else:
                 one, recalled = result
             submission = found_files[index]
             known = one.student or one.student_id
             student = one.student if known else submission.origin.person.name
-            made[index] = replace(one, submission=submission.name, student=student)
+            graded_by_index[index] = replace(one, submission=submission.name, student=student)
             reused += recalled
-            progress(len(made), len(found_files))
-    graded = [made[index] for index in range(len(found_files))]
+            progress(len(graded_by_index), len(found_files))
+    graded = [graded_by_index[index] for index in range(len(found_files))]
     entries, override_notes = class_entries(graded, found_files, course, overrides)
     written, class_notes = write_class(entries, course, output)
     return GradeOutcome(
@@ -126,7 +129,7 @@ def grade_one(
     largest_log_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
-    """Read, verify or recall, and score a file, whoever it is from; in a process of its own."""
+    """Read, verify (or load the stored verification) and score one file, in a separate process."""
     max_log_bytes.set(largest_log_bytes)
     submission, owner_id = job
     handed_out = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()

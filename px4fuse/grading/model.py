@@ -1,4 +1,4 @@
-"""What is handed in, and what it is worth: a submission, what it earns, and a student's row."""
+"""Data of grading: submissions, graded reports, and rows of the class."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from px4fuse.answers import Answers
 from px4fuse.assignment.roster import Person
 from px4fuse.verification.model import Verdict
 
-# What the sum over the items is called
+# title of the sum over all items
 TOTAL = "total"
 
 
@@ -18,21 +18,21 @@ UNKNOWN_PERSON = Person("")
 
 @dataclass(frozen=True)
 class ExportOrigin:
-    """What a platform says of a file that was handed in.
+    """Information of a learning platform about a file.
 
     Attributes
     ----------
     platform : str
-        One of :data:`px4fuse.grading.submissions.PLATFORMS`; "" where the name is of no platform.
+        One of :data:`px4fuse.grading.submissions.PLATFORMS`; "" if the name is not of a platform.
     person : Person
-        The student, as far as the platform says; its number is the platform's own (Moodle's
-        participant, Canvas's and ILIAS's user, Gradescope's submission), never the university's.
+        Student; the number is that of the platform (participant in Moodle, user in Canvas and
+        ILIAS, submission in Gradescope).
     time : datetime or None
-        Without a time zone where the platform leaves it out.
+        Submission time; without time zone if the platform omits it.
     late : bool
-        Whether the platform marks it so.
+        The platform marks the file as late.
     is_imitated : bool
-        Whether a student's own part of the name looks like a platform's.
+        The part of the name that the student chose imitates the names of a platform.
     """
 
     platform: str = ""
@@ -47,22 +47,21 @@ UNKNOWN_SUBMITTER = ExportOrigin()
 
 @dataclass(frozen=True)
 class Submission:
-    """One PDF that was handed in: a file, or an entry of a zip file.
+    """PDF that was handed in: a file, or an entry of a zip file.
 
     Attributes
     ----------
     file : Path
-        The PDF itself, or the zip file that holds it.
+        The PDF, or the zip file that contains it.
     entry : str
-        Name of the entry in the zip file, as it stands there; "" for a file.
+        Name of the entry in the zip file; "" for a file.
     name : str
-        For people: without folders of this machine, control characters or more than 200
-        characters, a number behind it not counted. Unique within a run.
+        Name in messages: one line of at most 200 characters, without folders of this computer;
+        unique in a run by a number at the end.
     time : datetime or None
-        Of the entry in the zip file, in an unknown time zone: when the platform took it, or when
-        it packed the zip file.
+        Time of the zip entry, in an unknown time zone: submission or packing.
     origin : ExportOrigin
-        Who handed it in, as a platform says.
+        Student and time according to a platform.
     """
 
     file: Path
@@ -74,9 +73,9 @@ class Submission:
 
 @dataclass(frozen=True)
 class Item:
-    """Points for one part of the rubric, and why.
+    """Points of a report for one item of the rubric, with a comment.
 
-    ``by_hand``: only the instructor gives them; ``awaits_points``: has not yet.
+    ``by_hand``: scored by the instructor; ``awaits_points``: not yet scored.
     """
 
     title: str
@@ -89,34 +88,34 @@ class Item:
 
 @dataclass(frozen=True)
 class GradedReport:
-    """One submission, graded; texts and bytes are empty where there is nothing to say.
+    """Submission with verdict and points; missing texts are empty.
 
     Attributes
     ----------
     submission : str
         :attr:`Submission.name`.
     student, student_id : str
-        As the report says.
+        As in the report.
     verdict : Verdict
-        "cannot verify" with the reason for what is not a report.
+        Result of verification; "cannot verify" for a file that is not a report.
     items : tuple of Item
-        In the rubric's order.
+        In the order of the rubric.
     flags : tuple of str
-        What an instructor should look at in this report: sentences.
+        Sentences on suspicious contents, for the instructor.
     pending : str
-        One sentence: what the instructor can do so that the points count.
+        Action of the instructor before the points count; "" if they count.
     form : Answers or None
-        The form as it was filled in.
+        Completed answer form.
     numbers : mapping
-        A few for the class table, by column title.
+        Numbers of the class table, by column title.
     sha256, log_sha256, version : str
-        Of the PDF, of the log it is about, and of px4fuse.
+        SHA-256 of the PDF and of its log, and px4fuse version of the report.
     notes : str
-        The student's own words.
+        Text of the student.
     mistakes : mapping
-        What the answer key says is wrong in the student's flight, and whether the form names it.
+        Mistakes of the student's flight (answer key); True if the form names them.
     redrawn_name : str
-        Where the redrawn PDF stands, relative to the class page.
+        Path of the redrawn PDF, relative to the class page.
     """
 
     submission: str
@@ -137,33 +136,33 @@ class GradedReport:
 
     @property
     def status(self) -> str:
-        """That of the verdict, or "page differs" if only the numbers are verified."""
+        """Outcome of the verification, including "page differs"."""
         return self.verdict.outcome
 
     @property
     def points(self) -> float:
-        """Sum over the items; while :attr:`pending` a proposal, never to be added to anything."""
+        """Sum over the items; only a proposal while :attr:`pending`."""
         return sum(item.points for item in self.items)
 
     @property
     def counted(self) -> float | None:
-        """The points that count; None while they, or some of them, are the instructor's to say."""
+        """Points that count; None while they, or points of an item, are pending."""
         return None if self.pending or self.awaits_points else self.points
 
     @property
     def awaits_points(self) -> bool:
-        """Whether the instructor has not yet given the points of an item."""
+        """True if the instructor has not scored an item yet."""
         return any(item.awaits_points for item in self.items)
 
     @property
     def of(self) -> float:
-        """The most that there is to have."""
+        """Maximum points."""
         return sum(item.of for item in self.items)
 
 
 @dataclass(frozen=True)
 class Override:
-    """What the instructor says instead: points, or words, or both."""
+    """Points or comment, or both, that the instructor sets."""
 
     points: float | None = None
     comment: str = ""
@@ -171,34 +170,32 @@ class Override:
 
 @dataclass(frozen=True)
 class Entry:
-    """One row of the class: a student, or a report that belongs to nobody known.
+    """Row of the class: a student, or a report of an unknown student.
 
     Attributes
     ----------
     student, student_id : str
-        As the roster says; of somebody who is not in it, as the report or the platform says.
-    counting : Graded or None
-        The attempt that counts, with the instructor's points and comments on its items; None where
-        nothing was handed in.
-    others : tuple of Graded
-        Further attempts, earliest first.
+        As in the class list, else as in the report or platform.
+    counting : GradedReport or None
+        Attempt that counts, with overrides applied; None without a submission.
+    others : tuple of GradedReport
+        Other attempts, earliest first.
     handed_in : str
-        When the counting one was handed in, as the platform says; "" where unknown.
+        Submission time of the counting attempt; "" if unknown.
     late_s : float or None
-        After the due time (s), 0 in time; None where one of the two is unknown.
+        Time after the due time (s), 0 if in time; None if unknown.
     deduction : float
-        Points taken off for being late, from the sum over the items.
+        Points deducted for late submission.
     overrides : mapping
-        What the instructor says, by the title of an item, "total", or "" for all of it.
+        Overrides by the title of an item, "total", or "" (the whole report).
     comment : str
-        The instructor's own words on all of it.
+        Comment of the instructor on the whole report.
     total : float or None
-        What is entered as the grade; None while pending or missing.
+        Grade in points; None while pending or missing.
     of : float
-        The most that there is to have.
+        Maximum points.
     flags : tuple of str
-        All that an instructor should look at: on who this is and what counts, on the counting
-        report, and on what it has in common with others.
+        All flags: on student and attempt, on the report, and on equal contents of other reports.
     """
 
     student: str
@@ -221,12 +218,12 @@ class Entry:
 
     @property
     def display_name(self) -> str:
-        """What the class page calls the student."""
+        """Name of the student on the class page."""
         return self.student or self.student_id or "no name"
 
 
 def columns(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Titles of the items and of the numbers that the class has, each once."""
+    """Return the titles of all items and of all numbers of the class, each once."""
     graded = [one for entry in entries if (one := entry.counting)]
     items = dict.fromkeys(item.title for one in graded for item in one.items)
     return tuple(items), tuple(dict.fromkeys(title for one in graded for title in one.numbers))

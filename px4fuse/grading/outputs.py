@@ -1,19 +1,18 @@
-"""What grading a class writes: table, page, redrawn reports, feedback, and platforms' tables.
+"""Output files of grading: class table and page, redrawn reports, feedback, platform tables.
 
-A table that a platform exports for this purpose is given back with two kinds of cells filled, the
-grade and, where it has a column for it, the feedback; everything else stays. Rows of students with
-no grade yet (pending, or nothing handed in) stay as they are: a platform would take an empty cell
-for one to delete, and zero for a grade.
+Tables exported by a platform are returned with the grade and, if they have a column for it, the
+feedback; all other cells stay. Rows of students without a grade (pending, or no submission) are not
+changed: a platform reads an empty cell as "delete", and zero as a grade.
 
-- Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org; read back by
-  ``mod/assign/feedback/offline/importgradeslib.php``, which finds "Identifier" ("Participant 12"),
-  "Grade" and "Last modified (grade)" by their titles, takes "Feedback comments" as HTML, passes
-  over grades above "Maximum Grade", and numbers in the language of the site.
+- Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org.
+  ``mod/assign/feedback/offline/importgradeslib.php`` finds "Identifier" ("Participant 12"), "Grade"
+  and "Last modified (grade)" by their titles, reads "Feedback comments" as HTML, ignores grades
+  above "Maximum Grade", and reads numbers in the language of the site.
 - Canvas: "How do I import grades in the Gradebook?", Instructor Guide: the exported gradebook, with
-  Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment; columns
+  Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment. Columns
   marked "(read only)" in the row "Points Possible" are ignored.
-- Any other: a table with a column of ids, logins, emails or names, and one for the grade, whose
-  title is given or one of :data:`GRADE_TITLES`.
+- Others: a table with a column of ids, logins, emails or names, and a grade column, with the given
+  title or one of :data:`GRADE_TITLES`.
 """
 
 import html
@@ -47,13 +46,13 @@ from px4fuse.spreadsheet import neutralise_formulas, neutralise_id
 from px4fuse.webpage.safe import template
 from px4fuse.writing import write_all
 
-# Reports drawn again from their logs: what to read instead of what was handed in
+# folder of the reports redrawn from the logs, to be read instead of the handed-in PDFs
 REPORTS = "reports"
 FEEDBACK = "feedback"
 GRADES = "grades"
 NAMES = "names.csv"
 NAMES_HEAD = ("pseudonym", "id", "name")
-# Columns of the class table, before and behind those of items and numbers
+# columns of the class table before and after those of items and numbers
 FIRST_COLUMNS = (
     "file",
     "student",
@@ -76,30 +75,30 @@ LAST_COLUMNS = (
     "log SHA-256",
 )
 LIST_SEPARATOR = " | "
-# A list of reasons is cut where it would become longer than a sentence
+# number of reasons in a sentence
 MAX_REASONS = 4
-# Titles of columns of platforms' tables
+# column titles of platform tables
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
-# Read as HTML, and read as text
+# column titles of feedback: read as HTML, or as text
 HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
 COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
 ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
-# Never written into: of Canvas, what it computes
+# mark of columns that Canvas computes; never changed
 READ_ONLY = "(read only)"
 
 
 def write_class(
     entries: Sequence[Entry], course: Course, output: Path
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Write everything, and say what could not be entered.
+    """Write all output files; return them, and notes on grades that could not be entered.
 
-    ``overrides.csv`` is made where it is not there, and never written over.
+    ``overrides.csv`` is created if it does not exist, and never overwritten.
 
     Parameters
     ----------
     entries : sequence of Entry
-        Those of the people in the course's register first, in its order.
+        Entries of the students in the course's register first, in its order.
 
     Returns
     -------
@@ -143,13 +142,13 @@ def write_class(
 
 
 def _identity(entry: Entry, stem: bool = False) -> str:
-    """Id, or name, or the file: what stays the same over several runs."""
+    """Return id, name or file: an identity that stays the same in later runs."""
     file = entry.counting.submission if entry.counting else ""
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
 
 def _add_file_names(entry: Entry, stem: str, output: Path) -> Entry:
-    """Add the place of the redrawn report, and write it there."""
+    """Copy the redrawn report of an entry to the output folder, and add its path."""
     one = entry.counting
     if one is None or not one.sha256:
         return entry
@@ -162,9 +161,9 @@ def _add_file_names(entry: Entry, stem: str, output: Path) -> Entry:
 
 
 def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Entries under other names, in the order of these, and the list of who is who.
+    """Replace names by pseudonyms, and sort by them; return the entries and the list of names.
 
-    A second run keeps the pseudonyms of the first; their order says nothing of the names.
+    A later run keeps the pseudonyms. Their order is random.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -196,7 +195,7 @@ def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]
 
 
 def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
-    """What may be shown to others: states, points and the form, and no text that anybody wrote."""
+    """Reduce an entry to status, points and form, without texts, under a pseudonym."""
     one = entry.counting
     if one is not None:
         one = GradedReport(
@@ -205,7 +204,7 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             "",
             replace(one.verdict, reasons=(), differences=()),
             tuple(replace(item, comment="") for item in one.items),
-            pending=one.pending and "Its points are pending.",
+            pending=one.pending and "Points are pending.",
             form=one.form,
             numbers=one.numbers,
             mistakes=one.mistakes,
@@ -228,14 +227,12 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
 
 
 def csv_text(entries: Sequence[Entry]) -> str:
-    """Lay out a class as CSV, for Excel and LibreOffice.
-
-    Points of the items are those that count, the instructor's where there are some.
+    """Format the class as CSV, for Excel and LibreOffice; points include overrides.
 
     Returns
     -------
     str
-        Begins with the byte order mark by which Excel knows UTF-8; lines end with CRLF. Write it
+        Begins with the byte order mark by which Excel detects UTF-8; lines end with CRLF. Write
         without translating line ends.
     """
     items, numbers = columns(entries)
@@ -277,9 +274,9 @@ def csv_text(entries: Sequence[Entry]) -> str:
 
 
 def feedback_text(entry: Entry, class_name: str = "") -> str:
-    """Plain text for one student: points and why, what being late costs, and the instructor's word.
+    """Format the feedback for one student: points, late deduction, instructor's comment.
 
-    Flags and remarks are for the instructor and are not in it.
+    Flags are not included.
     """
     graded = entry.counting
     reasons = (
@@ -309,21 +306,21 @@ def _wrap_text(text: str, indent: str = "") -> str:
     )
 
 
-# ------------------------------------------------------------------ platforms' tables
+# ------------------------------------------------------------------ platform tables
 
 
 def grade_column(sheet: Sheet, wanted: str) -> int:
-    """Where the grade goes.
+    """Find the grade column of a platform table.
 
     Parameters
     ----------
     wanted : str
-        Title of the column, of Canvas without its number; "" where there is only one.
+        Title of the column, in Canvas without its number; "" if there is only one.
 
     Raises
     ------
     SettingsError
-        There is none, or several and none was named.
+        No column matches, or several without a given title.
     """
     titles = {
         at: title
@@ -339,30 +336,30 @@ def grade_column(sheet: Sheet, wanted: str) -> int:
         in (normalise_text(title), normalise_text(ASSIGNMENT_NUMBER.sub("", title)))
     ]
     candidates = assignments if grade_index is None else [grade_index]
-    # the title may be meant for another table than Moodle's
+    # for Moodle a title that does not match is ignored: it may be of another table
     if wanted and (matching_columns or sheet.column(("identifier",)) is None):
         candidates = matching_columns
     if len(candidates) == 1:
         return candidates[0]
-    several = "several columns for the grade" if candidates else "no column for the grade"
+    problem = "several grade columns" if candidates else "no grade column"
     shown = (ASSIGNMENT_NUMBER.sub("", titles[at]) for at in assignments or titles)
     others = one_line(", ".join(one_line(title, 40) for title in shown), 300)
-    raise SettingsError(f"{sheet.path}: {several}", f"Name one with --column: {others}.")
+    raise SettingsError(f"{sheet.path}: {problem}.", f"Name one with --column: {others}.")
 
 
 def fill_grades(
     sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
 ) -> tuple[Sheet, tuple[str, ...]]:
-    """Enter the grades of a class into a platform's table, and say what could not be entered.
+    """Enter the grades of a class into a platform table; return notes on those that do not fit.
 
     Parameters
     ----------
     entries : sequence of Entry
-        The first ones of the people in ``register``, in its order.
+        Entries of the students in ``register`` first, in its order.
     column : str
-        As :func:`grade_column` takes it.
+        See :func:`grade_column`.
     feedback : sequence of str
-        What the student of each entry reads.
+        Feedback of each entry.
 
     Raises
     ------
@@ -387,8 +384,8 @@ def fill_grades(
         max_points = _max_points(sheet, row, student_index)
         if max_points is not None and total > max_points:
             notes.append(
-                f"{sheet.path.name}: {number(total)} points of {names[at]} are more than "
-                f"the platform's {number(max_points)}, and will not be taken: change its maximum."
+                f"{sheet.path.name}: {names[at]} has {number(total)} points, above the maximum of "
+                f"the platform ({number(max_points)}). Increase the maximum on the platform."
             )
         row[student_index] = number(total).replace(".", "," if comma else ".")
         if comments is not None and comments != student_index:
@@ -399,12 +396,12 @@ def fill_grades(
         if at not in found_people and entries[at].total is not None
     ]
     if missing_names:
-        notes.append(f"{sheet.path.name}: it has no row for {join_first(missing_names, 4)}.")
+        notes.append(f"{sheet.path.name}: no row for {join_first(missing_names, 4)}.")
     return replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes)
 
 
 def _max_points(sheet: Sheet, row: Sequence[str], student_index: int) -> float | None:
-    """The most points that the platform takes, where the table says it."""
+    """Return the maximum points of the platform, if the table contains them."""
     possible = (
         one[student_index] for one in sheet.rows[:3] if "points possible" in one[0].casefold()
     )
@@ -412,7 +409,7 @@ def _max_points(sheet: Sheet, row: Sequence[str], student_index: int) -> float |
 
 
 def as_html(text: str) -> str:
-    r"""Plain text for a field that is shown as HTML, in which nothing of it is markup.
+    r"""Escape plain text for a field that is shown as HTML, with line breaks and indentation.
 
     >>> as_html("a <b>\n 1")
     'a &lt;b&gt;<br>&nbsp;1'

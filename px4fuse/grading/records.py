@@ -1,8 +1,7 @@
-"""What verifying a report found, kept apart from its points: they change, the flight does not.
+"""Stored verifications: reports are verified again only if the report, a log or a version changed.
 
-A record is found by the content of the PDF, whoever handed it in and under what name, and holds
-for the versions that made it and the files that were there: the report says which log and which
-request. Rubric, answer key, roster and overrides are not in it.
+A record is found by the SHA-256 of the PDF. It is valid for the versions that made it and the files
+that were available. It is independent of rubric, answer key, class list and overrides.
 """
 
 import hashlib
@@ -22,22 +21,22 @@ from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256, verify
 from px4fuse.writing import write_all
 
-# In the folder of a class
+# subfolder of the output folder
 RECORDS = "records"
-# The redrawn report: behind the SHA-256 of the handed-in PDF, whose record is ".json"
+# file name of a redrawn report: SHA-256 of the handed-in PDF with this suffix; record: ".json"
 REDRAWN_SUFFIX = ".pdf"
 
 
 @dataclass(frozen=True)
 class VerificationRecord:
-    """What was found of one report.
+    """Verification of one report.
 
     Attributes
     ----------
     rests_on : dict
-        What it holds for: see :func:`_dependencies`.
+        Versions and files for which the record is valid: see :func:`_dependencies`.
     results : str
-        As they were attached.
+        Attached results.
     """
 
     rests_on: dict[str, str]
@@ -48,27 +47,28 @@ class VerificationRecord:
 def load_or_verify(
     records: Path, pdf: bytes, logs: Mapping[str, Path], handed_out: frozenset[str]
 ) -> tuple[Reported, Verdict, bool]:
-    """Read and verify a report, or recall what an earlier run found.
+    """Read and verify a report, or load the stored verification.
 
     Parameters
     ----------
     pdf : bytes
-        Anything.
+        Content of the file.
     logs : mapping
         Files by SHA-256.
     handed_out : frozenset of str
-        SHA-256 of the logs in the answer key: one of them that is not at hand is the
-        instructor's gap, not another log.
+        SHA-256 of the logs in the answer key. If such a log is not available, the verdict is
+        "cannot verify", not "other log".
 
     Returns
     -------
     results, verdict
     recalled : bool
+        True if the verification was loaded.
 
     Raises
     ------
     ResultsError
-        It is no report.
+        The file is not a report.
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
     if loaded := _load_record(records, sha256, logs, handed_out):
@@ -87,10 +87,9 @@ def load_or_verify(
 def _dependencies(
     results: str, logs: Mapping[str, Path], handed_out: frozenset[str]
 ) -> dict[str, str]:
-    """The versions, and of every file that a report rests on, by SHA-256, where it is.
+    """Return the library versions, and the availability of each file of a report by SHA-256.
 
-    "here", "handed out" by the answer key and not at hand, which is the instructor's gap, or
-    "away".
+    Availability: "here", "handed out" (in the answer key, but not available), or "away".
     """
     return _versions() | {
         name: "here" if name in logs else "handed out" if name in handed_out else "away"
@@ -108,7 +107,7 @@ def _write_record(
     records: Path, sha256: str, record: VerificationRecord, files: Mapping[str, bytes]
 ) -> None:
     for earlier in records.glob(f"{sha256}.*"):
-        # another process may be reading what an identical file left
+        # keep the record: another process may read it for an identical file
         if earlier.suffix != ".json":
             earlier.unlink(missing_ok=True)
     contents = {**files, ".json": msgspec.json.encode(record)}
@@ -118,14 +117,14 @@ def _write_record(
 def _load_record(
     records: Path, sha256: str, logs: Mapping[str, Path], handed_out: frozenset[str]
 ) -> tuple[Reported, Verdict] | None:
-    """What an earlier run found, if nothing that it rests on has changed."""
+    """Load a record if all of its dependencies are unchanged; else None."""
     try:
         content = (records / f"{sha256}.json").read_bytes()
         record = msgspec.json.decode(content, type=VerificationRecord)
         if record.rests_on != _dependencies(record.results, logs, handed_out):
             return None
         results = read_results(record.results.encode())
-    # none, or not one of ours: done again
+    # no record, or not readable: verify again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
     return (results, record.verdict) if isinstance(results, Reported) else None

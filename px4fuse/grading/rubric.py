@@ -1,8 +1,7 @@
-"""The rubric: what a report is worth, as an instructor writes it down, and points by it.
+"""Rubric: reading the TOML file of an instructor, and scoring a report with it.
 
-A TOML file of items, each with a title, points, the name of a check and its parameters: see
-:mod:`px4fuse.grading.checks`. A number that a report does not have gives no points and a comment,
-never an exception.
+The rubric has items, each with title, points, a check of :mod:`px4fuse.grading.checks` and its
+parameters. A number that a report does not contain gives no points and a comment.
 """
 
 from __future__ import annotations
@@ -31,38 +30,41 @@ from px4fuse.verification.verification import cannot_verify, log_sha256
 
 DEFAULT_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
-RUBRIC_HELP = "px4fuse grade --write-rubric FILE.toml writes one that explains itself."
+RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
 
-# For the class table: column title, and where in the results
+# numbers of the class table: column title, and path in the results
 NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
     ("SIGMA_Z (m)", "settings.sigma_z_m"),
     ("mean NIS north", "axes.north.filters.kf.nis_mean"),
     ("mean NIS east", "axes.east.filters.kf.nis_mean"),
-    ("position RMSE to truth, aisle (m)", "axes.aisle.filters.kf.truth.position_rmse_m"),
+    (
+        "position RMSE against ground truth, aisle (m)",
+        "axes.aisle.filters.kf.truth.position_rmse_m",
+    ),
     ("closure error (m)", "loop.closure_error_m"),
 )
 
 if TYPE_CHECKING:
     AnyItem = RubricItem
 else:
-    # of every check, told apart by their tags
+    # items of all checks, distinguished by their tag
     AnyItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
-# What is done with points that nobody can vouch for: left for the instructor, taken, or counted
+# points of a report that is not fully verified: left to the instructor, zero, or counted
 Doubtful = Literal["pending", "zero", "count"]
 
 
 class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a report is worth.
+    """Items of a grade, and rules for reports that are not fully verified.
 
     Attributes
     ----------
     unverified : {"pending", "zero"}
-        What becomes of the points of a report that cannot be verified.
+        Rule for a report that could not be verified.
     others_log : {"pending", "zero", "count"}
-        What becomes of those of a report on a log that was not given to the student.
+        Rule for a report on a log that was not given to the student.
     pages : {"count", "pending", "zero"}
-        What becomes of those of a verified report whose pages look otherwise.
+        Rule for a verified report with pages that differ from the redrawn ones.
     """
 
     title: Text = ""
@@ -77,12 +79,12 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         titles = [TOTAL, *(item.title for item in self.items)]
         for title, unique_title in zip(titles, make_unique(titles), strict=True):
             if title != unique_title:
-                owner = "that of the sum" if title.casefold() == TOTAL else "another item's"
-                raise ValueError(f"the title {title!r} is {owner}; give each its own")
+                owner = "the sum" if title.casefold() == TOTAL else "another item"
+                raise ValueError(f"the title {title!r} is used by {owner}; use unique titles")
 
 
 def rubric_text() -> str:
-    """The default rubric, comments and all, for an instructor to copy and edit."""
+    """Return the default rubric with its comments, as an example to edit."""
     return files("px4fuse.grading").joinpath(DEFAULT_NAME).read_text(encoding="utf-8")
 
 
@@ -105,7 +107,7 @@ def read_rubric(path: Path | None) -> Rubric:
 
 
 def parse_rubric(text: str, source_name: str) -> Rubric:
-    """Check the text of a rubric; ``source_name`` names it in errors."""
+    """Parse and check the text of a rubric; ``source_name`` names it in errors."""
     try:
         return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
     # ValueError: not TOML, or an integer of a million digits
@@ -115,7 +117,7 @@ def parse_rubric(text: str, source_name: str) -> Rubric:
 
 
 def _describe_place(path: re.Match[str]) -> str:
-    """Which item and what of it, as a person counts."""
+    """Format the place of an error: item number (from 1) and field."""
     return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
 
 
@@ -125,11 +127,11 @@ def _describe_place(path: re.Match[str]) -> str:
 def assess(
     results: Reported, verdict: Verdict, rubric: Rubric, key: AnswerKey | None, owner_id: str = ""
 ) -> GradedReport:
-    """Points for one report, whether they count, and what is left for the instructor.
+    """Score a report, and state whether its points count and what the instructor has to do.
 
-    Items for another kind of report are left out, and without an answer key those on the form. The
-    names of the file, and what :mod:`px4fuse.grading.grade` knows of it, are for the caller to add.
-    ``owner_id`` is that of who handed it in, where a platform says so, whatever the report says.
+    Items for other commands are left out; items on the form also without an answer key. The caller
+    adds the file names. ``owner_id`` is the student id according to the learning platform, which
+    takes precedence over the id in the report.
     """
     evidence = Evidence(results, verdict, key, owner_id)
     points_status, why = _points_status(evidence, rubric)
@@ -138,7 +140,7 @@ def assess(
     for item in rubric.items:
         if not item.applies(kind, key):
             continue
-        share, comment = 0.0, f"No points, since {why}."
+        share, comment = 0.0, f"No points: {why}."
         if points_status != "zero":
             share, comment = item.score(evidence)
         awaits_points = item.by_hand and bool(student.notes.strip()) and points_status != "zero"
@@ -171,24 +173,24 @@ def assess(
 
 
 def _points_status(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
-    """What becomes of the points, and why: for "pending" what the instructor can do."""
+    """Return the rule for the points and its reason; for "pending" the action required."""
     verdict = evidence.verdict
     reason = in_brackets("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
-        return "zero", f"your report's numbers are not those that its log gives{reason}"
-    # of each doubt what the rubric says, why there are no points, and what can be done
+        return "zero", f"the numbers of your report differ from those of its log{reason}"
+    # rule of the rubric, reason for the student, action for the instructor
     doubts: list[tuple[Doubtful, str, str]] = []
     if verdict.status != "verified":
-        todo = verdict.remedy or f"Look at it yourself: it could not be verified{reason}."
+        todo = verdict.remedy or f"Check the report by hand: it was not verified{reason}."
         doubts.append((rubric.unverified, f"your report could not be verified{reason}", todo))
     elif verdict.page_status == "differ":
-        why = "pages of your PDF are not those that px4fuse draws from the log"
+        why = "pages of your PDF differ from those that px4fuse draws from the log"
         doubts.append((rubric.pages, why, "Compare the pages with the redrawn report."))
     if not evidence.is_own_log:
         why = "your report is not about the log that you were given"
         doubts.append((rubric.others_log, why, _foreign_log_advice(evidence)))
     if evidence.key is not None and getattr(evidence.results.request, "position", None):
-        todo = "Ask where its position file comes from: none was handed out."
+        todo = "Ask where the position file (--position) is from: none was handed out."
         doubts.append(("pending", "", todo))
     for rule, why, _ in doubts:
         if rule == "zero":
@@ -198,22 +200,22 @@ def _points_status(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
 
 
 def _foreign_log_advice(evidence: Evidence) -> str:
-    """What the instructor can do about a log that is not the student's."""
+    """Format the action of the instructor for a report on a log of another student."""
     student_id = text_of(evidence.results.student.id)
-    id_text = f"the report gives the id {student_id}" if student_id else "the report gives no id"
+    id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
     if evidence.owner_id:
         id_text += f", and {text_of(evidence.owner_id)} handed it in"
     if evidence.answer is None:
-        return "Ask for a report on the log that was handed out: this one is about another."
+        return "The report is not about a log of the answer key. Ask for a report on that log."
     given_to = text_of(evidence.answer.student_id)
-    return f"Find out whose report it is: the log was given to {given_to}, {id_text}."
+    return f"Find the author of the report: its log was given to {given_to}, {id_text}."
 
 
 def refused_report(
     rubric: Rubric, key: AnswerKey | None, why: str, remedy: str = ""
 ) -> GradedReport:
-    """No points for what is not a report, so that it stands in the table with the others."""
-    comment = f"No points, since the file could not be read as a report: {text_of(why)}"
+    """Return a graded report with zero points, for a file that is not a report."""
+    comment = f"No points: the file is not a px4fuse report ({text_of(why).rstrip('.')})."
     items = (
         Item(item.title, 0.0, item.points, comment)
         for item in rubric.items

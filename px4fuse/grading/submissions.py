@@ -1,23 +1,22 @@
-"""What was handed in, by whom and when: PDFs in folders and in zip files as platforms export them.
+"""Submissions: PDFs in folders and in zip files of learning platforms, with student and time.
 
-Nothing is unpacked to disk. Names from a zip file are shown and never used as paths.
+Zip files are not unpacked to disk, and names in them are never used as paths. Students choose the
+names of their files, but not the beginning of the path, which the platform writes: the first match
+in a path counts.
 
-A student chooses the name of the file and what is in a zip file, and nothing outside of it: what
-the platform wrote stands first in a path, and the first match is taken.
+Sources of the file names:
 
-Sources of the names:
-
-- Moodle: ``mod/assign/feedback/file/importziplib.php`` of its repository, which reads the names
-  back: ``{full name}_{participant}_assignsubmission_{plugin}_``, since 4.1 without the last ``_``.
+- Moodle: ``mod/assign/feedback/file/importziplib.php`` of its repository, which reads the names:
+  ``{full name}_{participant}_assignsubmission_{plugin}_``, since 4.1 without the last ``_``.
 - Canvas: "How do I download all student submissions for an assignment?", Instructor Guide:
   ``{surnamefirst}[_LATE]_{user}_{submission}_{file}``.
 - Blackboard Learn: "Download assignments", Instructor Help:
   ``{assignment}_{user name}_attempt_{year-month-day-hour-minute-second}_{file}``.
-- Gradescope: "Exporting submissions", Help Center: ``submission_{number}``, and beside them
+- Gradescope: "Exporting submissions", Help Center: ``submission_{number}``, and
   ``submission_metadata.yml`` with names, ids (``:sid:``) and times.
 - ILIAS: multi-feedback of ``components/ILIAS/Exercise`` in its repository:
-  ``{last}_{first}_{login}_{user}/``, where a late file's name begins with "Late Submission - " if
-  the instructor's language is English; in others only ``--due`` tells.
+  ``{last}_{first}_{login}_{user}/``. The name of a late file begins with "Late Submission - " if
+  the language of the instructor is English; for other languages use ``--due``.
 """
 
 import re
@@ -44,26 +43,26 @@ from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import BAD_VALUES
 
 MAX_ENTRIES = 10_000
-# Of the table of contents, which zipfile reads in one piece before it can be counted
+# bytes; zipfile reads the whole table of contents before entries can be counted
 MAX_DIRECTORY_BYTES = 4_000_000
-# Of all that is in one zip file, whose entries may share their bytes
+# bytes; sum of the unpacked sizes of a zip file, whose entries may overlap
 MAX_TOTAL_BYTES = 4_000_000_000
-# PDFs are compressed inside; what still shrinks a hundred times is empty
+# compression ratio; PDFs are compressed already and do not shrink 100 times
 MAX_RATIO = 100
 MAX_NAME = 200
-# The year that stands where a program knew no time
+# year of zip entries without a time
 ZIP_EPOCH = 1980
 
 _TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 _ENCRYPTED = 1
 _UTF8 = 0x800
 METADATA = "submission_metadata.yml"
-# By platform: how its exports name files
+# patterns of the file names, by platform
 PLATFORMS = {
     name: re.compile(pattern)
     for name, pattern in table(__file__, "platforms.toml", dict[str, str]).items()
 }
-# What a platform writes into a name once, and nobody else by chance
+# parts of names that a platform writes once, and that students do not write by accident
 _PLATFORM_MARKS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 TIME_IN_NAMES = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION = re.compile(r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE)
@@ -71,16 +70,16 @@ _SUBMITTERS = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.M
 
 
 class _EntryError(Exception):
-    """Why an entry of a zip file is not read."""
+    """Reason why an entry of a zip file is not read."""
 
 
 _BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# with RuntimeError also NotImplementedError, for what zipfile does not know
+# BAD_VALUES contains RuntimeError, and with it NotImplementedError of zipfile
 _UNREADABLE = (_EntryError, *_BROKEN_ZIP, *BAD_VALUES)
 
 
 def _unread_reason(error: Exception) -> str:
-    """Why something could not be read: the end of a sentence."""
+    """Format the reason why a file could not be read, as the end of a sentence."""
     if isinstance(error, _EntryError):
         return str(error)
     why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
@@ -88,27 +87,26 @@ def _unread_reason(error: Exception) -> str:
 
 
 def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
-    """Find the PDFs in files, folders and zip files, and who handed them in by their names.
+    """Find the PDFs in files, folders and zip files, and their students by the file names.
 
     Parameters
     ----------
     paths : sequence of Path
-        PDFs, folders, which are searched with their subfolders, and zip files as platforms export
-        them; a zip file in one of these was handed in by a student. Gradescope's
-        ``submission_metadata.yml`` is read where it stands beside the submissions, never inside
-        one.
+        PDFs, folders (searched with their subfolders), and zip files exported by platforms. A zip
+        file inside of a folder or zip file is a student's and not opened. Gradescope's
+        ``submission_metadata.yml`` is read beside the submissions, never inside of one.
 
     Returns
     -------
     submissions : tuple of Submission
-        Sorted by name. A PDF that cannot be read is among them, and :func:`read` says why.
+        Sorted by name, including unreadable PDFs: :func:`read` gives the reason.
     notes : tuple of str
-        What was passed over: one sentence each.
+        Ignored files, one sentence each.
 
     Raises
     ------
     SettingsError
-        A path does not exist, or there is no PDF in any of them.
+        A path does not exist, or no PDF was found.
     """
     notes: list[str] = []
     submissions_by_place: dict[tuple[Path, str], Submission] = {}
@@ -131,15 +129,13 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
                 except ResultsError as error:
                     notes.append(str(error))
     if other_count:
-        notes.append(f"Files passed over that are not PDFs: {other_count}.")
+        notes.append(f"Ignored files (not PDF): {other_count}.")
     if zip_count:
         notes.append(
-            f"Zip files not opened: {zip_count}; give a platform's export by its own name."
+            f"Zip files not opened: {zip_count}. Name the export of a platform on the command line."
         )
     if not submissions_by_place:
-        raise SettingsError(
-            one_line(" ".join(["No PDF was found in what was given.", *notes]), 500)
-        )
+        raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
     order = sorted(
         submissions_by_place.values(),
         key=lambda one: (one.name.casefold(), one.name, one.file, one.entry),
@@ -152,15 +148,15 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
 def with_origins(
     submissions: Sequence[Submission], people: Mapping[str, ExportOrigin]
 ) -> Iterator[Submission]:
-    """Submissions with who handed in each, and by which platform.
+    """Add student and platform to submissions.
 
-    An export is of one platform: that of most of its files. What a student called a file, in the
-    way of another platform, says nothing.
+    All files of an export are of the platform that matches most of them. A file that a student
+    named like those of another platform is not assigned to it.
 
     Parameters
     ----------
     people : mapping
-        Of Gradescope's metadata, by number of a submission.
+        Gradescope's metadata, by submission number.
     """
     exports = [one.file if one.entry else one.name.partition("/")[0] for one in submissions]
     platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
@@ -183,7 +179,7 @@ def read(submission: Submission) -> bytes:
     Raises
     ------
     ResultsError
-        It cannot be read.
+        The submission cannot be read.
     """
     try:
         with submission.file.open("rb") as file:
@@ -207,7 +203,7 @@ def _is_metadata(name: str) -> bool:
 
 
 class _LimitedFile:
-    """A file of which no more than a table of contents can be read in one piece."""
+    """File that does not return more than MAX_DIRECTORY_BYTES at once."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -217,7 +213,7 @@ class _LimitedFile:
     def read(self, size: int = -1) -> bytes:
         if size > MAX_DIRECTORY_BYTES:
             raise zipfile.BadZipFile("table of contents too large")
-        # zipfile asks for "the rest" only where it looks for the end of the archive
+        # zipfile reads without size only to find the end of the archive
         return self._file.read(size if size >= 0 else MAX_DIRECTORY_BYTES)
 
 
@@ -230,21 +226,21 @@ def _archive(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
 
 
 def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
-    """What is in a zip file; nothing, and a note, where it cannot be read."""
+    """Return the entries of a zip file; none, and a note, if it cannot be read."""
     try:
         with path.open("rb") as file, _archive(file) as archive:
             entries = [one for one in archive.infolist() if not one.is_dir()]
-        # zipfile gives no more than the declared size
+        # zipfile returns at most the declared size
         if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
             raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
     except _UNREADABLE as error:
-        notes.append(f"{_short_name(path.name)}: passed over: {_unread_reason(error)}")
+        notes.append(f"{_short_name(path.name)}: ignored: {_unread_reason(error)}")
         return []
     last = {one.filename: one for one in entries}
     if len(last) < len(entries):
         notes.append(
-            f"{_short_name(path.name)}: {len(entries) - len(last)} entries have the name of another "
-            "one; only the last of each name was read."
+            f"{_short_name(path.name)}: {len(entries) - len(last)} entries have duplicate names; "
+            "only the last entry of each name was read."
         )
     places = (
         Submission(path.resolve(), name, _entry_label(one), _entry_time(one))
@@ -254,12 +250,12 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
 
 
 def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
-    """Regular files with their names for people, without hidden ones."""
+    """Yield the regular files of a folder, except hidden ones."""
     if path.is_file():
         yield Submission(path.resolve(), "", path.name)
         return
     if not path.is_dir():
-        raise SettingsError(f"{one_line(str(path), MAX_NAME)}: no regular file, and no folder.")
+        raise SettingsError(f"{one_line(str(path), MAX_NAME)}is not a file or folder.")
     root = path.resolve()
     outside = 0
     for file in files_below(root):  # symbolic links to folders are not entered
@@ -268,9 +264,9 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
             continue
         try:
             resolved = file.resolve(strict=True)
-            # a named pipe would keep us waiting forever
+            # reading a named pipe would wait forever
             inside = resolved.is_relative_to(root) and resolved.is_file()
-        except (OSError, RuntimeError):  # it leads nowhere, or in a circle
+        except (OSError, RuntimeError):  # link without target, or circular
             inside = False
         if inside:
             yield Submission(resolved, "", name.as_posix())
@@ -278,7 +274,7 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
     if outside:
         notes.append(
             f"{one_line(path.name, MAX_NAME)}: {outside} links out of the folder, special files or "
-            "folders that cannot be read were not followed."
+            "unreadable folders were ignored."
         )
 
 
@@ -287,7 +283,7 @@ def _is_hidden(name: str) -> bool:
 
 
 def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
-    """When an entry was changed, in the time zone of who packed it; None where that is nonsense."""
+    """Return the time of a zip entry, in an unknown time zone; None if it is not valid."""
     try:
         time = datetime(*entry.date_time)
     except ValueError:
@@ -296,10 +292,10 @@ def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
 
 
 def _entry_label(entry: zipfile.ZipInfo) -> str:
-    """Name of an entry for people: its folders and name, whatever else is in it left out."""
+    """Return folders and name of a zip entry for messages, without '.', '..' and drives."""
     name = entry.filename
     if not entry.flag_bits & _UTF8:
-        # zipfile takes unmarked names for code page 437; most programs write UTF-8 unmarked
+        # zipfile decodes names without UTF-8 flag as code page 437; most programs write UTF-8
         try:
             name = name.encode("cp437").decode("utf-8")
         except UnicodeError:
@@ -313,39 +309,42 @@ def _entry_label(entry: zipfile.ZipInfo) -> str:
 
 
 def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Content of an entry, if it is one that a learning platform would write."""
+    """Read an entry that is of a kind that learning platforms write."""
     entry = archive.getinfo(name)
     is_small = entry.file_size <= max(1_000_000, MAX_RATIO * entry.compress_size)
     is_known_method = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
     for has_problem, why in (
-        (entry.flag_bits & _ENCRYPTED, "encrypted in its zip file."),
+        (entry.flag_bits & _ENCRYPTED, "the zip entry is encrypted."),
         (
             stat.S_ISLNK(entry.external_attr >> 16),
-            "a symbolic link in its zip file, which is not followed.",
+            "the zip entry is a symbolic link.",
         ),
-        (not is_known_method, "packed in its zip file by a method that is not read."),
+        (not is_known_method, "the compression method of the zip entry is not supported."),
         (entry.file_size > MAX_BYTES, _TOO_LARGE),
-        (not is_small, f"it shrinks more than {MAX_RATIO} times in its zip file: no report."),
+        (
+            not is_small,
+            f"the zip entry is compressed more than {MAX_RATIO} times, so it is not a report.",
+        ),
     ):
         if has_problem:
             raise _EntryError(why)
-    # zipfile gives no more than the declared size
+    # zipfile returns at most the declared size
     return archive.read(entry)
 
 
 def _short_name(name: str) -> str:
-    """A name on one line, with its end, where the file's name is."""
+    """Format a name on one line; of a long name the start and the end."""
     line = " ".join(clean_text(name[-10 * MAX_NAME :]).split())
     if len(line) > MAX_NAME:
         line = f"{line[: MAX_NAME // 2]}…{line[-(MAX_NAME - MAX_NAME // 2 - 1) :]}"
-    return line or "nameless"
+    return line or "no name"
 
 
-# ------------------------------------------------------------------ who and when, as platforms say
+# ------------------------------------------------------------------ student and time in exports
 
 
 def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
-    """Who handed a file in, by its path in the export.
+    """Return the student of a file, by its path in the export.
 
     >>> origin_of("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
     'Doe Jane'
@@ -367,7 +366,7 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
             stamp = fields.get("time", "")
             try:
                 time = datetime.strptime(stamp, TIME_IN_NAMES) if stamp else None
-            except ValueError:  # a 99th month: a student's own name
+            except ValueError:  # not a valid time: the student chose the name
                 continue
             full_name = (
                 fields.get("name") or f"{fields.get('first', '')} {fields.get('last', '')}".strip()
@@ -382,10 +381,10 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
 
 
 def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
-    r"""People and times of Gradescope's ``submission_metadata.yml``, by number of submission.
+    r"""Read students and times from Gradescope's ``submission_metadata.yml``, by submission number.
 
-    Only the keys at Gradescope's own depth are read: texts of students are in it as well, deeper.
-    Of a group the first member is named.
+    Only keys at the depth of Gradescope's own are read; texts of students are deeper. The student
+    of a group is its first member.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
     >>> gradescope_metadata(text)["7"].person.student_id
@@ -406,13 +405,13 @@ def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
 
 
 def _value(block: str, key: str) -> str:
-    """The first value of a key, without quotes."""
+    """Return the first value of a key, without quotes."""
     match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
     return match[2] if match else ""
 
 
 def _time_of(value: str) -> datetime | None:
-    """A time as YAML of Gradescope has it, with its zone.
+    """Read a time of Gradescope's YAML, with its time zone.
 
     >>> _time_of("2026-11-20 12:34:56.123456000 Z").isoformat()
     '2026-11-20T12:34:56.123456+00:00'

@@ -1,5 +1,4 @@
-"""Trajectories: loop closure, pose graphs, and scores against a reference.
+"""Trajectories in three dimensions: pose graphs, time offsets, and scores against a reference.
 
-Position and orientation over time, in three dimensions; the two-state filter along one axis is in
-:mod:`px4fuse.filter.kalman`.
+The two-state filter KF along one axis is in :mod:`px4fuse.filter.kalman`.
 """

@@ -1,9 +1,8 @@
-"""Alignment of an estimate with its reference: what of the difference is only a choice of frame.
+"""Alignment of an estimate with its reference: the transform that is not counted as error.
 
-An estimator that feels gravity knows what is vertical: it may be turned about the vertical and
-shifted, four degrees of freedom, and a tilt of it is an error (Zhang & Scaramuzza 2018). SLAM whose
-world is its first key frame may be turned in any way (six), and a single camera does not know the
-scale (seven).
+Estimators that use gravity are aligned in yaw and position (4 degrees of freedom), so tilt counts
+as error (Zhang & Scaramuzza 2018). SLAM with the frame of its first key frame is aligned in
+rotation and position (6), monocular SLAM also in scale (7).
 """
 
 from typing import Literal
@@ -18,26 +17,26 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# Below this share of the motion's extent, or this RMS, there is nothing to turn by
+# fraction of the extent, and m (RMS); smaller motion does not determine a rotation
 MIN_SHARE, MIN_SPREAD_M = 1e-6, 1e-6
-# The turn's standard deviation is residual / (spread · √n). Two spreads of mere noise leave √2 of
-# one as residual in the plane, and √6 around a line: chance decides the turn
+# ratios of residual to extent above which the rotation is not determined. Its standard deviation is
+# residual / (extent · √n); pure noise has a ratio of √2 in the plane, and √6 around a line
 MAX_PLANE_RATIO, MAX_LINE_RATIO = 1.0, 2.0
 
 
 class Transform(Record, frozen=True):
-    """A similarity, from the estimate's world to the reference's: x ↦ scale · R x + t.
+    """Similarity transform from the frame of the estimate to that of the reference: x ↦ scale · R x + t.
 
     Attributes
     ----------
     quaternion_wxyz : tuple of float
         R.
     translation_m : tuple of float
-        t, in the reference's frame.
+        t, in the frame of the reference.
     scale : float
         Exactly 1 except for Sim(3).
     degrees_of_freedom : int
-        How many of its numbers were fitted: 0, 4, 6 or 7.
+        Number of fitted parameters: 0, 4, 6 or 7.
     """
 
     quaternion_wxyz: tuple[float, float, float, float]
@@ -47,22 +46,22 @@ class Transform(Record, frozen=True):
 
     @property
     def rotation(self) -> Rotation:
-        """R, a single one."""
+        """Rotation R."""
         return Rotation.from_quat(self.quaternion_wxyz, scalar_first=True)
 
     def apply(self, position_m: Array) -> Array:
-        """Positions in the reference's frame, shape (n, 3) or (3,)."""
+        """Transform positions to the frame of the reference, shape (n, 3) or (3,)."""
         rotated: Array = self.rotation.apply(self.scale * position_m)
         return rotated + self.translation_m
 
     def apply_inverse(self, position_m: Array) -> Array:
-        """Positions in the estimate's world, shape (n, 3) or (3,)."""
+        """Transform positions to the frame of the estimate, shape (n, 3) or (3,)."""
         shifted: Array = self.rotation.inv().apply(position_m - np.array(self.translation_m))
         return shifted / self.scale
 
 
 def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform:
-    """Transform of the estimate that leaves the least squared distance to the reference.
+    """Fit the transform of the estimate with the least squared distance to the reference.
 
     Umeyama (1991), eqs. 40 to 43, for "se3" and "sim3"; for "yaw" the closed form of Zhang &
     Scaramuzza (2018), section III-C, about z.
@@ -72,21 +71,19 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
     estimate_m, reference_m : ndarray, shape (n, 3)
         Positions at the same times.
     kind : {"none", "yaw", "se3", "sim3"}
-        For "yaw" z must be vertical in both frames, and point the same way.
+        For "yaw" z must be vertical in both frames, with the same direction.
 
     Raises
     ------
     TrajectoryError
-        Fewer than three positions, or a motion from which the transform cannot be found: none, or
-        along a line, about which any turn fits as well.
+        Fewer than three positions, or the motion does not determine the transform: no motion, or
+        motion along a line, around which the rotation is arbitrary.
     """
     if len(estimate_m) < MIN_POSES:
         raise TrajectoryError(
             f"Only {len(estimate_m)} poses match in time; an alignment needs {MIN_POSES}.",
-            (
-                "Check that both trajectories are of the same flight and use the same clock "
-                "(--time-offset auto)."
-            ),
+            "Check that both trajectories are of the same flight and use the same clock "
+            "(--time-offset auto).",
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
@@ -96,28 +93,28 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         transform = _similarity(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
         _require_determined(transform, estimate_m, reference_m, kind)
         return transform
-    # the scale is left out of the question: a wrong one is no reason to doubt the turn
+    # test with scale, because a scale factor error does not make the rotation uncertain
     similarity = umeyama(estimate_m, reference_m, with_scale=True)
     _require_determined(similarity, estimate_m, reference_m, kind)
     return similarity if kind == "sim3" else umeyama(estimate_m, reference_m, with_scale=False)
 
 
 def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Transform:
-    """SE(3) or Sim(3) of least squares, without asking whether the motion determines it.
+    """Fit SE(3) or Sim(3) by least squares, without testing that the motion determines it.
 
-    Along a line it is one of many that are equally good.
+    For motion along a line the result is one of many with equal residual.
 
     Parameters
     ----------
     estimate_m, reference_m : ndarray, shape (n, 3)
     with_scale : bool
-        Sim(3); scale 1 where the estimate does not move.
+        Sim(3); scale 1 if the estimate does not move.
     """
     x, y = estimate_m - estimate_m.mean(axis=0), reference_m - reference_m.mean(axis=0)
     u, d, vt = np.linalg.svd(y.T @ x / len(x))  # eq. 38
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # eq. 43
     variance = float((x * x).sum() / len(x))  # eq. 36
-    # eq. 42; the smallest double would give an infinite scale
+    # eq. 42; a tiny variance would give an infinite scale
     scale = float(d @ s / variance) if with_scale and variance > MIN_SPREAD_M**2 else 1.0
     turn = Rotation.from_matrix((u * s) @ vt)  # eq. 40
     return _similarity(turn, estimate_m, reference_m, scale, 7 if with_scale else 6)
@@ -126,30 +123,30 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
 def _similarity(
     turn: Rotation, estimate_m: Array, reference_m: Array, scale: float, freedom: int
 ) -> Transform:
-    """The similarity of a turn and a scale, which brings the means together (eq. 41)."""
+    """Return the similarity with given rotation and scale that aligns the means (eq. 41)."""
     shift = reference_m.mean(axis=0) - scale * turn.apply(estimate_m.mean(axis=0))
     w, x, y, z = turn.as_quat(scalar_first=True).tolist()
     return Transform((w, x, y, z), tuple(shift.tolist()), scale, freedom)
 
 
 def _spread(position_m: Array) -> Array:
-    """RMS about the mean along the principal directions, descending (m)."""
+    """Return the RMS (m) about the mean along the principal directions, descending."""
     centred = position_m - position_m.mean(axis=0)
     return np.asarray(np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred)))
 
 
 def rms_m(difference_m: Array) -> float:
-    """Root mean square length of vectors, shape (n, d)."""
+    """Return the RMS length of vectors, shape (n, d)."""
     return float(np.sqrt((difference_m * difference_m).sum(axis=1).mean()))
 
 
 def _require_determined(
     transform: Transform, estimate_m: Array, reference_m: Array, kind: str
 ) -> None:
-    """Refuse a turn that the motion does not determine.
+    """Raise TrajectoryError if the motion does not determine the rotation.
 
-    What determines a yaw is the horizontal motion; any other turn, the extent away from a line,
-    which is the second singular value.
+    Yaw is determined by horizontal motion, other rotations by the extent across a line (the second
+    singular value).
     """
     spread, target = _spread(estimate_m), _spread(reference_m)
     if kind == "yaw":
@@ -161,14 +158,12 @@ def _require_determined(
         length, extent_m, _ = np.minimum(transform.scale * spread, target)
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
         limit = MAX_LINE_RATIO
-        motion = f"motion is along a line: {length:.2g} m (RMS) by"
-        instead = "`alignment` yaw if z is vertical in both, or `alignment` none"
+        motion = f"motion is along a line: {length:.2g} m (RMS), across it"
+        instead = "--alignment yaw if z is vertical in both, or --alignment none"
     if extent_m < max(MIN_SPREAD_M, MIN_SHARE * length) or residual_m > limit * extent_m:
         raise TrajectoryError(
-            (
-                f"{kind} cannot be estimated: the {motion} {extent_m:.2g} m, and the "
-                f"alignment residual is {residual_m:.2g} m. The vehicle moved too little, or "
-                "the estimate does not follow it."
-            ),
+            f"Alignment {kind} cannot be estimated: the {motion} {extent_m:.2g} m, and the "
+            f"residual is {residual_m:.2g} m. The vehicle moved too little, or the estimate does "
+            "not follow its motion.",
             f"Use {instead}.",
         )

@@ -1,4 +1,4 @@
-"""Two trajectories at the same times."""
+"""Association of the poses of two trajectories by time."""
 
 from dataclasses import replace
 from typing import Literal
@@ -13,30 +13,30 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# Positions are not interpolated across longer intervals than so many median ones, or this
+# longest interpolated interval: multiple of the median interval, and at least this (s)
 GAP_INTERVALS, GAP_S = 3.0, 0.1
-NEAREST_S = 0.01  # the evo package's default too
+NEAREST_S = 0.01  # largest time difference; same default as the evo package
 
 
 class Association(Record, frozen=True):
-    """How poses were paired by time, and how many were left out.
+    """Pairing of poses by time, with the numbers of unused poses.
 
     Attributes
     ----------
     method : {"interpolate", "nearest"}
     poses : int
-        Of each of the two, at the same times.
+        Number of pairs.
     max_gap_s : float
-        Longest interval of the reference that is interpolated across; for "nearest" the largest
-        difference in time.
+        Longest interval of the reference that is interpolated; for "nearest" the largest time
+        difference.
     outside, in_gaps : int
-        Poses of the estimate dropped as the reference has none at their time: before its start
-        or after its end, and in its gaps.
+        Poses of the estimate without a reference: before its start or after its end, and in its
+        gaps.
     coverage_estimate : float
-        Share of the estimate's poses that are used.
+        Fraction of the poses of the estimate that are used.
     coverage_reference : float
-        Share of the reference's span in time that the used poses cover; intervals between them
-        longer than five median ones and 0.5 s do not.
+        Fraction of the time of the reference that the used poses cover. Intervals between them are
+        not counted if they are longer than five median intervals and 0.5 s.
     """
 
     method: Method
@@ -56,24 +56,25 @@ def associate(
     max_gap_s: float | None = None,
     time_offset_s: float = 0.0,
 ) -> tuple[Trajectory, Trajectory, Association]:
-    """Poses of both at the same times: the estimate's on its own clock, and as many references.
+    """Return the poses of both trajectories at the same times, on the clock of the estimate.
 
     Parameters
     ----------
     method : {"interpolate", "nearest"}
-        "interpolate" puts the reference at the estimate's times, position linearly and rotation by
-        slerp. "nearest" pairs the poses of the one that has fewer with the nearest of the other,
-        as the evo package does; a pose of the longer one may serve twice.
+        "interpolate": interpolate the reference at the times of the estimate, positions linearly
+        and rotations by slerp. "nearest": pair each pose of the trajectory with fewer poses with
+        the nearest of the other, as the evo package does; a pose of the longer one may be used
+        twice.
     max_gap_s : float, optional
         See :class:`Association`; by default three median intervals of the reference and at least
         0.1 s, and 0.01 s for "nearest".
     time_offset_s : float
-        Added to the estimate's stamps.
+        Added to the timestamps of the estimate.
 
     Raises
     ------
     TrajectoryError
-        Fewer than three poses match; the text gives both spans.
+        Fewer than three poses match; the message contains both time spans.
     """
     time, (first, last) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
     if method == "nearest":
@@ -88,17 +89,14 @@ def associate(
         pose_indices = np.flatnonzero(is_bracketed(time, reference.time_s, limit))
         matched_reference = _interpolate_poses(reference, time[pose_indices])
     if len(pose_indices) < MIN_POSES:
-        what = (
-            f"only {len(pose_indices)} of its poses match"
-            if len(pose_indices)
-            else "no poses match"
-        )
-        added = f" (with the offset of {time_offset_s:.12g} s)" if time_offset_s else ""
+        count = f"only {len(pose_indices)}" if len(pose_indices) else "no"
+        added = f" (with the time offset {time_offset_s:.12g} s)" if time_offset_s else ""
         raise TrajectoryError(
-            f"{estimate.name}: {what} in time: it spans {time[0]:.3f} to {time[-1]:.3f} s{added}, "
-            f"the reference {reference.name} {first:.3f} to {last:.3f} s",
-            "Check that both are of "
-            "the same flight; if their clocks differ, give `time_offset_s` auto.",
+            f"{estimate.name}: {count} poses match in time. The estimate is from {time[0]:.3f} to "
+            f"{time[-1]:.3f} s{added}, the reference {reference.name} from {first:.3f} to "
+            f"{last:.3f} s.",
+            "Check that both are of the same flight. If their clocks differ, give "
+            "--time-offset auto.",
         )
     outside = int(((time < first - end_tolerance_s) | (time > last + end_tolerance_s)).sum())
     steps = np.diff(time[pose_indices])
@@ -118,12 +116,12 @@ def associate(
 
 
 def gap_limit(time_s: Array, least_s: float = GAP_S) -> float:
-    """Longest interval (s) between stamps across which positions are interpolated."""
+    """Return the longest interval (s) between timestamps that is interpolated."""
     return max(GAP_INTERVALS * float(np.median(np.diff(time_s))), least_s)
 
 
 def is_bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:
-    """Whether each time is a reference's, or between two that are near enough to each other."""
+    """Return True for times at a reference time, or between two within ``limit`` (s)."""
     right = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
     before, after = reference_s[right - 1], reference_s[right]
     between = (before <= time_s) & (time_s <= after) & (after - before <= limit)
@@ -131,7 +129,7 @@ def is_bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:
 
 
 def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
-    """Poses at times within its span."""
+    """Interpolate the poses at times within the trajectory."""
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
@@ -140,16 +138,16 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
 
 
 def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
-    """Positions at times within its span, shape (n, 3)."""
+    """Interpolate the positions at times within the trajectory, shape (n, 3)."""
     columns = trajectory.position_m.T
-    return np.stack([np.interp(time_s, trajectory.time_s, one) for one in columns], axis=-1)
+    return np.stack([np.interp(time_s, trajectory.time_s, column) for column in columns], axis=-1)
 
 
 def _pair_nearest(
     estimate_s: Array, reference_s: Array, limit: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
-    """Indices of pairs: each stamp of the shorter with the nearest of the longer."""
-    # the offset goes to the longer one's stamps, so that roundings are those of evo
+    """Return indices of pairs: each time of the shorter with the nearest of the longer one."""
+    # add the offset to the longer one, so that rounding is the same as in evo
     is_longer = len(estimate_s) > len(reference_s)
     short = reference_s if is_longer else estimate_s
     long = estimate_s + offset_s if is_longer else reference_s - offset_s

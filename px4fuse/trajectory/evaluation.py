@@ -1,7 +1,8 @@
-"""Scores of a trajectory against a reference: ATE and RPE (Sturm 2012), with intervals.
+"""Evaluation of a trajectory against a reference: ATE and RPE (Sturm 2012) with 95 % intervals.
 
-The absolute trajectory error is the distance of each pose to the reference after alignment; the
-relative pose error compares motions over a fixed distance or time, and so does not add up.
+The absolute trajectory error (ATE) is the distance of each pose to the reference after alignment.
+The relative pose error (RPE) compares motions over a fixed distance or time, so drift does not
+accumulate in it.
 """
 
 import re
@@ -17,6 +18,7 @@ from px4fuse.arrays import Array
 from px4fuse.display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
+from px4fuse.plain import capitalise_first
 from px4fuse.record import OrUnavailable, Record
 from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
@@ -25,18 +27,18 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 from px4fuse.trajectory.offset import TimeOffset, clock_difference, estimate_time_offset
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 
-MAX_SCALE_ERROR = 0.1
-MIN_COVERAGE = 0.5
-MIN_CLOCK_DOUBT_S = 0.1  # less than this may be the filter's own lag
-MAX_SPARSER = 5.0  # a reference with so much longer intervals is hardly one
+MAX_SCALE_ERROR = 0.1  # relative scale factor error that is accepted without a warning
+MIN_COVERAGE = 0.5  # fraction of poses or time below which a warning is given
+MIN_CLOCK_DOUBT_S = 0.1  # smallest time offset with a warning; a filter may lag by less
+MAX_SPARSER = 5.0  # ratio of intervals above which estimate and reference seem interchanged
 
 _DOWN, _UP = ("NED", "FRD"), ("ENU",)
-_FREE_KINDS = ("slam", "unknown")  # whose world may be turned in any way
+_FREE_KINDS = ("slam", "unknown")  # kinds whose frame has no known vertical
 _MONO = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
 class AbsoluteError(Record, frozen=True):
-    """ATE: of position (m), with its RMSE's interval, and of orientation (degrees)."""
+    """ATE of position (m), with the 95 % interval of its RMSE, and of orientation (degrees)."""
 
     translation_m: Statistics
     interval_m: OrUnavailable[Interval]
@@ -44,18 +46,18 @@ class AbsoluteError(Record, frozen=True):
 
 
 class Score(Record, frozen=True, kw_only=True):
-    """ATE and RPE of an estimate against a reference, and how the two were made comparable.
+    """ATE and RPE of an estimate against a reference, with alignment and time offset.
 
     Attributes
     ----------
     alignment : {"none", "yaw", "se3", "sim3"}
     alignment_reason : str
-        Why this one, a sentence.
+        Reason for this alignment, a sentence.
     transform : Transform
-        From the estimate's world to the reference's.
+        From the frame of the estimate to that of the reference.
     association : Association
     time_offset : TimeOffset
-        ``offset_s`` is what was added to the estimate's stamps.
+        ``offset_s`` was added to the timestamps of the estimate.
     ate : AbsoluteError
     rpe : tuple of RelativeError
     notes, warnings : tuple of str
@@ -74,24 +76,24 @@ class Score(Record, frozen=True, kw_only=True):
 
 
 class Evaluation(Score, frozen=True, kw_only=True, eq=False):
-    """An estimate's scores against a reference, with the error of each pose.
+    """Scores of an estimate against a reference, with the error of each pose.
 
     Attributes
     ----------
     estimate, reference : Trajectory
-        As given.
+        Trajectories as given.
     rpe : tuple of PairwiseError
     time_s : ndarray, shape (n,)
-        Of the poses used, on the estimate's clock.
+        Times of the compared poses, on the clock of the estimate.
     distance_m : ndarray, shape (n,)
-        Along the reference, from its first pose used.
+        Distance along the reference, from the first compared pose.
     unaligned_m, estimate_m, reference_m : ndarray, shape (n, 3)
         Positions of the estimate before and after alignment, and of the reference.
     position_error_m : ndarray, shape (n,)
     rotation_error_deg : ndarray, shape (n,), or None
     body_rotation : Rotation or None
-        Constant rotation from the reference's body to the estimate's that the rotations were
-        freed of; None where both are of the same body.
+        Constant rotation from the body axes of the reference to those of the estimate, which
+        rotation errors exclude; None if the body axes are the same.
     """
 
     schema_type = Score
@@ -121,35 +123,35 @@ def evaluate(
     rpe_deltas: Sequence[Delta] | None = None,
     all_pairs: bool = True,
 ) -> Evaluation:
-    """Score an estimate against a reference.
+    """Compute ATE and RPE of an estimate against a reference.
 
     Parameters
     ----------
     alignment : {"none", "yaw", "se3", "sim3"}, optional
-        By default what the two are decides, see :func:`choose_alignment`.
+        By default chosen by :func:`choose_alignment`.
     association : {"interpolate", "nearest"}
     max_gap_s : float, optional
         See :func:`~px4fuse.trajectory.association.associate`.
     time_offset_s : float, "auto" or None
-        Added to the estimate's stamps, as they are. By default what UNIX time says where both know
-        it, else nothing; "auto" finds it from the motion, and so does None where the two would not
-        overlap.
+        Added to the timestamps of the estimate. "auto" estimates the offset from the motion. None
+        uses UNIX time if both contain it, else 0; if the two then do not overlap, it acts as
+        "auto".
     rpe_deltas : sequence of Delta, optional
-        By default some distances and times that suit the flight.
+        By default distances and times that fit the flight.
 
     Raises
     ------
     TrajectoryError
         The two do not overlap in time, or the motion does not determine the alignment.
     SettingsError
-        A delta is not above zero, or not whole for frames.
+        A delta is not positive, or not an integer for frames.
     """
     offset, offset_warnings = _time_offset(estimate, reference, time_offset_s)
     added_offset_s = offset.offset_s or 0.0
     x, y, association_found = associate(
         estimate, reference, method=association, max_gap_s=max_gap_s, time_offset_s=added_offset_s
     )
-    reason = "As asked for."
+    reason = "Requested alignment."
     if alignment is None:
         alignment, reason = choose_alignment(x, y)
     transform = fit_alignment(x.position_m, y.position_m, alignment)
@@ -199,26 +201,27 @@ def evaluate(
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
-    """Alignment that suits what the two are, and why, in one sentence.
+    """Choose the alignment by the kinds of the two trajectories; return it with the reason, a sentence.
 
-    Ground truth is compared as it is; estimators that feel gravity may turn about the vertical;
-    SLAM may turn in any way, and scale where it is monocular or its scale is more than 10 % off.
+    Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
+    is aligned in rotation and position, and in scale if it is monocular or the scale factor error
+    exceeds 10 %.
 
     Parameters
     ----------
     estimate, reference : Trajectory
-        Associated: as many poses, at the same times.
+        Associated: the same number of poses, at the same times.
     """
     same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (same_frame or reference.kind == "truth"):
-        return "none", "No alignment, as ground truth is compared as it is."
+        return "none", "No alignment: the estimate is ground truth."
     frames = f"{estimate.frame} and {reference.frame}"
     is_upright = any({estimate.frame, reference.frame} <= set(same) for same in (_DOWN, _UP))
-    unaligned = [one for one in (estimate, reference) if one.kind in _FREE_KINDS]
+    unaligned = [track for track in (estimate, reference) if track.kind in _FREE_KINDS]
     if is_upright and estimate.kind not in _FREE_KINDS:
         return "yaw", (
-            f"Yaw and position (4 DoF), as z is vertical in both frames ({frames}): a tilt of the "
-            "estimate is an error."
+            f"Yaw and position (4 degrees of freedom): z is vertical in both frames ({frames}), "
+            "so a tilt counts as error."
         )
     try:
         scale = fit_alignment(estimate.position_m, reference.position_m, "sim3").scale
@@ -226,36 +229,43 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         if not is_upright:
             raise
         return "yaw", (
-            f"Yaw and position (4 DoF), as the motion is along a line and z is vertical in "
-            f"both frames ({frames})."
+            "Yaw and position (4 degrees of freedom): the motion is along a line, and z is "
+            f"vertical in both frames ({frames})."
         )
-    frame_reason = f"as the frames are {frames}, which do not share a vertical"
+    frame_reason = f"the frames {frames} have no common vertical"
     if unaligned:
-        slam_note = "comes from SLAM, whose world is its first key frame"
-        frame_reason = f"as {unaligned[0].name} {slam_note if unaligned[0].kind == 'slam' else 'does not say what made it'}"
-    monocular = [one.name for one in (estimate, reference) if _MONO.search(one.name)]
-    scale_reasons = [f"{name} says that it is monocular" for name in monocular]
+        is_slam = unaligned[0].kind == "slam"
+        frame_reason = f"{unaligned[0].name} has no known vertical " + (
+            "(SLAM: its frame is that of the first key frame)" if is_slam else "(unknown system)"
+        )
+    monocular = [track.name for track in (estimate, reference) if _MONO.search(track.name)]
+    scale_reasons = [f"{name} is monocular by its name" for name in monocular]
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
-        scale_reasons.append(f"the scale is {scale:.3g}, more than {MAX_SCALE_ERROR:.0%} off")
+        scale_reasons.append(
+            f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
+        )
     if not unaligned or not scale_reasons:
-        return "se3", f"Rotation and position (6 DoF), {frame_reason}."
-    return "sim3", f"Rotation, position and scale (7 DoF), {frame_reason}, and {scale_reasons[0]}."
+        return "se3", f"Rotation and position (6 degrees of freedom): {frame_reason}."
+    return "sim3", (
+        f"Rotation, position and scale (7 degrees of freedom): {frame_reason}, and "
+        f"{scale_reasons[0]}."
+    )
 
 
 def _time_offset(
     estimate: Trajectory, reference: Trajectory, given_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str]]:
-    """What to add to the estimate's stamps."""
+    """Return the offset to add to the timestamps of the estimate, and warnings."""
     if isinstance(given_s, float | int):
-        return TimeOffset(offset_s=given_s, determinable=True, reason="As asked for."), []
+        return TimeOffset(offset_s=given_s, determinable=True, reason="Requested offset."), []
     clock_offset_s = clock_difference(estimate, reference)
-    by_clock = "UNIX time of both clocks" if clock_offset_s else "the stamps as they are"
+    by_clock = "UNIX time of both clocks" if clock_offset_s else "unchanged timestamps"
     clock_offset = TimeOffset(
-        offset_s=clock_offset_s or 0.0, determinable=True, reason=f"By {by_clock}."
+        offset_s=clock_offset_s or 0.0, determinable=True, reason=f"{capitalise_first(by_clock)}."
     )
     start, end = estimate.time_s[[0, -1]] + (clock_offset_s or 0.0)
     no_overlap = start > reference.time_s[-1] or end < reference.time_s[0]
-    # a flight's boot clock and the clock of a file have nothing to do with each other
+    # the boot clock of a flight log and the clock of a file are unrelated
     unrelated_clocks = clock_offset_s is None and estimate.is_of_log != reference.is_of_log
     is_estimated = given_s == "auto" or no_overlap
     if not (is_estimated or unrelated_clocks):
@@ -265,30 +275,30 @@ def _time_offset(
         if found.determinable:
             return found, []
         used = structs.replace(clock_offset, determinable=False, reason=found.reason)
-        return used, [f"{found.reason} Used {by_clock} instead."]
+        return used, [f"{found.reason} {capitalise_first(by_clock)} used instead."]
     offset, (low, high) = found.offset_s or 0.0, found.interval_s or (0.0, 0.0)
     is_doubtful = not low <= 0.0 <= high and abs(offset) >= MIN_CLOCK_DOUBT_S
     doubt = (
-        f"The stamps are used as they are, but the motions fit best with {offset:+.3f} s added to "
-        "the estimate's: are the two clocks unrelated? Then give --time-offset auto."
+        f"The timestamps are used unchanged, but the motions match best with {offset:+.3f} s added "
+        "to the estimate. If the clocks are unrelated, give --time-offset auto."
     )
     return clock_offset, [doubt] if is_doubtful else []
 
 
 def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> list[str]:
-    """Warnings where the two look interchanged."""
+    """Return warnings if estimate and reference seem interchanged."""
     if reference.kind == "truth" != estimate.kind:
         return []
-    step, other_step = (float(np.median(np.diff(one.time_s))) for one in (estimate, reference))
+    step, other_step = (float(np.median(np.diff(track.time_s))) for track in (estimate, reference))
     signs = {
         f"{estimate.name} is ground truth and {reference.name} is not": (
             estimate.kind == "truth" != reference.kind
         ),
-        f"The reference has one pose in {other_step:.3g} s, the estimate one in {step:.3g} s": (
+        f"The reference has a pose every {other_step:.3g} s, the estimate every {step:.3g} s": (
             other_step > MAX_SPARSER * step
         ),
     }
-    swap = "Are the two interchanged? The estimate comes first."
+    swap = "Check the order of the arguments: the estimate is the first one."
     return [f"{sign}. {swap}" for sign, holds in signs.items() if holds]
 
 
@@ -298,21 +308,22 @@ def _comparison_warnings(
     association_found: Association,
     alignment: AlignmentKind,
 ) -> list[str]:
-    """Warnings on what was compared."""
+    """Return warnings on low coverage and on a scale factor error."""
     x, y = estimate.position_m, reference.position_m
-    # of the spreads: it needs no turn that the motion would have to determine
+    # this scale does not depend on a rotation, which the motion may not determine
     scale = umeyama(x, y, with_scale=True).scale
-    moves = min(float(np.ptp(one, axis=0).max()) for one in (x, y)) > 0.0
+    moves = min(float(np.ptp(position, axis=0).max()) for position in (x, y)) > 0.0
     warnings_by_text = {
-        f"Only {association_found.coverage_estimate:.0%} of the estimate's poses have a reference "
-        f"({association_found.outside} lie outside its span, {association_found.in_gaps} in its gaps).": (
+        f"Only {association_found.coverage_estimate:.0%} of the poses of the estimate have a "
+        f"reference ({association_found.outside} are outside of the time of the reference, "
+        f"{association_found.in_gaps} in its gaps).": (
             association_found.coverage_estimate < MIN_COVERAGE
         ),
-        f"The estimate covers only {association_found.coverage_reference:.0%} of the reference's time: "
-        "errors where it has no poses do not count.": association_found.coverage_reference
+        f"The estimate covers only {association_found.coverage_reference:.0%} of the reference's "
+        "time. Errors without estimate are not counted.": association_found.coverage_reference
         < MIN_COVERAGE,
-        f"The estimate's scale is off: {scale:.3g} times it would fit best, and the alignment "
-        f"({alignment}) leaves that in the errors.": (
+        f"Scale factor error of the estimate: a factor of {scale:.3g} fits best. The alignment "
+        f"({alignment}) does not correct it.": (
             alignment != "sim3" and moves and abs(scale - 1.0) > MAX_SCALE_ERROR
         ),
     }
@@ -322,7 +333,7 @@ def _comparison_warnings(
 def _body_rotation(
     aligned: Trajectory, reference: Trajectory
 ) -> tuple[Rotation | None, tuple[str, ...]]:
-    """Constant rotation between two bodies whose axes differ, as a camera's and a vehicle's do."""
+    """Estimate the constant rotation between different body axes (camera and vehicle)."""
     if aligned.rotation is None or reference.rotation is None:
         return None, ()
     vehicles = (*_DOWN, *_UP)
@@ -335,7 +346,7 @@ def _body_rotation(
     # chordal mean (Hartley 2013, section 5.3)
     turn = (aligned.rotation.inv() * reference.rotation).mean()
     return turn, (
-        "The axes of the two bodies differ (camera and vehicle): rotation errors are those around "
-        f"a constant rotation of {np.degrees(turn.magnitude()):.1f}° between them, which was "
-        "estimated; the distance between camera and vehicle is part of the position errors.",
+        "The body axes differ (camera and vehicle). Rotation errors exclude an estimated constant "
+        f"rotation of {np.degrees(turn.magnitude()):.1f}°. The lever arm between camera and "
+        "vehicle is part of the position errors.",
     )

@@ -1,4 +1,4 @@
-"""What a trajectory is: poses over time, from a file or out of a flight."""
+"""Trajectory: poses over time, from a file or a flight log."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.display import one_line_repr
 from px4fuse.record import Count, Record
 
-# What made it; "slam" is a system whose world is its first key frame (ORB-SLAM3 and the like)
+# source; "slam": SLAM whose frame is that of its first key frame (such as ORB-SLAM3)
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
-# Axes of its world: "NED" and "FRD" have z down, "ENU" z up, "camera" y down and z forward
+# frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 MIN_POSES = 3
 AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
@@ -28,11 +28,11 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 }
 
 
-# A vector by the names of a frame's axes
+# components of a vector by the names of the axes
 AxisLengths = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
-# Where what is negative along an axis lies
+# names of the negative directions
 OPPOSITE = {
     "north": "south",
     "east": "west",
@@ -44,7 +44,7 @@ OPPOSITE = {
 
 
 def format_vector(vector_m: Mapping[str, float]) -> str:
-    """A vector by the names of the axes, without signs where the axes have a direction.
+    """Format a vector with the names of its directions.
 
     >>> format_vector({"forward": 1.0, "right": -0.5}), format_vector({"x": -1.0})
     ('1.00 m forward, 0.50 m left', '-1.00 m along x')
@@ -58,12 +58,12 @@ def format_vector(vector_m: Mapping[str, float]) -> str:
 
 
 def by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
-    """A vector by the names of the axes."""
+    """Return the components of a vector by the names of the frame's axes."""
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
 class Track(Record, frozen=True):
-    """A trajectory as results name it, and the file that it was read from."""
+    """Description of a trajectory and its file, for the results."""
 
     name: str
     sha256: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")]
@@ -84,26 +84,26 @@ class Trajectory:
     Attributes
     ----------
     name : str
-        File name without its folder, with the part for a log ("log.ulg:vio").
+        File name without folder; with the track for a log ("log.ulg:vio").
     kind : Kind
     time_s : ndarray, shape (n,)
-        Strictly increasing seconds: the file's own stamps, or seconds from a log's first data.
+        Strictly increasing times (s): timestamps of the file, or time since the first data of a
+        log.
     position_m : ndarray, shape (n, 3)
         In ``frame``.
     rotation : Rotation of n, or None
-        Turns vectors of the body (or camera) into ``frame``; None where only positions are known.
+        Rotates vectors from body (or camera) axes to ``frame``; None without orientation.
     frame : Frame
     unix_offset_s : float or None
-        What must be added to ``time_s`` to give UNIX time; None where that is not known.
+        UNIX time minus ``time_s``; None if unknown.
     position_variance_m2, rotation_variance_rad2 : ndarray, shape (n, 3), or None
-        As the estimator itself reported them, rotation about the body's axes; None where it gave
-        none.
+        Reported variances, of rotation about the body axes; None without report.
     sha256 : str
-        Of the file that it was read from.
+        SHA-256 of the file.
     size_bytes : int
-        Of that file.
+        Size of the file.
     notes : tuple of str
-        What the reader recognised and did, each a sentence.
+        Remarks of the reader, sentences.
     """
 
     name: str
@@ -123,19 +123,14 @@ class Trajectory:
 
     @property
     def is_of_log(self) -> bool:
-        """Whether it is part of a flight log, on the autopilot's boot clock."""
+        """True for a track of a flight log, on the boot clock of the autopilot."""
         return self.name.endswith(f":{self.kind}")
 
     def __len__(self) -> int:
         return len(self.time_s)
 
     def __getitem__(self, selection: slice | BoolArray | IntArray) -> Trajectory:
-        """Some of its poses, in order.
-
-        Parameters
-        ----------
-        selection : slice, boolean array of shape (n,), or integer array
-        """
+        """Select poses by a slice, boolean array (n,) or integer array."""
         array_fields = (
             "time_s",
             "position_m",
@@ -150,9 +145,9 @@ class Trajectory:
         return replace(self, **selected)
 
     def moved(self, position_m: Array, world_rotation: Rotation | None = None) -> Trajectory:
-        """The same poses elsewhere, of which no reported variance holds any longer.
+        """Return the poses with other positions, and rotated; reported variances are dropped.
 
-        ``world_rotation`` is of their world: one, or one for each pose.
+        ``world_rotation``: one rotation of the frame, or one for each pose.
         """
         rotated = (
             self.rotation
@@ -166,7 +161,7 @@ class Trajectory:
         return replace(self, position_m=position_m, rotation=rotated, **no_variances)
 
     def track(self) -> Track:
-        """What results say about it."""
+        """Return the description for the results."""
         track_fields = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
         return Track(
             **{name: getattr(self, name) for name in track_fields},
@@ -178,6 +173,6 @@ class Trajectory:
 
 
 def cumulative_distance(position_m: Array) -> Array:
-    """Length of the path from its start to each position, shape (n, d) to (n,), in m."""
+    """Compute the path length (m) from the start to each position, shape (n, d) to (n,)."""
     steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,12 +1,11 @@
-"""Offset between the clocks of two recordings of one motion: every lag, then least squares.
+"""Time offset between two recordings of the same motion: search over all lags, then least squares.
 
-One search serves trajectories here, and a position file against EKF2 or the IMU in
-:mod:`px4fuse.alignment.fitting`: both series are correlated over all lags (:mod:`correlation`), the
-best is refined by least squares, and is refused where another lag's residual is within
-:data:`MIN_SECOND_PEAK_RATIO` of it. What differs is what is known. Trajectories may have any frame and scale,
-so their speeds are correlated and a free similarity is refined; a position file is in metres with z
-vertical and has outliers, so horizontal positions are correlated, and yaw and origin refined
-robustly.
+The same method is used for trajectories here, and for a position file against EKF2 or the IMU in
+:mod:`px4fuse.alignment.fitting`. Two series are correlated at all lags (:mod:`correlation`). The
+best lag is refined by least squares, and is rejected if another lag has a residual within the
+factor :data:`MIN_SECOND_PEAK_RATIO`. Trajectories may have any frame and scale: their speeds are
+correlated, and a similarity transform is refined. A position file is in metres with z vertical, and
+has outliers: horizontal positions are correlated, and yaw and origin are refined robustly.
 """
 
 from __future__ import annotations
@@ -27,43 +26,41 @@ from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
-STEP_S, MAX_SAMPLES = 0.05, 200_000  # of the grid for the search
-SMOOTHING_S = 0.25  # of speeds, which noise would drown
-MIN_OVERLAP_S, MIN_OVERLAP_SHARE = 5.0, 0.5  # of the shorter one
-MIN_POSES_SHARE = 0.3  # of those in the shorter one's span; gaps take some
-CANDIDATES = 12  # peaks of the correlation whose ATE is looked at
-# By which the least squares may leave a peak, and then what it found
+STEP_S, MAX_SAMPLES = 0.05, 200_000  # step and size of the search grid
+SMOOTHING_S = 0.25  # smoothing time of speeds; differentiated positions are noisy
+MIN_OVERLAP_S, MIN_OVERLAP_SHARE = 5.0, 0.5  # overlap: s, and fraction of the shorter one
+MIN_POSES_SHARE = 0.3  # fraction of the poses in the time of the shorter one, outside of gaps
+CANDIDATES = 12  # number of correlation peaks whose ATE is computed
+# s; half-width of the least-squares search around a peak, and around its result
 WINDOW_S, FINE_WINDOW_S = 0.5, 0.1
-MIN_SEPARATION_S = 1.0  # another offset, not the same peak
+MIN_SEPARATION_S = 1.0  # smallest distance of two peaks
 MIN_CORRELATION = 0.3
-# Another offset fits as well where its residual (RMS) is not larger by this factor: of two sets of
-# 80 independent residuals, which is half a minute of a flight, one is larger by it in 5 % by chance
-# (F-test, F = 1.2² at 80 and 80 degrees of freedom)
+# ratio of residuals (RMS) below which another offset fits equally well: 95 % limit for two sets of
+# 80 independent residuals, half a minute of flight (F-test, F = 1.2², 80 and 80 degrees of freedom)
 MIN_SECOND_PEAK_RATIO = 1.2
-MAX_POSES = 2000  # in the least squares
-# Of the motion's extent: above the first nothing was matched; fits below the second are alike
+MAX_POSES = 2000  # number of poses in the least squares
+# residual over extent: above the first the fit is rejected; below the second fits count as equal
 MAX_MISFIT, MIN_MISFIT = 0.5, 1e-3
-# Velocity that no shift, turn or scale could stand for: its share of the speed (RMS), and how far
-# the two must agree on it, as noise would not
+# velocity that a similarity transform cannot absorb: smallest fraction of the speed (RMS), and
+# smallest correlation between the two trajectories, which excludes noise
 MIN_FREE_SHARE, MIN_FREE_CORRELATION = 0.05, 0.5
-WINDOW_LENGTHS = 4  # correlation lengths of the score in the window of its variance
-MAX_HALF_INTERVAL_S = 0.5  # that of the search; beyond it an interval helps nobody
+WINDOW_LENGTHS = 4  # window of the variance of the score, in correlation lengths
+MAX_HALF_INTERVAL_S = 0.5  # half-width of the 95 % interval above which the offset is rejected
 LEVEL = 0.95
 
 
 class TimeOffset(Record, frozen=True, kw_only=True):
-    """Offset between two clocks.
+    """Time offset between two trajectories.
 
     Attributes
     ----------
     offset_s : float or None
-        What must be added to the estimate's stamps to give the reference's; None where it is not
-        determinable.
+        Offset to add to the timestamps of the estimate; None if it cannot be determined.
     interval_s : (float, float) or None
-        95 %.
+        95 % interval.
     determinable : bool
     reason : str
-        How it was found, or why it was not.
+        Method, or reason why the offset cannot be determined.
     """
 
     offset_s: float | None = None
@@ -73,28 +70,28 @@ class TimeOffset(Record, frozen=True, kw_only=True):
 
 
 def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | None:
-    """What UNIX time says must be added to the estimate's stamps (s); None where one lacks it."""
+    """Return the offset (s) of the estimate by UNIX time; None if one lacks UNIX time."""
     if estimate.unix_offset_s is None or reference.unix_offset_s is None:
         return None
     return estimate.unix_offset_s - reference.unix_offset_s
 
 
 def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOffset:
-    """Offset between the clocks of two trajectories of the same motion.
+    """Estimate the time offset between two trajectories of the same motion.
 
-    Speeds, and angular speeds where both have orientations, do not depend on frames: their masked
-    correlation over all lags (Padfield 2012; Furrer 2017) gives candidates, also where the clocks
-    have nothing in common. Of these the one wins whose ATE after a free similarity is least, which
-    is then minimised over the offset. The interval is that of the linearised least squares, with
-    the score's variance over long runs (Newey & West 1987), as errors of poses are correlated.
+    Speeds, and angular speeds if both have orientations, do not depend on the frame. Their masked
+    correlation at all lags (Padfield 2012; Furrer 2017) gives candidates for any offset. The
+    candidate with the smallest ATE after a similarity alignment is refined by minimising the ATE.
+    The interval is that of the linearised least squares, with the long-run variance of the score
+    (Newey & West 1987), because pose errors are correlated.
 
     Returns
     -------
     TimeOffset
-        Not determinable where nothing moves, where the speed is constant along a line or a circle
-        (a shift in time is then one in space), or where other offsets fit as well.
+        Not determinable without motion, with constant speed along a line or circle (a time offset
+        then equals a position offset), or if other offsets fit equally well.
     """
-    # what is interpolated should be the denser of the two
+    # interpolate the denser trajectory
     if _median_step(estimate) >= _median_step(reference):
         return _search(estimate, reference)
     found = _search(reference, estimate)
@@ -109,20 +106,20 @@ def _median_step(trajectory: Trajectory) -> float:
 
 
 def _search(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
-    """Offset that must be added to the sparse one's stamps."""
+    """Estimate the offset to add to the timestamps of the sparse trajectory."""
     start_s = clock_difference(sparse, dense)
     candidates = ([] if start_s is None else [start_s]) + _candidates(sparse, dense)
     if not candidates:
         return _not_determinable(
-            "the speeds of the two do not resemble each other at any offset (nothing moves, the "
-            "speed is constant, or they are of different flights)"
+            "the speeds are not correlated at any offset (no motion, constant speed, or different "
+            "flights)"
         )
     coarse = [_refine_offset(sparse, dense, lag, WINDOW_S) for lag in candidates]
     fits = [fit for fit in coarse if fit is not None and fit.misfit <= MAX_MISFIT]
     fits.sort(key=lambda fit: fit.misfit)
     if not fits:
         return _not_determinable(
-            "where speeds resemble each other, positions do not, or too few overlap"
+            "the offsets with correlated speeds do not fit the positions, or the overlap is too short"
         )
     best = fits[0]
     similar_fits = [fit for fit in fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best.misfit]
@@ -130,36 +127,38 @@ def _search(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
         fit for fit in similar_fits if abs(fit.offset_s - best.offset_s) > MIN_SEPARATION_S
     ]
     if start_s is not None:
-        # clocks that are set decide between offsets that fit alike
+        # UNIX time decides between offsets that fit equally well
         best = min(similar_fits, key=lambda fit: abs(fit.offset_s - start_s))
     elif distant_fits:
         return _not_determinable(
-            f"the motion repeats itself: {abs(distant_fits[0].offset_s - best.offset_s):.1f} s further "
-            f"the ATE is {distant_fits[0].rms_m:.3g} m instead of {best.rms_m:.3g} m"
+            "the motion is periodic: with an offset that differs by "
+            f"{abs(distant_fits[0].offset_s - best.offset_s):.1f} s the ATE is "
+            f"{distant_fits[0].rms_m:.3g} m instead of {best.rms_m:.3g} m"
         )
-    # again with the poses that are known around the offset, not around the candidate
+    # repeat with the poses available around the result, not around the candidate
     best = _refine_offset(sparse, dense, best.offset_s, FINE_WINDOW_S) or best
     half_interval_s = _half_interval(sparse, dense, best)
     if not half_interval_s <= MAX_HALF_INTERVAL_S:
         width = f" (95 %: ±{half_interval_s:.2g} s)" if np.isfinite(half_interval_s) else ""
         return _not_determinable(
-            f"the speed hardly changes: a shift in time is as good as one in space{width}"
+            "the speed is nearly constant, so a time offset cannot be distinguished from a "
+            f"position offset{width}"
         )
     return TimeOffset(
         offset_s=best.offset_s,
         interval_s=(best.offset_s - half_interval_s, best.offset_s + half_interval_s),
         determinable=True,
-        reason=f"Speeds correlated over all lags, then the least ATE ({best.rms_m:.3g} m after a "
-        f"free similarity, {len(best.time_s)} poses).",
+        reason="Maximum speed correlation over all lags, refined by minimum ATE "
+        f"({best.rms_m:.3g} m after a similarity alignment, {len(best.time_s)} poses).",
     )
 
 
 def _not_determinable(why: str) -> TimeOffset:
-    return TimeOffset(determinable=False, reason=f"The time offset is not determinable: {why}.")
+    return TimeOffset(determinable=False, reason=f"The time offset cannot be estimated: {why}.")
 
 
 def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
-    """Times on a regular grid from its first stamp on, and smooth velocities there."""
+    """Return a regular time grid and the smoothed velocities on it."""
     time = trajectory.time_s
     grid = time[0] + step_s * np.arange(int((time[-1] - time[0]) / step_s) + 1)
     sigma = max(SMOOTHING_S, _median_step(trajectory)) / step_s
@@ -168,7 +167,7 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
 
 
 def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
-    """Velocity at times within its span, shape (n, 3); smooth, as noise is no excitation."""
+    """Return the smoothed velocity at times within the trajectory, shape (n, 3)."""
     span = float(trajectory.time_s[-1] - trajectory.time_s[0])
     grid, velocity = _grid_velocity(trajectory, max(STEP_S, span / MAX_SAMPLES))
     columns = [np.interp(time_s, grid, column) for column in velocity.T]
@@ -176,10 +175,10 @@ def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
 
 
 def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
-    """Speed, and angular speed where there is one, on a grid, and where they are known."""
+    """Return speed, and angular speed if known, on a grid, with the mask of known samples."""
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
-    # key frames are interpolated too, tracking that is lost is not
+    # interpolate between key frames, but not across lost tracking
     known = is_bracketed(grid, time, max(10.0 * _median_step(trajectory), 0.5))
     speeds = [np.linalg.norm(velocity, axis=1)]
     if trajectory.rotation is not None:
@@ -192,18 +191,18 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
 
 
 def _candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
-    """Offsets at which speeds correlate, best first (Padfield 2012, eqs. 3 to 9)."""
-    spans = [float(one.time_s[-1] - one.time_s[0]) for one in (sparse, dense)]
+    """Return offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
+    spans = [float(track.time_s[-1] - track.time_s[0]) for track in (sparse, dense)]
     step = max(STEP_S, max(spans) / MAX_SAMPLES)
     if min(spans) < 10 * step:
         return []
-    (x, x_known), (y, y_known) = (_speeds(one, step) for one in (sparse, dense))
+    (x, x_known), (y, y_known) = (_speeds(track, step) for track in (sparse, dense))
     min_count = max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * min(spans)) / step
     min_count = min(min_count, 0.5 * min(spans) / step)
     correlations = []
-    for a, b in zip(x, y, strict=False):  # angular speeds where both have them
+    for a, b in zip(x, y, strict=False):  # angular speeds if both have them
         found = moments(a, b, x_known, y_known)
-        # a stretch at rest correlates with anything once its variance is rounding
+        # exclude parts at rest, where the variance is only rounding
         is_usable = found.count >= min_count
         for values, known, power in ((a, x_known, found.power_a), (b, y_known, found.power_b)):
             total_power = float(np.var(values[known])) * np.count_nonzero(known)
@@ -214,24 +213,24 @@ def _candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
     highest = maximum_filter1d(total, round(2 * MIN_SEPARATION_S / step) + 1)
     order = np.flatnonzero((total == highest) & (total > MIN_CORRELATION))
     order = order[np.argsort(-total[order])][:CANDIDATES]
-    # index k: the sparse one's first sample is at the dense one's sample k - (n - 1)
+    # index k: the first sample of sparse is at sample k - (n - 1) of dense
     lags = (order - (len(x_known) - 1)) * step + float(dense.time_s[0]) - float(sparse.time_s[0])
     return list(lags.tolist())
 
 
 @dataclass(frozen=True)
 class _OffsetFit:
-    """Least squares over the offset, near one candidate.
+    """Least-squares fit of the offset near one candidate.
 
     Attributes
     ----------
     offset_s : float
     transform : Transform
-        From the sparse one to the dense one.
+        From the sparse to the dense trajectory.
     time_s : ndarray, shape (n,)
-        Of the sparse one's poses that were used.
+        Times of the used poses of the sparse trajectory.
     aligned_m, target_m : ndarray, shape (n, 3)
-        Positions of the sparse one as aligned, and of the dense one.
+        Positions of the sparse trajectory after alignment, and of the dense one.
     """
 
     offset_s: float
@@ -242,23 +241,23 @@ class _OffsetFit:
 
     @property
     def rms_m(self) -> float:
-        """RMS of what is left."""
+        """RMS of the residuals."""
         return rms_m(self.target_m - self.aligned_m)
 
     @property
     def misfit(self) -> float:
-        """RMS of what is left over that of the motion: fits of a part do not win by moving less."""
-        # of the target: an estimate that does not follow is scaled to a point
+        """RMS of the residuals over that of the motion, so short parts have no advantage."""
+        # extent of the target, because a bad fit scales the estimate to a point
         extent = float(np.sqrt(self.target_m.var(axis=0).sum()))
         return max(self.rms_m / extent, MIN_MISFIT) if extent > 0.0 else float("inf")
 
 
 def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> float:
-    """Half of the 95 % interval (s); infinite where a shift in space does as well."""
+    """Return half of the 95 % interval (s); infinite if a position offset fits equally well."""
     n, centred = len(fit.time_s), fit.aligned_m - fit.aligned_m.mean(axis=0)
     velocity = _velocity(dense, fit.time_s + fit.offset_s)
     other = fit.transform.rotation.apply(fit.transform.scale * _velocity(sparse, fit.time_s))
-    # what the similarity cannot take over of a shift in time: shifts, small turns, scale
+    # remove the part of a time offset that equals a translation, small rotation or scale
     columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred) for axis in np.eye(3)]
     similarity_columns = np.stack([*columns, centred], axis=-1).reshape(3 * n, 7)
@@ -271,7 +270,7 @@ def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> fl
     ):
         return float("inf")
     score = (both[:, 0].reshape(n, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
-    # weights that fall to zero must not do so within the correlation
+    # the window of the weights must be longer than the correlation
     lags = min(max(1, WINDOW_LENGTHS * _correlation_length(score)), n // 4)
     weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
     products = [float(score[k:] @ score[:-k]) for k in range(1, lags + 1)]
@@ -282,7 +281,7 @@ def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> fl
 
 
 def _correlation_length(values: Array) -> int:
-    """First lag at which the autocorrelation is below 1/e, at most a quarter of them."""
+    """Return the first lag with autocorrelation below 1/e, at most n / 4."""
     full = autocovariance(values - values.mean())
     below = np.flatnonzero(full < full[0] / np.e)
     return int(below[0]) if len(below) else len(values) // 4
@@ -291,9 +290,9 @@ def _correlation_length(values: Array) -> int:
 def _refine_offset(
     sparse: Trajectory, dense: Trajectory, lag_s: float, window_s: float
 ) -> _OffsetFit | None:
-    """Minimise the ATE over offsets around a given one; None where too few poses overlap."""
+    """Minimise the ATE over offsets around a candidate; None if too few poses overlap."""
     time, limit = sparse.time_s, max(gap_limit(dense.time_s), 0.5 * gap_limit(sparse.time_s))
-    # the same poses at every offset, else the objective jumps where poses come and go
+    # the same poses at every offset, so that the objective is continuous
     window_offsets = (lag_s + edge for edge in (-window_s, 0.0, window_s))
     known = np.all(
         [is_bracketed(time + offset, dense.time_s, limit) for offset in window_offsets], axis=0
@@ -308,7 +307,7 @@ def _refine_offset(
 
     def at(shift_s: float) -> _OffsetFit:
         target = positions_at(dense, time + (lag_s + shift_s))
-        # the similarity acts on the sparse one: acting on the target, its scale could fall to zero
+        # transform the sparse trajectory: the scale of a transformed target could become zero
         transform = umeyama(position, target, with_scale=True)
         return _OffsetFit(lag_s + shift_s, transform, time, transform.apply(position), target)
 
@@ -316,7 +315,7 @@ def _refine_offset(
         fit = at(shift_s)
         return float(((fit.target_m - fit.aligned_m) ** 2).sum())
 
-    # over the shift, not the offset: beside a difference of 50 years tolerances are seconds
+    # minimise over the shift: relative to an offset of 50 years the tolerance would be seconds
     grid = window_s * np.linspace(-1.0, 1.0, 21)
     best = int(np.argmin([cost(shift) for shift in grid]))
     bracket = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])

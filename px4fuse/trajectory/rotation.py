@@ -1,4 +1,4 @@
-"""Quaternions w, x, y, z as arrays of shape (..., 4); Hamilton product, as in PX4."""
+"""Quaternions (w, x, y, z) as arrays of shape (..., 4); Hamilton product, as in PX4."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from px4fuse.arrays import Array
 
 
 def multiply(a: Array, b: Array) -> Array:
-    """Product a ⊗ b: first b's rotation, then a's."""
+    """Compute the product a ⊗ b: rotation by b, then by a."""
     w, x, y, z = np.moveaxis(a, -1, 0)
     s, i, j, k = np.moveaxis(b, -1, 0)
     return np.stack(
@@ -21,18 +21,18 @@ def multiply(a: Array, b: Array) -> Array:
 
 
 def conjugate(q: Array) -> Array:
-    """The inverse of a unit quaternion."""
+    """Return the inverse of unit quaternions."""
     return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def from_vector(rotation: Array) -> Array:
-    """Quaternion of a rotation vector (rad)."""
+    """Convert rotation vectors (rad) to quaternions."""
     angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
     return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotation], -1)
 
 
 def to_vector(q: Array) -> Array:
-    """Rotation vector (rad) of a quaternion, the shorter way round."""
+    """Convert quaternions to rotation vectors (rad) of at most π."""
     q = q * np.where(q[..., :1] < 0.0, -1.0, 1.0)
     imaginary = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(imaginary, q[..., :1])
@@ -40,7 +40,7 @@ def to_vector(q: Array) -> Array:
 
 
 def from_elements(*rows: tuple[Array | float, ...]) -> Array:
-    """Matrices from their elements, each an array of the same shape or a number."""
+    """Build matrices from their elements, arrays of the same shape or numbers."""
     shape = np.broadcast_shapes(*(np.shape(element) for row in rows for element in row))
     matrices = np.empty((*shape, len(rows), len(rows[0])))
     for i, row in enumerate(rows):
@@ -50,7 +50,7 @@ def from_elements(*rows: tuple[Array | float, ...]) -> Array:
 
 
 def matrix(q: Array) -> Array:
-    """Rotation matrices, shape (..., 3, 3)."""
+    """Convert quaternions to rotation matrices, shape (..., 3, 3)."""
     w, x, y, z = np.moveaxis(q, -1, 0)
     return from_elements(
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -60,22 +60,22 @@ def matrix(q: Array) -> Array:
 
 
 def skew(v: Array) -> Array:
-    """[v]×, so that [v]× u = v × u; shape (..., 3, 3)."""
+    """Return the cross-product matrices [v]× with [v]× u = v × u, shape (..., 3, 3)."""
     x, y, z = np.moveaxis(v, -1, 0)
     return from_elements((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
 
 
 def running_product(quaternions: Array) -> Array:
-    """Products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2 and so on, shape (n, 4).
+    """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ..., shape (n, 4).
 
-    In √n columns side by side, so that n products take about 2√n vectorised steps.
+    The quaternions are arranged in about √n columns, so n products need about 2√n vectorised steps.
     """
     n = len(quaternions)
     width = max(1, int(np.sqrt(n)))
     rows = -(-n // width)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     padded = np.concatenate([quaternions, np.tile(identity, (rows * width - n, 1))])
-    # row r holds turns r·width to (r+1)·width
+    # row r contains quaternions r·width to (r+1)·width
     blocks = padded.reshape(rows, width, 4).copy()
     for column in range(1, width):
         blocks[:, column] = multiply(blocks[:, column - 1], blocks[:, column])
@@ -87,7 +87,7 @@ def running_product(quaternions: Array) -> Array:
 
 
 def interpolate(times: Array, known_times: Array, known: Array) -> Array:
-    """Quaternions between known ones that differ little: linear, then to unit length."""
+    """Interpolate quaternions that differ little: linearly, then normalised."""
     signs_between = np.sign(np.sum(known[1:] * known[:-1], axis=1))
     signs = np.concatenate([[1.0], np.cumprod(np.where(signs_between == 0.0, 1.0, signs_between))])
     continuous = known * signs[:, None]

@@ -1,6 +1,6 @@
-"""What the scores of a trajectory are made of: statistics, pairs of poses, RPE, intervals.
+"""Scores of a trajectory: statistics, pairs of poses, RPE, and 95 % intervals of an RMSE.
 
-Errors are correlated from pose to pose, so intervals are by a bootstrap over blocks.
+Errors of successive poses are correlated, so intervals use a block bootstrap.
 """
 
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 Unit = Literal["frames", "m", "s"]
 
-RELATIVE_TOLERANCE = 0.1  # of a delta where all pairs are used; evo's default too
-# RPE over these, where they are between these shares of the path or of the time
+RELATIVE_TOLERANCE = 0.1  # of a delta if all pairs are used; same default as the evo package
+# default deltas of the RPE, if they are between these fractions of path length or time
 DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 TIMES_S = (1.0, 10.0, 60.0)
 MAX_DISTANCES, MAX_TIMES = 3, 2
 MIN_DELTA_SHARE, MAX_DELTA_SHARE = 1 / 200, 1 / 5
 RESAMPLES, SEED, LEVEL = 2000, 20120101, 0.95
-BLOCK_TIMES = 3.0  # autocorrelation times in a block
-WINDOW_TIMES = 5.0  # and in the window that they are summed over (Sokal 1997)
-MIN_BLOCKS = 5.0
+BLOCK_TIMES = 3.0  # block length, in autocorrelation times
+WINDOW_TIMES = 5.0  # summation window, in autocorrelation times (Sokal 1997)
+MIN_BLOCKS = 5.0  # smallest number of blocks for an interval
 
 
 @dataclass(frozen=True)
 class Delta:
-    """Distance between the poses of a pair of the RPE: a value and its unit."""
+    """Distance between the two poses of an RPE pair, with unit."""
 
     value: float
     unit: Unit
@@ -44,7 +44,7 @@ class Delta:
 
 
 class Statistics(Record, frozen=True):
-    """Of ``count`` errors, all in their unit; ``std`` without Bessel's correction, as evo's."""
+    """Statistics of ``count`` errors, in their unit; ``std`` divides by n, as in evo."""
 
     count: Count
     rmse: NotNegative
@@ -56,15 +56,15 @@ class Statistics(Record, frozen=True):
 
 
 class Interval(Record, frozen=True):
-    """95 % interval of an RMSE, by block bootstrap.
+    """95 % interval of an RMSE by block bootstrap.
 
     Attributes
     ----------
     low, high : float
     block_length : int
-        In errors.
+        Number of errors in a block.
     blocks : float
-        Errors over block length: how many independent errors there are, roughly.
+        Number of errors over block length: approximate number of independent errors.
     """
 
     low: float
@@ -74,19 +74,19 @@ class Interval(Record, frozen=True):
 
 
 class RelativeError(Record, frozen=True):
-    """RPE over pairs that are ``delta`` apart.
+    """RPE of pairs with a distance of ``delta``.
 
     Attributes
     ----------
     delta : float
         In ``unit``.
     all_pairs : bool
-        Pairs start at every pose, else each where the one before ends.
+        Pairs start at every pose; else each pair starts at the end of the previous one.
     pairs_from : str
-        Whose path a distance is measured along: always the reference's, whose length is no error.
+        Path along which distances are measured: always the reference.
     translation_m, rotation_deg : Statistics or Unavailable
     interval_m : Interval or Unavailable
-        Of the translation's RMSE.
+        95 % interval of the RMSE of the translation.
     """
 
     delta: float
@@ -99,19 +99,19 @@ class RelativeError(Record, frozen=True):
 
     @property
     def delta_words(self) -> str:
-        """How far the poses of a pair are apart."""
+        """Distance of a pair, with unit."""
         return str(Delta(self.delta, self.unit))
 
 
 class PairwiseError(RelativeError, frozen=True, kw_only=True, eq=False):
-    """RPE over one delta, with its pairs.
+    """RPE over one delta, with the error of each pair.
 
     Attributes
     ----------
     start, end : ndarray of int, shape (k,)
-        Poses of each pair, as indices into the evaluation's arrays.
+        Poses of each pair, as indices into the arrays of the evaluation.
     translation_error_m, rotation_error_deg : ndarray, shape (k,)
-        Empty where unavailable.
+        Empty if unavailable.
     """
 
     schema_type = RelativeError
@@ -124,12 +124,7 @@ class PairwiseError(RelativeError, frozen=True, kw_only=True, eq=False):
 
 
 def statistics(errors: Array) -> Statistics:
-    """Statistics of at least one error.
-
-    Parameters
-    ----------
-    errors : ndarray, shape (n,)
-    """
+    """Compute the statistics of at least one error, shape (n,)."""
     return Statistics(
         count=len(errors),
         rmse=float(np.sqrt(np.mean(errors**2))),
@@ -142,14 +137,9 @@ def statistics(errors: Array) -> Statistics:
 
 
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
-    """Distances and times of the RPE that suit a flight.
-
-    Parameters
-    ----------
-    distance_m, time_s : ndarray, shape (n,)
-    """
+    """Choose distances and times of the RPE by path length and duration of the flight."""
     length, span = float(distance_m[-1]), float(time_s[-1] - time_s[0])
-    # a delta takes more than one pose
+    # a delta must contain at least two steps
     step, interval = float(np.median(np.diff(distance_m))), float(np.median(np.diff(time_s)))
     low, high = max(MIN_DELTA_SHARE * length, 2.0 * step), MAX_DELTA_SHARE * length
     distances = [value for value in DISTANCES_M if low <= value <= high][-MAX_DISTANCES:]
@@ -164,17 +154,17 @@ def pairs(
     *,
     all_pairs: bool = True,
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of poses that are a delta apart.
+    """Find pairs of poses with a distance of ``delta``.
 
     Parameters
     ----------
     position_m : ndarray, shape (n, 3)
     time_s : ndarray, shape (n,)
     delta : Delta
-        A distance is one along the path.
+        A distance is measured along the path.
     all_pairs : bool
-        From every pose to the one whose distance from it is nearest to the delta, if within a tenth
-        of it; else from the end of each pair to the first pose that is at least a delta on.
+        From every pose to that with the nearest distance, if within a tenth of delta; else from the
+        end of each pair to the first pose at least delta further.
 
     Returns
     -------
@@ -183,35 +173,35 @@ def pairs(
     Raises
     ------
     SettingsError
-        The delta is not above zero, or not whole for frames.
+        The delta is not positive, or not an integer for frames.
     """
     if not (np.isfinite(delta.value) and delta.value > 0.0):
-        raise SettingsError(f"RPE delta {delta}: it must be above zero.")
+        raise SettingsError(f"RPE delta {delta}: the value must be positive.")
     n = len(time_s)
     if delta.unit == "frames":
         step = int(delta.value)
         if step != delta.value:
-            raise SettingsError(f"RPE delta {delta}: frames come whole.")
+            raise SettingsError(f"RPE delta {delta}: the number of frames must be an integer.")
         start = np.arange(0, max(n - step, 0), 1 if all_pairs else step)
         return start, start + step
     path_position = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
     if not all_pairs:
         return _consecutive_pairs(np.diff(path_position), delta.value)
     start = np.arange(n - 1)
-    # roundings may put the sum on the other side of one sample
+    # also test the neighbours, because of rounding
     nearest_guess = np.searchsorted(path_position, path_position + delta.value)[:-1]
     candidates = np.clip(nearest_guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
     distance_error = np.abs(path_position[candidates] - path_position[start, None] - delta.value)
     best = np.argmin(distance_error, axis=1)
-    # of poses at rest, all equally far, the first
+    # the first of several poses at rest with equal distance
     first = np.searchsorted(path_position, path_position[candidates[start, best]])
     is_near = distance_error[start, best] <= RELATIVE_TOLERANCE * delta.value
     return start[is_near], np.maximum(first, start + 1)[is_near]
 
 
 def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    """Pairs end to end, each the shortest of at least a delta."""
-    # each pair's sum starts at zero: differences of one running sum would round otherwise
+    """Return consecutive pairs, each the shortest of at least ``delta``."""
+    # sum each pair from zero, for the same rounding as in evo
     ends, travelled = [0], 0.0
     for index, step in enumerate(steps.tolist(), 1):
         travelled += step
@@ -229,13 +219,13 @@ def relative_error(
     *,
     all_pairs: bool = True,
 ) -> PairwiseError:
-    """RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
+    """Compute the RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
     Parameters
     ----------
     aligned, reference : Trajectory
-        P and Q, as many poses at the same times. A similarity other than its scale leaves the
-        error as it is.
+        P and Q, with the same number of poses at the same times. Of an alignment only the scale
+        affects the error.
     delta, all_pairs
         See :func:`pairs`; measured along the reference.
     """
@@ -243,17 +233,19 @@ def relative_error(
     what = f"RPE over {delta}"
     rotations = rotations_of(aligned, reference, what)
     if not isinstance(rotations, Unavailable) and not len(start):
-        rotations = Unavailable(what, f"no two poses are {delta} apart", "Ask for another delta.")
+        rotations = Unavailable(
+            what, f"no pair of poses with a distance of {delta}", "Use another delta."
+        )
     scores: tuple[OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]]
     if isinstance(rotations, Unavailable):
         start = end = np.empty(0, dtype=np.intp)
         translation = rotation = np.empty(0)
         scores = rotations, rotations, rotations
     else:
-        p, q = (one[start].inv() for one in rotations)
+        p, q = (rotation_series[start].inv() for rotation_series in rotations)
         p_move = p.apply(aligned.position_m[end] - aligned.position_m[start])
         q_move = q.apply(reference.position_m[end] - reference.position_m[start])
-        # the outer rotation of E turns its translation but does not change its length
+        # the outer rotation of E does not change the length of the translation
         translation = np.linalg.norm(p_move - q_move, axis=1)
         p_turn, q_turn = p * rotations[0][end], q * rotations[1][end]
         rotation = np.degrees((q_turn.inv() * p_turn).magnitude())
@@ -276,7 +268,7 @@ def relative_error(
 def rotations_of(
     aligned: Trajectory, reference: Trajectory, what: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Rotations of both, or the reason why what was asked for is not possible."""
+    """Return the rotations of both, or Unavailable with the name of the analysis ``what``."""
     if aligned.rotation is not None and reference.rotation is not None:
         return aligned.rotation, reference.rotation
     reason = f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation"
@@ -286,20 +278,20 @@ def rotations_of(
 def rmse_interval(
     errors: Array, what: str, *, min_block: int = 1, resamples: int = RESAMPLES
 ) -> Interval | Unavailable:
-    """95 % interval of the RMSE of correlated errors: circular block bootstrap.
+    """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
-    Politis & Romano (1992), blocks of three integrated autocorrelation times of the squared errors.
-    Percentiles are moved outwards as Student's t would with so many blocks (Hesterberg 2015,
-    section 5.3).
+    Politis & Romano (1992), with blocks of three integrated autocorrelation times of the squared
+    errors. Percentiles are widened according to Student's t for the number of blocks (Hesterberg
+    2015, section 5.3).
 
     Parameters
     ----------
     errors : ndarray, shape (n,)
         In order of time.
     what : str
-        Of which score, for the reason where there is none.
+        Name of the score, for Unavailable.
     min_block : int
-        Errors of pairs that overlap are correlated over so many.
+        Smallest block length: number of overlapping pairs.
 
     Returns
     -------
@@ -312,14 +304,12 @@ def rmse_interval(
     if n < MIN_BLOCKS * length:
         return Unavailable(
             f"interval of the {what} RMSE",
-            (
-                f"errors are correlated over {length} of {n} samples, so fewer than "
-                f"{MIN_BLOCKS:.0f} independent blocks remain"
-            ),
+            f"errors are correlated over {length} of {n} samples, so fewer than "
+            f"{MIN_BLOCKS:.0f} independent blocks remain",
             "Use a longer flight.",
         )
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
-    block_means = (sums[length:] - sums[:-length]) / length  # one for each start, round the end
+    block_means = (sums[length:] - sums[:-length]) / length  # one per start, circular
     blocks = n / length
     block_starts = np.random.default_rng(SEED).integers(0, n, (resamples, round(blocks)))
     means = block_means[block_starts].mean(axis=1)
@@ -330,13 +320,9 @@ def rmse_interval(
 
 
 def autocorrelation_time(values: Array) -> float:
-    """Integrated autocorrelation time in samples: 1 + 2 Σ ρ, at least 1.
+    """Compute the integrated autocorrelation time in samples, shape (n,): 1 + 2 Σ ρ, at least 1.
 
-    The sum ends at five times itself (Sokal 1997, section 3).
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
+    The sum ends at five autocorrelation times (Sokal 1997, section 3).
     """
     centred = values - values.mean()
     if not centred.any():

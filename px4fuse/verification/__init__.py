@@ -1,1 +1,1 @@
-"""Whether a report is what its log gives."""
+"""Verification of reports: comparison with a new run of the analysis on the log."""

@@ -1,12 +1,11 @@
-"""A handed-in PDF, read without trusting it: a report, or an error that says why not.
+"""Reading of handed-in PDFs without trusting them: results of a report, or an error.
 
-Nothing in the file is executed, followed or written anywhere. Sizes are bounded here before pypdf
-sees the file, and by pypdf's own limits while it reads; what is left (a file made to be slow
-within every limit) is for the time and memory limits of :mod:`px4fuse.workers`.
+Nothing in the file is executed, followed or written. Sizes are limited here before pypdf reads the
+file, and by the limits of pypdf. Files that are slow within these limits are stopped by the time
+and memory limits of :mod:`px4fuse.workers`.
 
-Of the file only the attached results are read; its pages are only counted, since the report is
-drawn again. A file that another program saved again is therefore as good as the original, as long
-as its results are still attached.
+Only the attached results are read. The pages are counted, because the report is drawn again. A file
+that another program saved again is therefore accepted if the results are still attached.
 """
 
 import io
@@ -29,32 +28,32 @@ from px4fuse.verification.model import BAD_VALUES
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
-# Of one stream, and of all together
+# bytes; of one stream, and of all streams
 MAX_CONTENT_BYTES = 20_000_000
 MAX_DOCUMENT_BYTES = 100_000_000
 MAX_OBJECTS = 20_000
 MAX_VALUES = 1_000_000
-# Objects that are referred to and not there: pypdf searches the whole file for each of them
+# references to missing objects; pypdf searches the whole file for each
 MAX_MISSING = 100
 
-_DAMAGED_REASON = "damaged: it cannot be read as a PDF. Hand in the file that px4fuse wrote."
-_ENCRYPTED_REASON = "encrypted. Hand in the file that px4fuse wrote."
-_COSTLY_REASON = "it takes more memory or work to open than a report can need."
+_DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
+_ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
+_COSTLY_REASON = "opening it needs more memory or time than a report can need."
 
-# 900 files with a few bytes changed gave AttributeError too. What is none of these is a mistake of
-# ours, and stands as such in the row of that file
+# errors of pypdf on damaged files; AttributeError occurred in a test of 900 files with changed
+# bytes. Other errors are bugs of px4fuse, and are reported as such
 BROKEN_PDF_ERRORS = (*BAD_VALUES, PyPdfError, AttributeError, zlib.error)
 
-# What acts: keys of a dictionary ... Links, comments, forms without scripts and the view to open
-# with are what programs add that save a report again
+# active content: keys of a dictionary ... Links, comments, forms without scripts and the initial
+# view are allowed, because programs add them when they save a report again
 _KEYS = re.compile("/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)")
-# ... and types of an action
+# ... and types of actions
 _ACTIONS = re.compile(
     "/(JavaScript|Launch|SubmitForm|ImportData|GoToR|GoToE|Rendition|RichMediaExecute|Movie|Sound)"
 )
 
-# pypdf's defaults are for any PDF. A recovery of broken streams, filters other than Flate, chains
-# of filters and the external JBIG2 decoder are not for ours.
+# limits of pypdf, stricter than its defaults: px4fuse's reports need no recovery of broken streams,
+# no filters except Flate, no chains of filters and no external JBIG2 decoder
 PYPDF_LIMITS: dict[str, Any] = {
     "maximum_declared_stream_length": MAX_BYTES,
     "array_based_stream_maximum_output_length": MAX_CONTENT_BYTES,
@@ -71,54 +70,46 @@ PYPDF_LIMITS: dict[str, Any] = {
     "page_tree_maximum_page_entries": 100 * MAX_PAGES,
 }
 
-# Of content that is not ours to decode: what PDF writers use today, and of which none is a bomb
-# that inflating every stream once does not find
+# allowed filters of streams; inflating each stream once finds decompression bombs in these
 _FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 
 _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 
 
-# What pypdf thinks of a broken file is not for the instructor's terminal
+# keep pypdf's remarks on damaged files off the terminal
 logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
 def read_report(pdf: bytes, name: str) -> Reported:
-    """Read a report that was handed in.
-
-    Parameters
-    ----------
-    pdf : bytes
-        Anything.
-    name : str
-        What to call the file in errors.
+    """Read the results of a report that was handed in; ``name`` names the file in errors.
 
     Returns
     -------
     ComparisonResults or LoopResults
-        What is attached.
 
     Raises
     ------
     ResultsError
-        From :func:`attached_results`, or what is attached cannot be verified: the aids of EKF2
-        alone.
+        From :func:`attached_results`, or the results contain only EKF2 aids.
     """
     results = attached_results(pdf, name)
     if not isinstance(results, Reported):
-        content = "no results of a report"
+        content = "no results of compare or loop"
         if isinstance(results, AidsResults):
-            content = "the aids of EKF2 alone, nothing of our filter"
-        raise ResultsError(f"{one_line(name, 200)}: {RESULTS_NAME} in it holds {content}.")
+            content = "only EKF2 aids, no KF results"
+        raise ResultsError(
+            f"{one_line(name, 200)}: the attached {RESULTS_NAME} contains {content}."
+        )
     return results
 
 
 def attached_results(pdf: bytes, name: str) -> Results:
-    """The results attached to a PDF, their strings cleaned.
+    """Read the results attached to a PDF, with cleaned strings.
 
     Raises
     ------
     ResultsError
-        It is not one that px4fuse can have written.
+        px4fuse cannot have written the PDF.
     """
     remedy = ""
     try:
@@ -128,13 +119,13 @@ def attached_results(pdf: bytes, name: str) -> Results:
             if reader.is_encrypted:
                 raise ResultsError(_ENCRYPTED_REASON)
             if not 0 < len(reader.pages) <= MAX_PAGES:
-                raise ResultsError(f"a PDF without pages, or with more than {MAX_PAGES}.")
-            return read_results(_attachment(reader), f"{RESULTS_NAME} in it")
+                raise ResultsError(f"the PDF has no pages, or more than {MAX_PAGES}.")
+            return read_results(_attachment(reader), f"the attached {RESULTS_NAME}")
     except ResultsError as refusal:
         reason, remedy = f"{refusal.reason}.", refusal.remedy
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY_REASON
-    except DependencyError:  # pypdf decrypts AES with a library that px4fuse does not need
+    except DependencyError:  # pypdf needs a further library for AES
         reason = _ENCRYPTED_REASON
     except BROKEN_PDF_ERRORS:
         reason = _ENCRYPTED_REASON if b"/Encrypt" in pdf else _DAMAGED_REASON
@@ -142,7 +133,7 @@ def attached_results(pdf: bytes, name: str) -> Results:
 
 
 def opened(pdf: bytes) -> pypdf.PdfReader:
-    """Open a PDF within the limits, strictly: programs repair a damaged file in different ways."""
+    """Open a PDF within the limits, strictly: programs repair damaged files differently."""
     return pypdf.PdfReader(
         io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
     )
@@ -150,24 +141,27 @@ def opened(pdf: bytes) -> pypdf.PdfReader:
 
 def _check_file(pdf: bytes) -> None:
     for has_problem, why in (
-        (len(pdf) > MAX_BYTES, f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."),
-        (not pdf.startswith(b"%PDF-"), "not a PDF: hand in the file that px4fuse wrote."),
-        (b"%%EOF" not in pdf[-2048:], "cut off: the end of the PDF is missing. Hand it in again."),
+        (
+            len(pdf) > MAX_BYTES,
+            f"larger than {MAX_BYTES // 1_000_000} MB; reports are smaller than 2 MB.",
+        ),
+        (not pdf.startswith(b"%PDF-"), "not a PDF. Hand in the file that px4fuse wrote."),
+        (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand it in again."),
     ):
         if has_problem:
             raise ResultsError(why)
-    # every stream is inflated into nothing, so that no bomb reaches pypdf
+    # inflate every stream and discard the data, so that no decompression bomb reaches pypdf
     remaining_bytes = MAX_DOCUMENT_BYTES
     for match in _STREAM.finditer(pdf):
-        # `stream` may stand anywhere, also inside a stream; each try counts towards the same limit
+        # the keyword may also occur inside a stream; each attempt counts towards the limit
         spent = _inflated_bytes(pdf, match.end(), min(remaining_bytes, MAX_CONTENT_BYTES))
         remaining_bytes -= spent
         if spent > MAX_CONTENT_BYTES or remaining_bytes < 0:
-            raise ResultsError("a compressed part of it expands to more than a report can hold.")
+            raise ResultsError("a compressed part expands to more than a report can contain.")
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
-    """Bytes that zlib data at ``start`` takes or gives, whichever is more, up to limit + 1."""
+    """Count the input or output bytes of zlib data at ``start``, the larger, up to limit + 1."""
     head = pdf[start : start + 2]
     if len(head) < 2 or head[0] & 15 != zlib.DEFLATED or int.from_bytes(head) % 31:
         return 0  # RFC 1950, section 2.2: not zlib data
@@ -181,17 +175,17 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
             break
         try:
             output_bytes += len(inflate.decompress(feed, 1_000_000))
-        except zlib.error:  # pypdf, told not to repair, has no more use for it
+        except zlib.error:  # pypdf does not repair this stream either
             break
     input_bytes -= len(inflate.unused_data)
-    # the least is what a try costs, however little is there
+    # minimum: cost of an attempt
     return min(max(input_bytes, output_bytes, 1000), limit + 1)
 
 
 def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
-    """All that a viewer can reach, each object once, without decoding it.
+    """Yield all dictionaries that a viewer can reach, each once, without decoding streams.
 
-    With whether a viewer comes there by a click alone: the action of a link or of an outline.
+    The flag is True if the viewer reaches it only by a click (action of a link or outline).
     """
     visited: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
@@ -203,14 +197,14 @@ def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, b
             if (value, clicked) in visited:
                 continue
             visited.add((value, clicked))
-            # in the cross-reference table, so that no search is needed for it
+            # objects in the cross-reference table are found without a search
             number, generation = value.idnum, value.generation
             is_packed = generation == 0 and number in reader.xref_objStm
             is_listed = is_packed or number in reader.xref.get(generation, {})
             missing_count += not is_listed
             if len(visited) > MAX_OBJECTS or missing_count > MAX_MISSING:
                 raise ResultsError(_COSTLY_REASON)
-            # ISO 32000-1, 7.3.10: a reference to an object that is not there is null
+            # ISO 32000-1, 7.3.10: a reference to a missing object is null
             value = value.get_object() if is_listed else None
         if value_count > MAX_VALUES:
             raise ResultsError(_COSTLY_REASON)
@@ -218,11 +212,11 @@ def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, b
             yield value, clicked
             remaining.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
-            remaining.extend((each, False) for each in list.__iter__(value))
+            remaining.extend((element, False) for element in list.__iter__(value))
 
 
 def _foreign_features(value: DictionaryObject, clicked: bool) -> Iterator[str]:
-    """What a dictionary has that a report has not."""
+    """Yield the features of a dictionary that reports do not have."""
     yield from (key[1:] for key in value if _KEYS.fullmatch(key))
     action, kind = _name(value.get("/S")) or "", _name(value.get("/Type"))
     if _ACTIONS.fullmatch(action):
@@ -238,7 +232,7 @@ def _foreign_features(value: DictionaryObject, clicked: bool) -> Iterator[str]:
         used_names = [_name(each) for each in names if each is not None]
         if not _FILTERS.issuperset(used_names) or len(set(used_names)) != len(used_names):
             filter_names = " ".join(each or "?" for each in used_names[:3])
-            yield f"a stream packed by other means ({one_line(filter_names, 60)})"
+            yield f"a stream with other compression ({one_line(filter_names, 60)})"
 
 
 def _resolve(value: object) -> object:
@@ -251,7 +245,7 @@ def _name(value: object) -> str | None:
 
 
 def _attachment(reader: pypdf.PdfReader) -> bytes:
-    """Bytes of the one attached file; its name is compared and used for nothing else."""
+    """Return the bytes of the one attached file, whose name must be RESULTS_NAME."""
     files: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
     features: set[str] = set()
@@ -267,15 +261,15 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
             id(candidate): candidate for candidate in objects if isinstance(candidate, StreamObject)
         }
     if features:
-        raise ResultsError(f"it contains {', '.join(sorted(features))}; no report does.")
+        raise ResultsError(f"the PDF contains {', '.join(sorted(features))}, unlike a report.")
     if not files and not streams:
         raise ResultsError(
-            f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or "
-            "it was printed to PDF, which drops attachments. Hand in the original file."
+            f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "
+            "printed to PDF, which removes attachments. Hand in the original file."
         )
     if len(files) != 1 or len(streams) != 1:
         raise ResultsError(
-            "The PDF has several attachments, or none that can be read. Hand in one report per PDF."
+            "The PDF has several attachments, or an unreadable one. Hand in one report per PDF."
         )
     (file,), (stream,) = files, streams.values()
     names = {
@@ -285,9 +279,9 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
     }
     if names != {RESULTS_NAME}:
         name_text = one_line(" / ".join(sorted(names)), 80)
-        raise ResultsError(f"the attached file is called {name_text!r}, not {RESULTS_NAME!r}.")
+        raise ResultsError(f"the name of the attached file is {name_text!r}, not {RESULTS_NAME!r}.")
     data = bytes(stream.get_data())
     if len(data) > MAX_ATTACHMENT_BYTES:
         limit = MAX_ATTACHMENT_BYTES // 1_000_000
-        raise ResultsError(f"{RESULTS_NAME} in it is larger than {limit} MB.")
+        raise ResultsError(f"the attached {RESULTS_NAME} is larger than {limit} MB.")
     return data

@@ -1,9 +1,9 @@
-"""What is read from a report, and what verification says of it."""
+"""Results of verification: verdict, and differences of numbers and pages."""
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-# What Python raises where a value in a broken file is of another type, out of range or not there
+# Python errors caused by values of a damaged file: wrong type, out of range, missing
 BAD_VALUES = (
     ArithmeticError,
     AssertionError,
@@ -13,21 +13,21 @@ BAD_VALUES = (
     TypeError,
     ValueError,
 )
-# Of the numbers; the comparison of pages is a result of its own
+# status of the numbers; PageStatus: separate result of the comparison of pages
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
 
 
 @dataclass(frozen=True)
 class Mismatch:
-    """One number or text that a new run of the analysis does not confirm.
+    """Number or text of a report that differs from a new run of the analysis.
 
     Attributes
     ----------
     path : str
-        Where it stands in the results: ``axes.north.filters.kf.nis_mean``.
+        Place in the results: ``axes.north.filters.kf.nis_mean``.
     recorded, recomputed : str
-        "absent" where there is none.
+        Values; "absent" if missing.
     """
 
     path: str
@@ -37,17 +37,16 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class PageDifference:
-    """A difference between the handed-in PDF and the report that px4fuse draws.
+    """Difference between the handed-in PDF and the report that px4fuse draws.
 
     Attributes
     ----------
     page : int
-        Counted from 1; 0 for the document.
+        Page number from 1; 0 for the document.
     what : str
-        The difference: the end of a sentence.
+        Difference, as the end of a sentence.
     structural : bool
-        The PDF has parts that px4fuse does not write, or lacks parts: another program made it, or
-        something was added.
+        Parts of the PDF are added or missing: another program wrote or changed it.
     """
 
     page: int
@@ -56,34 +55,33 @@ class PageDifference:
 
     @property
     def sentence(self) -> str:
-        """The difference with its place."""
+        """Page and difference."""
         return f"{f'page {self.page}' if self.page else 'document'}: {self.what}"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What verification found.
+    """Result of a verification.
 
     Attributes
     ----------
     status : Status
-        Of the numbers: whether the log gives them. "cannot verify" too if they are right, but the
-        PDF has another structure than the redrawn one.
+        Result for the numbers. "cannot verify" also if the numbers agree, but the structure of the
+        PDF differs from that of the redrawn one.
     reasons : tuple of str
-        Sentences: what differs, or why nothing can be said; for "verified" what was checked.
+        Sentences: differences, reason for "cannot verify", or for "verified" the checks.
     with_log : bool
-        Whether the analysis was run again on the log.
+        True if the analysis was repeated on the log.
     page_status : {"same", "differ", "not compared"}
-        Result of the comparison of the handed-in PDF with the redrawn one.
+        Result of the comparison of pages.
     pages : tuple of PageDifference
-        What differs.
     redrawn : bytes
-        The report as px4fuse draws it from what the log gives, as a PDF: what to read instead of
-        what was handed in. Empty where the analysis was not run again.
+        Report that px4fuse drew from the repeated analysis (PDF), to be read instead of the
+        handed-in one; empty if the analysis was not repeated.
     remedy : str
-        What whoever verifies it can do where nothing could be said: one sentence.
+        Action if the report was not verified: one sentence.
     missing : str
-        Name of the log, or of another file, without which nothing could be said.
+        Name of the missing log or other file.
     """
 
     status: Status

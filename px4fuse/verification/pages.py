@@ -40,19 +40,20 @@ from px4fuse.verification.intake import BROKEN_PDF_ERRORS, MAX_VALUES, PYPDF_LIM
 from px4fuse.verification.model import PageDifference
 from px4fuse.workers import JobFailure, run_one_bounded
 
-# Of coordinates (pt). Other kernels of OpenBLAS move points by at most 0.07; 0.25 is not visible
+# pt; tolerance of coordinates. Other kernels of OpenBLAS move points by at most 0.07; 0.25 is not
+# visible
 COORDINATE_PT = 0.25
-# Of all other numbers, relative: programs that save a PDF again write 32-bit floats
+# relative tolerance of other numbers: programs that save a PDF again write 32-bit floats
 NUMBER = 1e-5
-# Of distances between letters in a text with a number that is rounded otherwise (1/1000 em)
+# 1/1000 em; largest letter distance in texts whose numbers may be rounded differently
 KERNING = 200.0
-# Factor on the length of content: every byte of a string may be an escape of four
+# factor on the length of content: each byte of a string may be an escape sequence of four
 SPELLING = 4
-# For one comparison, which takes 3 s and 0.3 GB for the largest report
+# limits of one comparison, which needs 3 s and 0.3 GB for the largest report
 TIMEOUT_S, MEMORY_BYTES = 12.0, 1_000_000_000
-# Differences that are listed; one is enough for the verdict
+# number of differences that are listed
 MAX_FOUND = 20
-# Compression of a stream, and fields of the document information that other programs write
+# not compared: compression of streams, and document information that other programs write
 _PACKED = frozenset(("/Length", "/Filter"))
 _STAMPS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
 _XMP_STAMPS = re.compile(
@@ -60,10 +61,10 @@ _XMP_STAMPS = re.compile(
     r"|stEvt:(?:when|instanceID))( [^>]*)?>[^<]*</\1>"
 )
 MAX_XMP_BYTES = 100_000
-# The version of Typst that set the report: 0.15.0 and 0.15.2 set the same pages
+# the Typst version is not compared: 0.15.0 and 0.15.2 produce the same pages
 _TYPST = re.compile(r"Typst \d+(\.\d+)*")
 _END = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
-_WORDS = {
+_PART_NAMES = {
     "/AA": "an action",
     "/AcroForm": "form fields",
     "/Annots": "an annotation",
@@ -84,14 +85,14 @@ _TOKEN = re.compile(
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
 _ESCAPE = re.compile(r"\\([0-7]{1,3}|\r\n?|.)|\r\n?", re.DOTALL)
 _ESCAPED = {"n": "\n", "r": "\r", "t": "\t", "b": "\b", "f": "\f", "\n": "", "\r": "", "\r\n": ""}
-# Operators whose operands are coordinates, from the one with this number on
+# operators with coordinates, and index of their first coordinate
 _COORDINATES = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT = frozenset(("Tj", "TJ"))
-# In ToUnicode: glyph and letters
+# entry of a ToUnicode map: glyph and letters
 _LETTERS = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
 
 WordsAlike = Callable[[str, str], bool]
-# Of an operation: a number, a string, or a name, bracket or other token
+# operand of an operation: number, string, or name, bracket and other tokens
 Operand = float | bytes | str
 Operation = tuple[str, tuple[Operand, ...]]
 
@@ -120,7 +121,7 @@ def compare_pages(
     job = (submitted, redrawn, words_alike, same_libraries)
     found = run_one_bounded(_found, job, TIMEOUT_S, MEMORY_BYTES)
     if isinstance(found, JobFailure):
-        what = f"it cannot be compared within the limits ({found.reason.rstrip('.')})"
+        what = f"not compared within the limits ({found.reason.rstrip('.')})"
         return (PageDifference(0, what, True),)
     return found
 
@@ -129,17 +130,17 @@ def _found(job: tuple[bytes, bytes, WordsAlike, bool]) -> tuple[PageDifference, 
     submitted, redrawn, words_alike, same_libraries = job
     try:
         with pypdf.apply_configuration(**PYPDF_LIMITS):
-            theirs, ours = map(opened, (submitted, redrawn))
+            submitted_pdf, redrawn_pdf = map(opened, (submitted, redrawn))
             walk = _Walk(words_alike, same_libraries)
             found = [PageDifference(0, what, True) for what in _tables(submitted)]
-            found += islice(walk.differences(theirs, ours), MAX_FOUND)
-            producer = (theirs.metadata or DictionaryObject()).get("/Producer")
-            if producer is not None and any(one.structural for one in found):
+            found += islice(walk.differences(submitted_pdf, redrawn_pdf), MAX_FOUND)
+            producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
+            if producer is not None and any(difference.structural for difference in found):
                 what = f"another program wrote this file ({one_line(str(producer), 60)})"
                 found.insert(0, PageDifference(0, what, True))
             return tuple(found)
     except (LimitReachedError, RecursionError, SyntaxError, *BROKEN_PDF_ERRORS) as error:
-        what = f"it cannot be read ({type(error).__name__})"
+        what = f"cannot be read ({type(error).__name__})"
         return (PageDifference(0, what, True),)
 
 
@@ -149,7 +150,7 @@ class _Walk:
 
     Attributes
     ----------
-    seen : set of tuple
+    compared : set of tuple
         Pairs of objects that were compared: number, generation, and px4fuse's number.
     parents : list of tuple
         Parents of pages, left for the walk from the catalogue.
@@ -159,116 +160,124 @@ class _Walk:
 
     words_alike: WordsAlike
     same_libraries: bool
-    seen: set[tuple[int, int, int]] = field(default_factory=set)
+    compared: set[tuple[int, int, int]] = field(default_factory=set)
     parents: list[tuple[Any, Any, str]] = field(default_factory=list)
     fonts: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 0
 
     def differences(
-        self, theirs: pypdf.PdfReader, ours: pypdf.PdfReader
+        self, submitted: pypdf.PdfReader, redrawn: pypdf.PdfReader
     ) -> Iterator[PageDifference]:
         """Yield the differences of pages, document information and catalogue."""
-        pages = [_sheets(reader) for reader in (theirs, ours)]
+        pages = [_sheets(reader) for reader in (submitted, redrawn)]
         for number, (one, other) in enumerate(zip_longest(*pages), start=1):
             if one is None or other is None:
-                what = "it is missing" if one is None else f"px4fuse draws {len(pages[1])} pages"
+                what = "missing" if one is None else f"px4fuse draws only {len(pages[1])} pages"
                 yield PageDifference(number, what)
                 return
             self.fonts = _resolved(other.get_object()["/Resources"].get("/Font", {}))
             yield from self._compare(one, other, "/Page", number)
         for key in ("/Info", "/Root"):
-            one, other = (dict.get(reader.trailer, key) for reader in (theirs, ours))
+            one, other = (dict.get(reader.trailer, key) for reader in (submitted, redrawn))
             yield from self._compare(one, other, key, 0)
         for one, other, key in self.parents:
             yield from self._compare(one, other, key, 0)
-        if "/XRefStm" in theirs.trailer:  # two tables of objects: programs differ in which they use
+        if "/XRefStm" in submitted.trailer:  # programs differ in the table that they use
             yield PageDifference(0, "a second table of objects", True)
 
-    def _compare(self, theirs: Any, ours: Any, key: str, page: int) -> Iterator[PageDifference]:
+    def _compare(
+        self, submitted: Any, redrawn: Any, key: str, page: int
+    ) -> Iterator[PageDifference]:
         """Yield the differences of two values and of all that they contain."""
-        left = [(theirs, ours, key)]
+        left = [(submitted, redrawn, key)]
         while left:
-            theirs, ours, key = left.pop()
+            submitted, redrawn, key = left.pop()
             self.steps += 1
             if self.steps > MAX_VALUES:
                 raise LimitReachedError("too many values")
-            if isinstance(theirs, IndirectObject) and theirs.generation:  # some programs ignore it
+            if (
+                isinstance(submitted, IndirectObject) and submitted.generation
+            ):  # some programs ignore the generation
                 yield PageDifference(page, f"{key}: an object of a later generation", True)
-            if isinstance(theirs, IndirectObject) and isinstance(ours, IndirectObject):
-                pair = theirs.idnum, theirs.generation, ours.idnum
-                if pair in self.seen:
+            if isinstance(submitted, IndirectObject) and isinstance(redrawn, IndirectObject):
+                pair = submitted.idnum, submitted.generation, redrawn.idnum
+                if pair in self.compared:
                     continue
-                self.seen.add(pair)
-            theirs, ours = _resolved(theirs), _resolved(ours)
-            if _kind(theirs) is not _kind(ours):
+                self.compared.add(pair)
+            submitted, redrawn = _resolved(submitted), _resolved(redrawn)
+            if _kind(submitted) is not _kind(redrawn):
                 yield PageDifference(page, f"{key} is of another type", True)
-            elif isinstance(ours, DictionaryObject):
-                yield from self._dictionaries(theirs, ours, key, page, left)
-            elif isinstance(ours, ArrayObject):
-                if len(theirs) != len(ours):
-                    what = f"{key} has {len(theirs)} parts; px4fuse writes {len(ours)}"
+            elif isinstance(redrawn, DictionaryObject):
+                yield from self._dictionaries(submitted, redrawn, key, page, left)
+            elif isinstance(redrawn, ArrayObject):
+                if len(submitted) != len(redrawn):
+                    what = f"{key} has {len(submitted)} parts; px4fuse writes {len(redrawn)}"
                     yield PageDifference(page, what, True)
                     continue
-                both = zip(list.__iter__(theirs), list.__iter__(ours), strict=True)
+                both = zip(list.__iter__(submitted), list.__iter__(redrawn), strict=True)
                 left += [(one, other, key) for one, other in both][::-1]
-            elif not self._same(theirs, ours):
-                found, drawn = (one_line(str(each), 60) for each in (theirs, ours))
+            elif not self._same(submitted, redrawn):
+                found, drawn = (one_line(str(each), 60) for each in (submitted, redrawn))
                 yield PageDifference(page, f"{key} is {found!r}; px4fuse writes {drawn!r}")
 
     def _dictionaries(
         self,
-        theirs: DictionaryObject,
-        ours: DictionaryObject,
+        submitted: DictionaryObject,
+        redrawn: DictionaryObject,
         key: str,
         page: int,
         left: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
         """Yield the differences of keys and streams; the values are put on the list."""
-        found, drawn = (_keys(each, key) for each in (theirs, ours))
+        found, drawn = (_keys(each, key) for each in (submitted, redrawn))
         for name in sorted(found ^ drawn):
-            said = _WORDS.get(name, f"an entry {one_line(name, 40)}")
+            part = _PART_NAMES.get(name, f"an entry {one_line(name, 40)}")
             what = "that px4fuse does not write" if name in found else "is missing"
-            yield PageDifference(page, f"{said} {what}", True)
+            yield PageDifference(page, f"{part} {what}", True)
         for name in sorted(found & drawn, reverse=True):
-            pair = theirs.raw_get(name), ours.raw_get(name), name
+            pair = submitted.raw_get(name), redrawn.raw_get(name), name
             (self.parents if page and name == "/Parent" else left).append(pair)
-        if isinstance(theirs, StreamObject) and isinstance(ours, StreamObject):
-            yield from self._streams(theirs, ours, key, page)
+        if isinstance(submitted, StreamObject) and isinstance(redrawn, StreamObject):
+            yield from self._streams(submitted, redrawn, key, page)
 
-    def _same(self, theirs: Any, ours: Any) -> bool:
-        if _kind(ours) is float:
-            return math.isclose(theirs, ours, rel_tol=NUMBER, abs_tol=NUMBER)
-        if _kind(ours) is str and _TYPST.fullmatch(str(theirs)) and _TYPST.fullmatch(str(ours)):
+    def _same(self, submitted: Any, redrawn: Any) -> bool:
+        if _kind(redrawn) is float:
+            return math.isclose(submitted, redrawn, rel_tol=NUMBER, abs_tol=NUMBER)
+        if (
+            _kind(redrawn) is str
+            and _TYPST.fullmatch(str(submitted))
+            and _TYPST.fullmatch(str(redrawn))
+        ):
             return True
-        if _kind(ours) is str:
+        if _kind(redrawn) is str:
             one, other = (
                 str(each) if isinstance(each, str) else each.decode("latin-1")
-                for each in (theirs, ours)
+                for each in (submitted, redrawn)
             )
             return one == other or self.words_alike(one, other)
-        return bool(theirs == ours)
+        return bool(submitted == redrawn)
 
     def _streams(
-        self, theirs: StreamObject, ours: StreamObject, key: str, page: int
+        self, submitted: StreamObject, redrawn: StreamObject, key: str, page: int
     ) -> Iterator[PageDifference]:
-        kind = ours.get("/Type")
+        kind = redrawn.get("/Type")
         if kind == "/EmbeddedFile":  # results.json, which intake has read
             return
-        packed = _resolved(theirs.get("/Filter"))
-        if packed not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf leaves a JPEG as it is
-            yield PageDifference(page, f"{key} is packed by other means", True)
+        packed = _resolved(submitted.get("/Filter"))
+        if packed not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
+            yield PageDifference(page, f"{key} has another compression", True)
             return
-        one, other = theirs.get_data(), ours.get_data()
+        one, other = submitted.get_data(), redrawn.get_data()
         if one == other or (kind == "/Metadata" and _xmp(one) == _xmp(other)):
             return
         if (key != "/Contents" and kind != "/Pattern") or len(one) > SPELLING * len(other):
-            yield PageDifference(page, f"{key}: its content is not what px4fuse writes")
+            yield PageDifference(page, f"{key}: the content differs from px4fuse's")
         elif what := self._other_operation(one, other):
             yield PageDifference(page, what)
 
-    def _other_operation(self, theirs: bytes, ours: bytes) -> str:
+    def _other_operation(self, submitted: bytes, redrawn: bytes) -> str:
         """Describe the first operation that differs; empty if none does."""
-        both = [_operations(each) for each in (theirs, ours)]
+        both = [_operations(each) for each in (submitted, redrawn)]
         if not self.same_libraries:
             both = [_without_drawings(each) for each in both]
         font = ""
@@ -284,8 +293,8 @@ class _Walk:
                 if texts[0] != texts[1] and widest < KERNING and self.words_alike(*texts):
                     continue
                 shown = [one_line(text, 60) for text in texts]
-                return f"its text has {shown[0]!r} where px4fuse prints {shown[1]!r}"
-            return f"drawing operation {number} is not what px4fuse draws ({one_line(other, 9)})"
+                return f"text {shown[0]!r}; px4fuse prints {shown[1]!r}"
+            return f"drawing operation {number} differs from px4fuse's ({one_line(other, 9)})"
         return ""
 
     def _text(self, operands: tuple[Operand, ...], font: str) -> str:
@@ -300,12 +309,12 @@ class _Walk:
 
 
 def _tables(pdf: bytes) -> Iterator[str]:
-    """Describe why programs may read different objects: they start from different tables."""
+    """Yield reasons why programs may read different objects of the PDF."""
     end = _END.search(pdf[-1024:])
     if end is None:
         yield "bytes after its end"
     elif b"/Linearized" in pdf[:1024]:
-        # the first table in the file has to be the one that its end refers to
+        # the end must refer to the first table in the file
         begin = pdf.find(b"endobj") + len(b"endobj")
         if pdf[begin : int(end[1])].strip():
             yield "a second table of objects"
@@ -322,7 +331,7 @@ def _resolved(value: Any) -> Any:
 
 
 def _kind(value: Any) -> type:
-    """Type of a PDF value: a name is no string, a stream no dictionary, a flag no number."""
+    """Return the type of a PDF value: name is not string, stream not dictionary, flag not number."""
     kinds = StreamObject, DictionaryObject, ArrayObject, NameObject
     if isinstance(value, TextStringObject | ByteStringObject):
         return str
@@ -340,8 +349,10 @@ def _keys(value: DictionaryObject, key: str) -> set[str]:
 
 
 def _xmp(data: bytes) -> str:
-    """Return metadata in one spelling, without what other programs write into it."""
-    if len(data) > MAX_XMP_BYTES or b"<!" in data:  # no document types, whose entities expand
+    """Return XMP metadata in canonical form, without fields that other programs change."""
+    if (
+        len(data) > MAX_XMP_BYTES or b"<!" in data
+    ):  # document types may contain entities that expand
         return data.decode("latin-1")
     packet = re.sub(r"<\?.*?\?>", "", data.decode("utf-8", "replace"))
     spelt = ElementTree.canonicalize(packet.strip(), strip_text=True)
@@ -371,17 +382,17 @@ def _operations(content: bytes) -> Iterator[Operation]:
 
 def _unescaped(match: re.Match[str]) -> str:
     escaped = match[1]
-    if escaped is None:  # an end of line, however it is written
+    if escaped is None:  # any end of line
         return "\n"
     if escaped[0] in "01234567":
         return chr(int(escaped, 8) & 255)
     return _ESCAPED.get(escaped, escaped)
 
 
-def _near(operator: str, theirs: Sequence[Operand], ours: Sequence[Operand]) -> bool:
+def _near(operator: str, submitted: Sequence[Operand], redrawn: Sequence[Operand]) -> bool:
     """Return True if operands are equal, coordinates within COORDINATE_PT."""
-    first = _COORDINATES.get(operator, len(ours))
-    return len(theirs) == len(ours) and all(
+    first = _COORDINATES.get(operator, len(redrawn))
+    return len(submitted) == len(redrawn) and all(
         one == other
         or (
             isinstance(one, float)
@@ -390,7 +401,7 @@ def _near(operator: str, theirs: Sequence[Operand], ours: Sequence[Operand]) -> 
                 one, other, rel_tol=NUMBER, abs_tol=COORDINATE_PT if at >= first else NUMBER
             )
         )
-        for at, (one, other) in enumerate(zip(theirs, ours, strict=True))
+        for at, (one, other) in enumerate(zip(submitted, redrawn, strict=True))
     )
 
 

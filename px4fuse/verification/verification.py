@@ -1,16 +1,14 @@
-"""Whether the numbers of a report are what its log gives, and the report drawn again from them.
+"""Verification: repeat the analysis of a report on its log, and compare numbers and pages.
 
-The attached results are taken for what they claim: the recorded command is run again on the log,
-found by its SHA-256, and what comes out is compared with what was handed in. This proves that the
-numbers belong to the log. It does not prove who wrote them: whoever has the log can make the same
-report with another name on it.
+The recorded command is run again on the log, which is found by its SHA-256, and the results are
+compared with the attached ones. This confirms that the numbers follow from the log. It does not
+confirm the author: anybody with the log can make the same report under another name.
 
-The report is drawn again from what the log gives, and the handed-in PDF is compared with it part
-by part (:mod:`px4fuse.verification.pages`). No number rests on the handed-in pages.
+The report is drawn again from the new results, and the handed-in PDF is compared with it
+(:mod:`px4fuse.verification.pages`). No number is read from the handed-in pages.
 
-The recorded request is a stranger's. It is decoded strictly, and the analysis knows the range of
-every value; files are found by their SHA-256 among those that were given, never by name; and
-nothing in it names an output.
+The recorded request is not trusted: it is decoded strictly, all values are checked for their
+ranges, files are found by SHA-256 and never by name, and it cannot name an output file.
 """
 
 import re
@@ -33,20 +31,19 @@ from px4fuse.verification.model import Mismatch, PageStatus, Status, Verdict
 from px4fuse.verification.pages import WordsAlike, compare_pages
 
 ADD_LOGS_ADVICE = "Add {} to --logs."
-ASK_ADVICE = "Ask how the report was made, and for the log and all files that it was made from."
-FOREIGN_REQUEST = "the recorded request is not one that px4fuse can have made"
-# A flight of ten minutes has 60,000 steps of it, which take half a minute
+ASK_ADVICE = "Ask how the report was made, and for its log and all other input files."
+FOREIGN_REQUEST = "the recorded command was not written by px4fuse"
+# s; ten minutes of flight have 60,000 such steps, which take half a minute
 MIN_DT_S = 0.01
-ORIGINAL = "Ask for the PDF as px4fuse wrote it."
-LIMIT = "A verified report proves that its numbers belong to the log, not who wrote them."
-NO_LOG = "no log was given, so that no number could be computed again"
-# Between processors: sums over a flight differ in the last few of 16 digits, differences of such
-# sums in the last 8. Four kernels of OpenBLAS differ by 3e-8 at most (six flights). This is a
-# tolerance, not a number of digits: two nearly equal numbers may be rounded to other last digits
+ORIGINAL = "Ask for the PDF that px4fuse wrote."
+LIMIT = "verification confirms that the numbers follow from the log, not the author"
+NO_LOG = "no log was given, so no number could be re-computed"
+# Tolerance between processors: sums over a flight differ in the last few of 16 digits, differences
+# of such sums in the last 8. Four kernels of OpenBLAS differ by at most 3e-8 (six flights)
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-9
-# Minima are flat: where the likelihood or a cost differs in its 12th digit, the place of its
-# minimum does in its 6th, and the ends of an interval found from it in the 4th. No page prints
-# more than three digits of these.
+# Tolerance of estimates: minima are flat. If a likelihood or cost differs in its 12th digit, its
+# minimum differs in the 6th, and the ends of its interval in the 4th. Pages print up to three
+# digits
 ESTIMATE_RELATIVE_TOLERANCE, ESTIMATE_ABSOLUTE_TOLERANCE = 1e-3, 1e-5
 ESTIMATE_PATHS = (
     "tuning",
@@ -59,61 +56,57 @@ ESTIMATE_PATHS = (
     "source.alignment",
     "settings.clock_offset_s",
 )
-# How often a solver went round
+# number of solver iterations, and accepted difference
 ITERATIONS, MAX_MORE_ITERATIONS = "iterations", 2
-# What tells the machine that a report was made on, and no number of it
+# fields that describe the computer of the report, not compared
 MACHINE_PATHS = ("provenance.python", "provenance.libraries")
 MAX_DIFFERENCES = 20
 SHOWN_PAGES = 5
 MAX_TEXT_LENGTH = 120
-# Sizes by which a report multiplies numbers to print them: 1, per cent, thousandths
+# factors of printed numbers: 1, per cent, thousandths
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
-# Of notes that are drawn again; a page holds about 60
+# lines of notes that are redrawn; a page has about 60
 MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-# What the analysis gives now: results as a report attaches them, and what draws the report, with
-# the student and the versions that were recorded
+# new results, and a function that draws the report with the recorded student and versions
 Recomputed = tuple[Reported, Callable[[], bytes]]
 _LinkFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Why an analysis is not run again, with the arguments of :func:`cannot_verify`."""
+    """Reason why an analysis cannot be repeated: arguments of :func:`cannot_verify`."""
 
 
 def log_sha256(results: Reported) -> str:
-    """SHA-256 of the log that a report is about."""
+    """Return the SHA-256 of the log of a report."""
     return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
 
 
 def log_name(results: Reported) -> str:
-    """Name of the log that a report is about, as the report gives it."""
+    """Return the name of the log of a report, as recorded."""
     loop = isinstance(results, LoopResults)
     return split_part(results.track.name)[0] if loop else results.log.name  # type: ignore[union-attr]
 
 
 def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdict:
-    """Repeat the analysis from what a report recorded.
+    """Repeat the recorded analysis of a report.
 
     Parameters
     ----------
     results : ComparisonResults or LoopResults
-        What is attached to the report.
+        Attached results.
     logs : mapping of str to Path
-        Files by their SHA-256.
+        Files by SHA-256.
 
     Returns
     -------
     Recomputed or Verdict
-        "cannot verify" where the command is not px4fuse's, a file is missing, or the analysis
-        fails.
+        "cannot verify" if the command is not px4fuse's, a file is missing, or the analysis fails.
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
-            raise NotRepeatableError(
-                "the results do not say which libraries they were made with", ASK_ADVICE
-            )
+            raise NotRepeatableError("the results do not list the library versions", ASK_ADVICE)
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
             link_file = partial(_link_file, logs, Path(folder))
             if isinstance(results, LoopResults):
@@ -121,13 +114,13 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdi
             else:
                 analysis_result, new_results = _repeat_comparison(results, link_file)
         return new_results, partial(_draw_report, analysis_result, new_results, results.provenance)
-    except SettingsError as error:  # no run with these settings can have made a report
+    except SettingsError as error:  # px4fuse rejects these settings, so it did not make the report
         return cannot_verify(f"{FOREIGN_REQUEST}: {error}", ASK_ADVICE)
     except NotRepeatableError as error:
         return cannot_verify(*error.args)
     except Px4FuseError as error:
         return cannot_verify(str(error), ASK_ADVICE)
-    except Exception as error:  # noqa: BLE001 - settings made to fail may fail anywhere
+    except Exception as error:  # noqa: BLE001 - forged settings may fail anywhere
         return cannot_verify(
             f"the analysis cannot be repeated ({type(error).__name__})", ASK_ADVICE
         )
@@ -136,31 +129,30 @@ def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdi
 def _link_file(
     logs: Mapping[str, Path], within: Path, name: str, sha256: str | None, role: str
 ) -> str:
-    """A file with this content where the analysis finds it, under the recorded name.
+    """Link the file with this SHA-256 under the recorded name, which the report prints.
 
-    Names are printed in the report. They are those of links in a folder of this run alone, and
-    only where they are plain names.
+    The link is in a temporary folder, and only plain file names are accepted.
     """
     path = None if sha256 is None else logs.get(sha256)
     if path is None:
-        missing = one_line(name, 80) or "its file"
-        problem = f"none of the files given has the SHA-256 of {role}"
+        missing = one_line(name, 80) or "the file"
+        problem = f"none of the given files has the SHA-256 of {role}"
         raise NotRepeatableError(problem, ADD_LOGS_ADVICE.format(missing), missing)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
         raise NotRepeatableError(
-            f"{FOREIGN_REQUEST}: a file name in it is not a plain name", ASK_ADVICE
+            f"{FOREIGN_REQUEST}: it contains a path instead of a file name", ASK_ADVICE
         )
-    # each in a folder of its own: two may have one name
+    # in separate folders, because two files may have the same name
     target = Path(tempfile.mkdtemp(dir=within), name)
     try:
         target.symlink_to(path.resolve())
-    except OSError:  # on Windows for administrators only
+    except OSError:  # links need administrator rights on Windows
         shutil.copyfile(path, target)
     return str(target)
 
 
 def split_part(source: str) -> tuple[str, str]:
-    """File and part of ``LOG:vio``, without a look at any file."""
+    """Split ``LOG:vio`` into file and track, without access to files."""
     from px4fuse.loop.tracks import FLIGHT_PARTS  # noqa: PLC0415
 
     name, colon, tail = source.rpartition(":")
@@ -176,7 +168,7 @@ def _repeat_comparison(
     recorded = handed_in.request
     if recorded.dt_s < MIN_DT_S:
         raise NotRepeatableError(
-            f"DT is below {MIN_DT_S:g} s, which takes too long to repeat", ASK_ADVICE
+            f"DT is below {MIN_DT_S:g} s, so the analysis would take too long", ASK_ADVICE
         )
     joined = {file.role: file.sha256 for file in handed_in.log.joined}
     request = replace(recorded, log=link_file(recorded.log, handed_in.log.sha256, "the log"))
@@ -205,7 +197,7 @@ def _repeat_loop(handed_in: LoopResults, link_file: _LinkFile) -> tuple[object, 
 
 
 def _draw_report(subject: object, results: Reported, versions: Provenance) -> bytes:
-    """Draw the report with the versions that were recorded."""
+    """Draw the report with the recorded versions."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
 
     new_provenance = replace(versions, command=results.provenance.command)
@@ -222,45 +214,44 @@ def verify(
     *,
     recompute: Callable[[Reported, Mapping[str, Path]], Recomputed | Verdict] = recompute,
 ) -> Verdict:
-    """Say whether a report's numbers are what its log gives, and draw it again.
+    """Verify a report: repeat its analysis, compare numbers and pages, and draw it again.
 
     Parameters
     ----------
     logs : mapping of str to Path
-        Logs and other recordings by their SHA-256.
+        Logs and other recordings by SHA-256.
     recompute : callable
         Repeats the analysis.
 
     Returns
     -------
     Verdict
-        "verified" where the log gives every number; without a log never. It proves that the
-        numbers belong to the log, not who wrote them. ``redrawn`` is the report to read, and
-        ``pages`` names those of the PDF that look otherwise.
+        "verified" if all numbers follow from the log; never without a log. ``redrawn`` is the
+        report to read, ``pages`` lists differing pages.
     """
     report_version, own_version = results.provenance.px4fuse, metadata.version("px4fuse")
     if report_version != own_version:
         shown_version = one_line(report_version, 40)
-        why = f"made with px4fuse {shown_version}, this is {own_version}"
-        return cannot_verify(why, f"Run it with px4fuse {shown_version}.")
-    name = one_line(log_name(results), 80) or "its log"
+        why = f"made with px4fuse {shown_version}; this is px4fuse {own_version}"
+        return cannot_verify(why, f"Verify it with px4fuse {shown_version}.")
+    name = one_line(log_name(results), 80) or "the log"
     if not logs:
         return cannot_verify(NO_LOG, ADD_LOGS_ADVICE.format(name), name)
     sha256 = log_sha256(results)
     if sha256 not in logs:
         expected_hash = one_line(sha256, 64) or "none"
-        reason = f"none of the {len(logs)} files given is the log, whose SHA-256 is {expected_hash}"
-        remedy = f"If it is a log of yours, a{ADD_LOGS_ADVICE.format(name)[1:]}"
+        reason = f"none of the {len(logs)} given files is the log (SHA-256 {expected_hash})"
+        remedy = f"If the log is yours, a{ADD_LOGS_ADVICE.format(name)[1:]}"
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
-        reason = f"its notes have more than {MAX_NOTES_LINES} lines, which is no report"
+        reason = f"the notes have more than {MAX_NOTES_LINES} lines"
         return cannot_verify(reason, ASK_ADVICE)
     again = recompute(results, logs)
     return again if isinstance(again, Verdict) else _verify_with_log(results, pdf, *again)
 
 
 def cannot_verify(reason: str, remedy: str = "", missing: str = "") -> Verdict:
-    """Nothing can be said, for this reason; with what helps, and the name of a file that would."""
+    """Return the verdict "cannot verify" with reason, remedy and name of a missing file."""
     reasons = (one_line(reason, 400),)
     return Verdict("cannot verify", reasons, False, remedy=remedy, missing=missing)
 
@@ -270,29 +261,29 @@ def _verify_with_log(
 ) -> Verdict:
     redrawn = draw()
     if redrawn == pdf:
-        reason = "the log gives the same file again, byte for byte"
+        reason = "the new run on the log gives an identical file"
         return Verdict("verified", (reason, LIMIT), True, page_status="same", redrawn=redrawn)
     mismatches, numbers_alike, compared = compare_results(to_plain(submitted), to_plain(recomputed))
-    first = ", ".join(one.path for one in mismatches[:3]) + ", …" * (len(mismatches) > 3)
+    first = ", ".join(m.path for m in mismatches[:3]) + ", …" * (len(mismatches) > 3)
     reasons = [
-        f"{len(mismatches)} of {compared} values are not what the log gives: {first}"
+        f"{len(mismatches)} of {compared} values differ from a new run on the log: {first}"
         if mismatches
-        else f"the log gives all {compared} values again (within {RELATIVE_TOLERANCE:g}, estimates "
-        f"within {ESTIMATE_RELATIVE_TOLERANCE:g})"
+        else f"all {compared} values agree with a new run on the log (within "
+        f"{RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
     ]
     others = _other_libraries(submitted.provenance, recomputed.provenance)
     words_alike = partial(same_words, numbers_alike=numbers_alike)
     pages = compare_pages(pdf, redrawn, words_alike, same_libraries=not others)
-    foreign = any(one.structural for one in pages)
+    foreign = any(difference.structural for difference in pages)
     page_status: PageStatus = "same"
     if pages:
         page_status = "not compared" if foreign else "differ"
     status: Status = "numbers differ" if mismatches else "cannot verify" if foreign else "verified"
-    sentences = [one.sentence for one in pages[:SHOWN_PAGES]]
+    sentences = [difference.sentence for difference in pages[:SHOWN_PAGES]]
     sentences += [f"{len(pages) - SHOWN_PAGES} more differences"] * (len(pages) > SHOWN_PAGES)
-    # the first reason is the one that a class table shows
+    # the class table shows the first reason
     reasons = [*sentences, *reasons] if status == "cannot verify" else [*reasons, *sentences]
-    reasons += [f"made with {others}: of figures only place and texts were compared"] * bool(others)
+    reasons += [f"made with {others}: only place and texts of figures were compared"] * bool(others)
     reasons += [LIMIT] * (status == "verified")
     remedy = ORIGINAL if foreign else ""
     return Verdict(
@@ -307,19 +298,19 @@ def _verify_with_log(
     )
 
 
-def _other_libraries(theirs: Provenance, ours: Provenance) -> str:
-    """List the libraries of which the report was made with other versions than those here."""
+def _other_libraries(submitted: Provenance, recomputed: Provenance) -> str:
+    """List the libraries whose versions differ between the report and this computer."""
     others = (
-        f"{name} {theirs.libraries.get(name)} (here {version})"
-        for name, version in ours.libraries.items()
-        if theirs.libraries.get(name) != version
+        f"{name} {submitted.libraries.get(name)} (here {version})"
+        for name, version in recomputed.libraries.items()
+        if submitted.libraries.get(name) != version
     )
     return one_line(", ".join(others), 300)
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """Compare two printed numbers: a recorded number and its recomputed twin, each rounded.
+    """Comparison of printed numbers: equal if a recorded and a recomputed number round to them.
 
     Attributes
     ----------
@@ -330,7 +321,7 @@ class Rounding:
     pairs: tuple[tuple[float, float], ...]
 
     def __call__(self, one: str, other: str) -> bool:
-        """Return True if one pair gives both numbers."""
+        """Return True if a pair rounds to both printed numbers."""
         decimals, printed = _decimals(one), (float(one), float(other))
         return decimals == _decimals(other) and any(
             printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
@@ -342,18 +333,18 @@ class Rounding:
 def compare_results(
     recorded: Mapping[str, Any], recomputed: Mapping[str, Any]
 ) -> tuple[tuple[Mismatch, ...], Rounding, int]:
-    """Compare every value of two results, of which the first is a stranger's.
+    """Compare all values of recorded and recomputed results.
 
     Returns
     -------
     differences : tuple of Mismatch
-        What is beyond the tolerances.
+        Values that differ by more than the tolerances.
     numbers_alike : Rounding
     compared : int
-        How many values.
+        Number of values.
     """
     command = str(recomputed["provenance"]["command"])
-    # everything rests on an offset or placement that was estimated
+    # all numbers depend on an estimated time offset or placement
     everywhere = not {"auto", "--position"}.isdisjoint(command.split())
     handed_in, new_values = dict(flatten(recorded)), dict(flatten(recomputed))
     pairs = {
@@ -381,12 +372,12 @@ def compare_results(
     return tuple(mismatches), numbers_alike, len(pairs)
 
 
-# Stands where there is nothing
+# marker of a missing value
 _ABSENT = object()
 
 
 def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Paths and values of what is no mapping and no list, keys joined by dots.
+    """Yield paths (keys joined by dots) and values of nested mappings and lists.
 
     >>> [*flatten({"a": {"b.c": [1, 2]}})]
     [('a.b.c.0', 1), ('a.b.c.1', 2)]
@@ -401,7 +392,7 @@ def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a number, and not a flag."""
+    """Return True for a number that is not a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -419,14 +410,14 @@ def _is_near(path: str, submitted: float, recomputed: float, wide: bool) -> bool
 
 
 def _is_same(submitted: Any, recomputed: Any, rounded: WordsAlike) -> bool:
-    """Whether two values that are not both numbers are the same."""
+    """Return True if two values, not both numbers, are equal up to rounding in texts."""
     if isinstance(submitted, str) and isinstance(recomputed, str):
         return same_words(submitted, clean_text(recomputed), rounded)
     return type(submitted) is type(recomputed) and bool(submitted == recomputed)
 
 
 def same_words(one: str, other: str, numbers_alike: WordsAlike) -> bool:
-    """Whether two texts are the same but for the rounding of their numbers.
+    """Return True if two texts are equal up to the rounding of their numbers.
 
     >>> same_words("0.15 m", "0.16 m", lambda one, other: True)
     True
@@ -435,7 +426,7 @@ def same_words(one: str, other: str, numbers_alike: WordsAlike) -> bool:
     """
     if one == other:
         return True
-    # every second part is a number
+    # split alternates between text and numbers
     pieces, other_pieces = _NUMBER.split(one), _NUMBER.split(other)
     numbers = zip(pieces[1::2], other_pieces[1::2], strict=False)
     return pieces[::2] == other_pieces[::2] and all(
@@ -444,7 +435,7 @@ def same_words(one: str, other: str, numbers_alike: WordsAlike) -> bool:
 
 
 def _decimals(number: str) -> int:
-    """Decimals of a printed number.
+    """Count the decimals of a printed number.
 
     >>> _decimals("0.15"), _decimals("3"), _decimals("1.2e-3")
     (2, 0, 4)
@@ -454,5 +445,4 @@ def _decimals(number: str) -> int:
 
 
 def _format_value(value: Any) -> str:
-    """A value on one line."""
     return "absent" if value is _ABSENT else one_line(str(value), MAX_TEXT_LENGTH)

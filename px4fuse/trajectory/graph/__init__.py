@@ -1,1 +1,1 @@
-"""SE(2), SE(3) and pose graphs: optimisation, and closures that may be false."""
+"""Pose graphs in SE(2) and SE(3): optimisation, and tests of loop closures."""

@@ -1,4 +1,4 @@
-"""A pose graph from a file: its closures judged, and the graph solved with and without doubt."""
+"""Analysis of a pose graph: tests of its closures, and optimisation with and without robustness."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,29 +12,29 @@ from px4fuse.trajectory.graph.covariance import GateResult, gate
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Robust, Solution, solve
 
-MAX_ROBUST_CLOSURES = 1000
-# What the solutions of the pose graph are called
+MAX_ROBUST_CLOSURES = 1000  # closures; more take minutes
+# names of the solutions
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
     "gated": "pose graph, gated",
     "dcs": "pose graph, DCS",
     "gnc": "pose graph, GNC",
 }
-# and those of them that doubt closures
+# robust methods by solution
 ROBUST: Mapping[str, Robust] = {"dcs": "dcs", "gnc": "gnc"}
 
 
 class Graph(Record, frozen=True, kw_only=True):
-    """A pose graph from a file, its closures and its solutions.
+    """Pose graph with the tests of its closures and its solutions, for the results.
 
     Attributes
     ----------
     name : str
     dimension, poses, edges : int
     initialised : str
-        Where the poses come from.
+        Source of the initial poses.
     gates : tuple of GateResult, or Unavailable
-        Of every edge that is no odometry.
+        Tests of all edges that are not odometry.
     solutions : mapping from name, as in :data:`SOLUTIONS`
     """
 
@@ -48,12 +48,12 @@ class Graph(Record, frozen=True, kw_only=True):
 
 
 class SolvedGraph(Graph, frozen=True, kw_only=True, eq=False):
-    """A pose graph with its solutions.
+    """Pose graph with its solutions.
 
     Attributes
     ----------
     graph : PoseGraph
-        With the poses of the plain solution.
+        With the poses of the solution with all closures.
     """
 
     schema_type = Graph
@@ -68,17 +68,16 @@ def analyse_graph(
     *,
     robust: bool | None = None,
 ) -> SolvedGraph:
-    """Judge the closures of a graph and solve it, plainly and robustly.
+    """Test the closures of a graph and optimise it, without and with robustness.
 
-    Edges between successive vertices are odometry, the others closures.
+    Edges between successive vertices are odometry, all others closures.
 
     Parameters
     ----------
     name : str
-        What the graph is called.
+        Name of the graph.
     robust : bool, optional
-        Whether to solve it robustly too; by default up to 1000 closures, since it takes minutes
-        for more.
+        Also run robust optimisation; by default with up to 1000 closures.
 
     Raises
     ------
@@ -86,17 +85,19 @@ def analyse_graph(
         The graph is not connected.
     """
     closures = ~graph.successive
-    progress(f"solving: {SOLUTIONS['all']}")
+    progress(f"optimising: {SOLUTIONS['all']}")
     solutions = {"all": solve(graph)}
     gates: tuple[GateResult, ...] | Unavailable
     try:
         gates = tuple(gate(graph, np.flatnonzero(closures)))
     except TrajectoryError as error:
-        gates = Unavailable("gate", str(error), "It needs an odometry edge between all successors.")
+        gates = Unavailable(
+            "gate", str(error), "Give an odometry edge between all successive vertices."
+        )
     count = int(np.count_nonzero(closures))
     if count > 1 and (count <= MAX_ROBUST_CLOSURES if robust is None else robust):
         for key, method in ROBUST.items():
-            progress(f"solving: {SOLUTIONS[key]}")
+            progress(f"optimising: {SOLUTIONS[key]}")
             solutions[key] = solve(graph, robust=method, loops=closures)
     return SolvedGraph(
         name=name,

@@ -1,4 +1,4 @@
-"""How well odometry alone knows one pose from another, and whether a closure agrees with it."""
+"""Covariance of relative poses by odometry, and the test of closures against it."""
 
 from collections.abc import Sequence
 
@@ -10,27 +10,27 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record, Share
 from px4fuse.trajectory.graph import lie, model
 
-# Chance that the gate rejects a closure that is true
+# probability that the gate rejects a true closure
 GATE_ALPHA = 0.001
-# Smallest eigenvalue of a correlation matrix below which rounding is larger than what it says
+# smallest eigenvalue of a correlation matrix that exceeds rounding errors
 _SINGULAR = 1e-13
 
 
 class GateResult(Record, frozen=True):
-    """What odometry alone says to a closure.
+    """Test of a closure against odometry.
 
     Attributes
     ----------
     first, second : int
-        Its ends, by the vertex numbers of the file.
+        Ends of the closure, as vertex numbers of the file.
     d2 : float
-        Squared Mahalanobis distance of the closure from the relative pose by odometry.
+        Squared Mahalanobis distance between the closure and the relative pose by odometry.
     degrees_of_freedom : int
-        Directions that the closure observes.
+        Number of directions that the closure observes.
     p : float
-        Probability of such a distance, or a larger one, if the closure is true.
+        Probability of this or a larger distance for a true closure.
     accepted : bool
-        Whether p is at least :data:`GATE_ALPHA`.
+        True if p is at least :data:`GATE_ALPHA`.
     """
 
     first: int
@@ -42,18 +42,18 @@ class GateResult(Record, frozen=True):
 
 
 def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
-    """Test closures against odometry alone, before they have pulled at anything.
+    """Test closures against odometry alone, before the optimisation uses them.
 
-    ``d2 = r' (J Sigma J' + Omega^-1)^-1 r`` with r the log of the closure's inverse times the
-    relative pose by odometry, J the inverse right Jacobian at r and Sigma the covariance of that
-    pose: each step's error is carried to the end by the adjoint (Barfoot 2017, 8.96 and the first
-    order of 8.108, with right perturbations). Only directions that the closure's information
-    observes take part.
+    ``d2 = r' (J Sigma J' + Omega^-1)^-1 r``, with r the log of the inverse closure times the
+    relative pose by odometry, J the inverse right Jacobian at r, and Sigma the covariance of the
+    relative pose: the error of each step is transformed to the end by the adjoint (Barfoot 2017,
+    8.96 and the first order of 8.108, with right perturbations). Only directions that the
+    information of the closure observes are used.
 
     Parameters
     ----------
     graph : PoseGraph
-        Its edges between successive poses are the odometry, except those under test.
+        Edges between successive poses are odometry, except the tested ones.
     edge_indices : sequence of int
         Edges to test.
 
@@ -65,8 +65,8 @@ def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list
     Raises
     ------
     TrajectoryError
-        If odometry does not lead from one end of a closure to the other, or has a direction without
-        information, or a closure tells nothing.
+        Odometry does not connect the ends of a closure or has a direction without information, or a
+        closure has no information.
     """
     tested = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested):
@@ -79,17 +79,15 @@ def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list
     if len(gap):
         at = low + int(gap[0])
         raise TrajectoryError(
-            (
-                f"No odometry edge connects vertices {graph.ids[at]} and {graph.ids[at + 1]}, "
-                "so the closure cannot be tested against odometry."
-            ),
+            f"No odometry edge connects vertices {graph.ids[at]} and {graph.ids[at + 1]}, "
+            "so the closure cannot be tested against odometry.",
             "Add the edge, or test shorter closures.",
         )
     poses = lie.chain(model.odometry_steps(graph, chain_edges))
     step_adjoints = lie.adjoint(poses[1:])
     step_covariances = (
         step_adjoints @ _covariances(graph, chain_edges) @ step_adjoints.transpose(0, 2, 1)
-    )  # in the axes of low
+    )  # in the axes of pose low
     cumulative_covariance = np.concatenate(
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )
@@ -119,15 +117,11 @@ def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: A
         or np.linalg.eigvalsh(model.scale_to_unit_diagonal(spread)[1])[0] <= _SINGULAR
     ):
         raise TrajectoryError(
-            (
-                f"The closure from vertex {ends[0]} to {ends[1]} cannot be tested: it has no "
-                "information, or the ratio of odometry and closure covariance exceeds the "
-                "numerical precision."
-            ),
-            (
-                "Give the closure's inverse covariance, and odometry information of a "
-                "similar magnitude."
-            ),
+            f"The closure from vertex {ends[0]} to {ends[1]} cannot be tested: it has no "
+            "information, or the ratio of odometry and closure covariance exceeds the "
+            "numerical precision.",
+            "Give the closure's inverse covariance, and odometry information of a "
+            "similar magnitude.",
         )
     d2 = float(observed_residual @ np.linalg.solve(spread, observed_residual))
     p = float(chdtrc(freedom, d2))
@@ -135,17 +129,15 @@ def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: A
 
 
 def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:
-    """Covariances of odometry edges in the axes of the later pose."""
+    """Return the covariances of odometry edges in the axes of the later pose."""
     scale, scaled = model.scale_to_unit_diagonal(graph.information[chain_edges])
     is_full_rank = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     if not np.all(is_full_rank):
         edge = chain_edges[int(np.argmin(is_full_rank))]
         raise TrajectoryError(
-            (
-                f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
-                f"{graph.ids[graph.second[edge]]} has no information in one direction, so "
-                "its error is unbounded."
-            ),
+            f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
+            f"{graph.ids[graph.second[edge]]} has no information in one direction, so "
+            "its error is unbounded.",
             "Give information in all directions.",
         )
     covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])

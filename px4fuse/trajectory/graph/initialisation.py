@@ -1,4 +1,4 @@
-"""Where to start a pose graph that comes without poses."""
+"""Initial poses of a pose graph without poses."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ from px4fuse.trajectory.graph.system import normal_equations, solve_with
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:
-    """Poses from the edges alone, except the first, which stays.
+    """Compute initial poses from the edges; the first pose stays.
 
     Chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D SLAM, section
-    IV-C): rotations by linear least squares without the constraint that they are rotations,
-    projected on rotations, then translations by linear least squares. Where odometry leads from
-    the first pose to the last, its composed edges are taken if their cost is lower.
+    IV-C): rotations by linear least squares without the rotation constraint, projected to
+    rotations, then translations by linear least squares. If odometry connects all poses, its
+    composed edges are used instead if their cost is lower.
 
     Parameters
     ----------
     graph : PoseGraph
-        Its poses but the first one are not looked at.
+        Only its first pose is used.
 
     Returns
     -------
     PoseGraph
-        ``initialised`` tells which.
+        ``initialised`` names the method.
 
     Raises
     ------
     TrajectoryError
-        If the graph falls into parts, or its edges do not determine its poses.
+        The graph is not connected, or its edges do not determine its poses.
     """
     if np.any(model.odometry_chain(graph) < 0):
         return _chordal(graph)
     composed_graph = model.compose_odometry(graph)
     try:
         return min(composed_graph, _chordal(graph), key=model.cost)
-    except TrajectoryError:  # rotations that only odometry tells
+    except TrajectoryError:  # only odometry determines the rotations
         return composed_graph
 
 
 def _chordal(graph: PoseGraph) -> PoseGraph:
-    """Chordal initialisation.
+    """Compute initial poses by chordal initialisation.
 
     Raises
     ------
     TrajectoryError
-        If the edges that tell a rotation do not join all poses, or poses are not determined.
+        Edges with rotation do not connect all poses, or the poses are not determined.
     """
     d = graph.dimension
     rotation_information = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
-    model.require_connected(graph, rotation_information > 0.0, "edges that tell a rotation")
+    model.require_connected(graph, rotation_information > 0.0, "edges with rotation")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(d), measured_rotation.shape)
-    # of the transposed rotations Y: sum of spin |Z' Y_i - Y_j|^2
+    # minimise the sum of weight |Z' Y_i - Y_j|^2 over the transposed rotations Y
     relaxed_rotation = _solve_positions(
         graph,
         measured_rotation.transpose(0, 2, 1),
@@ -69,7 +69,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
         lie.rotation_matrix(graph.poses[0]).T,
     )
     rotation = _nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
-    # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
+    # residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
     from_i = rotation[graph.first]
     axes = from_i @ measured_rotation
     information = axes @ graph.information[:, :d, :d] @ axes.transpose(0, 2, 1)
@@ -94,22 +94,17 @@ def _solve_positions(
     value: Array,
     first_pose: Array,
 ) -> Array:
-    """Least squares as :func:`normal_equations` has them, shape (n, d, k)."""
+    """Solve the least squares of :func:`normal_equations`, shape (n, d, k)."""
     solution = solve_with(
         *normal_equations(graph, of_first, of_second, information, value, first_pose)
     )
     if solution is None:
-        raise TrajectoryError("The edges do not determine where to start", "Give VERTEX lines.")
+        raise TrajectoryError("The edges do not determine the initial poses.", "Give VERTEX lines.")
     return np.concatenate([first_pose[None], solution.reshape(-1, *first_pose.shape)])
 
 
 def _nearest_rotations(matrices: Array) -> Array:
-    """Project on rotations in the Frobenius norm.
-
-    Parameters
-    ----------
-    matrices : ndarray, shape (n, d, d)
-    """
+    """Project matrices, shape (n, d, d), to rotations in the Frobenius norm."""
     left, _, right = np.linalg.svd(matrices)
     left[:, :, -1] *= np.sign(np.linalg.det(left @ right))[:, None]
     return np.asarray(left @ right)

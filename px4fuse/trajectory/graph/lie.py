@@ -1,12 +1,11 @@
-"""Rigid motions in the plane and in space, and their tangents, over arrays.
+"""Poses and tangents in SE(2) and SE(3), over arrays.
 
 A pose is x, y, heading (last axis 3) or x, y, z, qx, qy, qz, qw (last axis 7), in m and rad. A
 tangent has translation (rho) first, then rotation (phi): 3 or 6 numbers, in the order of g2o's
-information matrices. Perturbations stand on the right, in the axes of the pose itself:
-``X exp(xi)``.
+information matrices. Perturbations are on the right, in the axes of the pose: ``X exp(xi)``.
 
-Sources: Barfoot 2017, State Estimation for Robotics, chapter 7 and section 8.3; Sola, Deray and
-Atchuthan 2018, A micro Lie theory for state estimation in robotics, for the plane.
+Sources: Barfoot 2017, State Estimation for Robotics, chapter 7 and section 8.3; for SE(2) Sola,
+Deray and Atchuthan 2018, A micro Lie theory for state estimation in robotics.
 """
 
 import numpy as np
@@ -16,25 +15,19 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array
 from px4fuse.trajectory.rotation import from_elements, skew
 
-# Below this angle (rad) series replace quotients that cancel; five terms then reach 1e-14
+# below this angle series replace quotients that lose precision; five terms are accurate to 1e-14
 SMALL_ANGLE_RAD = 0.3
 _C = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _C_SLOPE = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
 
 def wrap(angle: Array) -> Array:
-    """Angles within (-pi, pi].
-
-    Parameters
-    ----------
-    angle : ndarray
-        rad.
-    """
+    """Wrap angles (rad) to (-pi, pi]."""
     return np.pi - (np.pi - angle) % (2.0 * np.pi)
 
 
 def rotation_matrix(pose: Array) -> Array:
-    """Rotation of poses as a matrix.
+    """Return the rotations of poses as matrices.
 
     Returns
     -------
@@ -47,25 +40,19 @@ def rotation_matrix(pose: Array) -> Array:
 
 
 def identity(width: int) -> Array:
-    """Pose that moves nothing.
-
-    Parameters
-    ----------
-    width : int
-        3 in the plane, 7 in space.
-    """
+    """Return the identity pose; ``width`` 3 in the plane, 7 in space."""
     pose = np.zeros(width)
     pose[6:] = 1.0  # w of the quaternion
     return pose
 
 
 def compose(a: Array, b: Array) -> Array:
-    """Poses ``a b``: first the motion a, then b in the axes that a reached.
+    """Compute the products ``a b``: motion a, then motion b in the axes of a.
 
     Parameters
     ----------
     a, b : ndarray, shape (..., 3) or (..., 7)
-        Quaternions are normalised in the result; headings are not wrapped.
+        Quaternions of the result are normalised; headings are not wrapped.
     """
     d = _dimension(a)
     turn = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
@@ -73,12 +60,12 @@ def compose(a: Array, b: Array) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """Poses that undo poses."""
+    """Return the inverse poses."""
     return between(pose, identity(pose.shape[-1]))
 
 
 def between(a: Array, b: Array) -> Array:
-    """Poses b as seen from a: the inverse of a, composed with b."""
+    """Return the poses b relative to a: the inverse of a, times b."""
     d, inverse_rotation = _dimension(a), np.swapaxes(rotation_matrix(a), -1, -2)
     turn = (
         b[..., 2:] - a[..., 2:] if d == 2 else (_rotation_of(a).inv() * _rotation_of(b)).as_quat()
@@ -87,12 +74,12 @@ def between(a: Array, b: Array) -> Array:
 
 
 def exp(tangent: Array) -> Array:
-    """Poses that a constant twist reaches in unit time (Barfoot 2017, 7.35; Sola 2018, 156).
+    """Return the exponentials of tangents (Barfoot 2017, 7.35; Sola 2018, 156).
 
     Parameters
     ----------
     tangent : ndarray, shape (..., 3) or (..., 6)
-        With a rotation below 2 pi.
+        Rotation below 2 pi.
     """
     d = _dimension(tangent)
     rho, phi = tangent[..., :d], tangent[..., d:]
@@ -102,7 +89,7 @@ def exp(tangent: Array) -> Array:
 
 
 def log(pose: Array) -> Array:
-    """Tangents that :func:`exp` turns into poses, with a rotation of pi at most.
+    """Return the tangents of poses, the inverse of :func:`exp`, with rotations up to pi.
 
     Parameters
     ----------
@@ -115,7 +102,7 @@ def log(pose: Array) -> Array:
 
 
 def adjoint(pose: Array) -> Array:
-    """Adjoints: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45; Sola 2018, 159).
+    """Return the adjoints: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45; Sola 2018, 159).
 
     Returns
     -------
@@ -135,12 +122,12 @@ def adjoint(pose: Array) -> Array:
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
-    """Inverse of the right Jacobian: how log(X) changes as X is moved in its own axes.
+    """Return the inverse right Jacobians: derivative of log(X) by a right perturbation of X.
 
     Parameters
     ----------
     tangent : ndarray, shape (..., 3) or (..., 6)
-        With a rotation below 2 pi.
+        Rotation below 2 pi.
 
     Returns
     -------
@@ -150,7 +137,7 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     commutator_squared = commutator @ commutator
     theta = np.linalg.norm(tangent[..., _dimension(tangent) :], axis=-1)[..., None, None]
     c, slope = _c(theta), 0.5 * _c_slope(theta)
-    # x / (1 - exp(-x)) of it, as ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    # x / (1 - exp(-x)) with x = ad, reduced by ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
@@ -160,7 +147,7 @@ def right_jacobian_inverse(tangent: Array) -> Array:
 
 
 def _commutator(tangent: Array) -> Array:
-    """``ad``: how :func:`adjoint` of ``exp(t tangent)`` grows with t (Barfoot 2017, 7.33)."""
+    """Return ``ad`` of tangents: derivative of ``adjoint(exp(t tangent))`` at t = 0 (Barfoot 2017, 7.33)."""
     if tangent.shape[-1] == 3:
         x, y, theta = np.moveaxis(tangent, -1, 0)
         return from_elements((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
@@ -171,9 +158,7 @@ def _commutator(tangent: Array) -> Array:
 
 
 def chain(steps: Array) -> Array:
-    """Poses along a chain of motions: the products of the first 0, 1, ..., n of them.
-
-    Doubles the length of what is composed, so that log2(n) passes over arrays do.
+    """Compute the products of the first 0, 1, ..., n motions, in log2(n) vectorised steps.
 
     Parameters
     ----------
@@ -192,12 +177,11 @@ def chain(steps: Array) -> Array:
 
 
 def _dimension(values: Array) -> int:
-    """2 or 3, of poses or tangents."""
+    """Return the dimension of poses or tangents: 2 or 3."""
     return 2 if values.shape[-1] == 3 else 3
 
 
 def _rotation_of(pose: Array) -> Rotation:
-    """Rotation of poses in space."""
     return Rotation.from_quat(pose[..., 3:])
 
 
@@ -206,7 +190,7 @@ def _multiply(matrix: Array, vector: Array) -> Array:
 
 
 def _left_jacobian_inverse(phi: Array) -> Array:
-    """Inverse of the matrix by which a turn bends a motion (Barfoot 2017, 7.37)."""
+    """Return the inverse left Jacobians of SO(2) or SO(3) (Barfoot 2017, 7.37)."""
     if phi.shape[-1] == 1:
         skew_matrix = from_elements((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
     else:
@@ -218,14 +202,14 @@ def _left_jacobian_inverse(phi: Array) -> Array:
 
 
 def _c(theta: Array) -> Array:
-    """(1 - theta/2 cot(theta/2)) / theta^2."""
+    """Return (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     exact = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
     return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _C), exact)
 
 
 def _c_slope(theta: Array) -> Array:
-    """Derivative of c by theta, over theta."""
+    """Return the derivative of :func:`_c` by theta, divided by theta."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     g_slope = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     exact = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3

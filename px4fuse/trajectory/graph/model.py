@@ -1,4 +1,4 @@
-"""What a pose graph is, what it costs, and what holds it together."""
+"""Pose graph: poses and relative measurements, with residuals, cost and connectivity."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from px4fuse.display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
-# An information matrix, scaled to a unit diagonal, sees the directions whose eigenvalue is above
+# eigenvalue of an information matrix, scaled to unit diagonal, above which a direction is observed
 MIN_OBSERVED_EIGENVALUE = 1e-9
 FROM_FILE = "the file's vertices"
 FROM_ODOMETRY = "odometry edges composed"
@@ -22,28 +22,27 @@ FROM_CHORDAL = "chordal initialisation"
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Poses, and measurements of one pose as seen from another.
+    """Poses, and measurements of relative poses (edges).
 
     Attributes
     ----------
     dimension : int
         2 or 3.
     ids : ndarray of int, shape (n,)
-        Vertex numbers as in the file, in ascending order where a file gave them.
+        Vertex numbers of the file, in ascending order.
     poses : ndarray, shape (n, 3) or (n, 7)
-        x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space; m and rad, in the world's
-        frame. Quaternions are normalised.
+        x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space; m and rad, in the frame of the
+        graph. Quaternions are normalised.
     first, second : ndarray of int, shape (m,)
-        Indices into ``poses``, not vertex numbers: the measurement is of ``second`` as seen from
-        ``first``.
+        Indices into ``poses``: the pose of ``second`` relative to ``first`` is measured.
     measurements : ndarray, shape (m, 3) or (m, 7)
-        As ``poses``, in the axes of ``first``.
+        Relative poses, in the axes of ``first``.
     information : ndarray, shape (m, 3, 3) or (m, 6, 6)
-        Inverse covariance of the measurement's error in the axes of the measured pose, translation
-        before rotation, in 1/m² and 1/rad². Positive semidefinite: zero along what the measurement
-        does not tell.
+        Inverse covariance of the measurement error in the axes of the measured pose, translation
+        before rotation, in 1/m² and 1/rad². Positive semidefinite: zero in directions that are not
+        measured.
     initialised : str
-        Where the poses come from.
+        Source of the poses.
     """
 
     dimension: int
@@ -61,36 +60,36 @@ class PoseGraph:
         return len(self.ids)
 
     def select_edges(self, chosen: BoolArray) -> PoseGraph:
-        """The graph with some of its edges, shape (m,)."""
+        """Return the graph with the edges of a mask, shape (m,)."""
         edges = ("first", "second", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[chosen] for name in edges})
 
     @property
     def freedom(self) -> int:
-        """Numbers of a tangent: 3 in the plane, 6 in space."""
+        """Length of a tangent: 3 in the plane, 6 in space."""
         return 3 if self.dimension == 2 else 6
 
     @property
     def successive(self) -> BoolArray:
-        """Which edges join two successive poses: odometry, unless the caller knows better."""
+        """Mask of edges between successive poses, which are odometry by default."""
         return np.asarray(np.abs(self.first - self.second) == 1)
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """By how much some poses miss the measurements of a graph.
+    """Residuals of the measurements of a graph at given poses.
 
     Attributes
     ----------
     poses : ndarray, shape (n, 3) or (n, 7)
     relative : ndarray, shape (m, 3) or (m, 7)
-        Second pose of each edge as seen from the first.
+        Second pose of each edge relative to the first.
     residual : ndarray, shape (m, d)
-        ``r = log(Z^-1 X_i^-1 X_j)``, as GTSAM's BetweenFactor has it.
+        ``r = log(Z^-1 X_i^-1 X_j)``, as in GTSAM's BetweenFactor.
     weighted : ndarray, shape (m, d)
         ``Omega r``.
     chi2 : ndarray, shape (m,)
-        ``r' Omega r``: squared, in units of the measurements' own covariance.
+        ``r' Omega r``, the squared Mahalanobis distance.
     """
 
     poses: Array
@@ -101,7 +100,7 @@ class Residuals:
 
 
 def residuals(graph: PoseGraph, poses: Array) -> Residuals:
-    """Residuals of all edges at given poses, shape (n, 3) or (n, 7)."""
+    """Compute the residuals of all edges at given poses, shape (n, 3) or (n, 7)."""
     relative = lie.between(poses[graph.first], poses[graph.second])
     residual = lie.log(lie.between(graph.measurements, relative))
     weighted = (graph.information @ residual[..., None])[..., 0]
@@ -109,15 +108,15 @@ def residuals(graph: PoseGraph, poses: Array) -> Residuals:
 
 
 def cost(graph: PoseGraph) -> float:
-    """Half the sum of the squared residuals, as GTSAM's ``graph.error`` has it."""
+    """Return half of the sum of the squared residuals, as GTSAM's ``graph.error``."""
     return 0.5 * float(np.sum(residuals(graph, graph.poses).chi2))
 
 
 def information_eigenvectors(information: Array) -> tuple[Array, Array]:
-    """Functionals of the residual that an information matrix tells about, and their variances.
+    """Return the directions that an information matrix observes, and their variances.
 
-    Translation and rotation have different units, so the matrix is scaled to a unit diagonal
-    before eigenvalues are called zero.
+    Translation and rotation have different units, so the matrix is scaled to unit diagonal before
+    eigenvalues are compared with zero.
 
     Parameters
     ----------
@@ -137,29 +136,29 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
-    """Roots of the diagonals of matrices, and the matrices divided by them; what is 0 stays 0."""
+    """Return square roots of the diagonals, and the matrices divided by them; zeros stay zero."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
     return scale, matrices * (inverse[..., :, None] * inverse[..., None, :])
 
 
 def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
-    """Refuse a graph that falls into parts.
+    """Raise TrajectoryError if the graph is not connected.
 
     Parameters
     ----------
     used : ndarray of bool, shape (m,)
-        The edges that may hold it together, where they tell anything at all.
+        Edges that may connect poses, if they have information.
     what : str
-        Their name, for the message: "the edges".
+        Name of these edges in the message: "the edges".
 
     Raises
     ------
     TrajectoryError
-        Says how many parts there are and which vertex is apart.
+        With the number of parts and a vertex that is not connected.
     """
     if not len(graph.first):
-        raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
+        raise TrajectoryError("The pose graph has no edges.", "Give a file with EDGE lines.")
     is_informative = used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
     ends, n = (graph.first[is_informative], graph.second[is_informative]), len(graph)
     links = sparse.coo_array((np.ones(len(ends[0])), ends), shape=(n, n))
@@ -167,38 +166,32 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
     if component_count > 1:
         other_vertex = graph.ids[np.flatnonzero(component != component[0])[0]]
         raise TrajectoryError(
-            (
-                f"The pose graph has {component_count} disconnected parts: vertex "
-                f"{other_vertex} is not connected to vertex {graph.ids[0]} by {what}."
-            ),
+            f"The pose graph has {component_count} disconnected parts: vertex "
+            f"{other_vertex} is not connected to vertex {graph.ids[0]} by {what}.",
             "Add an edge between the parts, or optimise them separately.",
         )
 
 
 def compose_odometry(graph: PoseGraph) -> PoseGraph:
-    """The same graph with poses along its odometry, which has no gap, from the first pose on."""
+    """Return the graph with poses composed from its odometry, which must be complete."""
     steps = odometry_steps(graph, odometry_chain(graph))
     poses = lie.compose(graph.poses[:1], lie.chain(steps))
     return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
 
 
 def odometry_chain(graph: PoseGraph, without: IntArray | None = None) -> IntArray:
-    """The edge that leads from each pose to the next, -1 where there is none.
+    """Return the edge from each pose to the next, -1 if missing, shape (n - 1,).
 
     Parameters
     ----------
     without : ndarray of int, optional
-        Edges that may not be used. The first one between two poses is taken.
-
-    Returns
-    -------
-    ndarray of int, shape (n - 1,)
+        Excluded edges. Of several edges between two poses the first is used.
     """
     odometry_edges = np.flatnonzero(graph.successive)
     if without is not None:
         odometry_edges = np.setdiff1d(odometry_edges, without)
     next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
-    # Backwards, so that of several edges the first one is what stays
+    # assign backwards, so that the first of several edges remains
     odometry_edges = odometry_edges[::-1]
     next_edge[np.minimum(graph.first[odometry_edges], graph.second[odometry_edges])] = (
         odometry_edges
@@ -207,16 +200,12 @@ def odometry_chain(graph: PoseGraph, without: IntArray | None = None) -> IntArra
 
 
 def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
-    """Each next pose as seen from the one before, along a chain of edges.
+    """Return the relative poses along a chain of edges, shape (k, 3) or (k, 7).
 
     Parameters
     ----------
     chain : ndarray of int, shape (k,)
         Edges between successive poses, in order.
-
-    Returns
-    -------
-    ndarray, shape (k, 3) or (k, 7)
     """
     steps = graph.measurements[chain].copy()
     is_backward = graph.first[chain] > graph.second[chain]

@@ -1,4 +1,4 @@
-"""Poses that fit a pose graph best, with or without closures that may be false."""
+"""Pose graph optimisation by Levenberg-Marquardt, optionally robust against false closures."""
 
 from __future__ import annotations
 
@@ -18,44 +18,42 @@ from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 from px4fuse.trajectory.graph.system import normal_equations, solve_with
 
 Robust = Literal["none", "dcs", "gnc"]
-# From the squared residuals: the factors on the information, and the cost of each edge
+# function of the squared residuals: weights of the information, and cost of each edge
 Kernel = Callable[[Array], tuple[Array, Array]]
 
 MAX_ITERATIONS = 100
-# GTSAM's LevenbergMarquardtParams
+# defaults of GTSAM's LevenbergMarquardtParams
 _INITIAL_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-5, 10.0, 1e5
 _MIN_FIDELITY = 1e-3
 _TOLERANCE = 1e-10
 _EPSILON = float(np.finfo(float).eps)
-# Stages of graduated non-convexity only lead to the last one
+# looser limits for the intermediate stages of graduated non-convexity
 _STAGE_TOLERANCE, _STAGE_ITERATIONS = 1e-6, 20
 
 DCS_PHI = 1.0  # Agarwal 2013, section IV
-GNC_PROBABILITY = 0.99  # a true closure is within the truncation with this probability
-DROP_PROBABILITY = 0.999  # the gate's
+GNC_PROBABILITY = 0.99  # probability that a true closure is not truncated
+DROP_PROBABILITY = 0.999  # as in the gate
 _GNC_FACTOR = 1.4  # Yang 2020, section V
 _GNC_STAGES = 100
-_MAX_RETRIED_CLOSURES = (
-    20  # dropped closures, those that fit best first; each costs one minimisation
-)
+_MAX_RETRIED_CLOSURES = 20  # dropped closures that are tested again; each needs one minimisation
 _TLS_ROUNDS = 20
 
 
 class GraphSolution(Record, frozen=True, kw_only=True):
-    """One solution of a pose graph.
+    """Solution of a pose graph, for the results.
 
     Attributes
     ----------
     cost_initial : float
-        Half the sum of the squared residuals at the graph's own poses, with all weights 1.
+        Half of the sum of the squared residuals at the initial poses, with all weights 1.
     cost : float
-        Half the sum of the squared residuals times the weights.
+        Half of the weighted sum of the squared residuals.
     iterations : int
         Accepted steps, over all starts and stages.
     converged : bool
-        False where the iterations ran out, or no step could lower the cost before it was flat.
+        False if the iterations were exhausted, or no step lowered a cost that was not yet flat.
     dropped : int
-        Edges of weight below a half.
+        Number of edges with a weight below 0.5.
     """
 
     cost_initial: NotNegative
@@ -66,14 +64,14 @@ class GraphSolution(Record, frozen=True, kw_only=True):
 
 
 class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
-    """Result of an optimisation.
+    """Solution of a pose graph, with poses and weights.
 
     Attributes
     ----------
     poses : ndarray, shape (n, 3) or (n, 7)
-        As in the graph; the first one as it was.
+        The first pose is unchanged.
     weights : ndarray, shape (m,)
-        Factors on each edge's information, from 0 (set aside) to 1.
+        Factors on the information of each edge, from 0 (ignored) to 1.
     """
 
     schema_type = GraphSolution
@@ -85,7 +83,7 @@ class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
 
 @dataclass(frozen=True)
 class _Descent:
-    """Where a minimisation ended."""
+    """Result of a minimisation."""
 
     state: Residuals
     cost: float
@@ -99,40 +97,39 @@ def solve(
     robust: Robust = "none",
     loops: BoolArray | None = None,
 ) -> Solution:
-    """Poses of least cost, by Levenberg and Marquardt's method with GTSAM's schedule.
+    """Optimise the poses by Levenberg-Marquardt, with the schedule of GTSAM.
 
-    The first pose is held. Steps, damping (of the identity, from 1e-5, by factors of 10) and the
-    test of a step follow GTSAM's LevenbergMarquardtOptimizer, so that both go from the same start
-    into the same minimum; the tolerances are 1e-10, relative and absolute.
+    The first pose is fixed. Steps, damping (identity, from 1e-5, by factors of 10) and acceptance
+    of steps are those of GTSAM's LevenbergMarquardtOptimizer, so both reach the same minimum from
+    the same start. The tolerances are 1e-10, relative and absolute.
 
     ``dcs`` multiplies the information of closures by s², s = min(1, 2 Phi / (Phi + chi²)), Phi = 1
-    (Agarwal et al. 2013, Robust map optimization using dynamic covariance scaling, eq. 15): an
-    M-estimator (MacTavish and Barfoot 2015, At all costs) with many minima. It starts from the
-    solution of ``gnc``: where odometry drifts, true closures too begin with a large chi² and are
-    lost from the given poses or from the least-squares solution. The lowest of its minima is no
-    better a choice: with Phi = 1 a closure that is dropped costs 1.5 at most, and a true one of 3
-    degrees of freedom costs 1.5 on average.
+    (Agarwal et al. 2013, Robust map optimization using dynamic covariance scaling, eq. 15). This is
+    an M-estimator with many minima (MacTavish and Barfoot 2015, At all costs). It starts from the
+    solution of ``gnc``: with drifting odometry true closures have a large initial chi², and would
+    be lost from the initial poses or from the least-squares solution. Taking the lowest minimum is
+    not better: with Phi = 1 a dropped closure costs at most 1.5, and a true one with 3 degrees of
+    freedom costs 1.5 on average.
 
-    ``gnc`` minimises least squares truncated at the 99 % point of chi-square, with as many degrees
-    of freedom as the closure's information has rank, by graduated non-convexity (Yang et al. 2020,
-    eq. 13 and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage), from the
-    least-squares solution and from the given poses. Of the two results that of lower cost is taken,
-    with every dropped closure counted at its 99.9 % point: one is given up for no less than what
-    the gate refuses. Up to 20 dropped ones are then put back one by one, and stay where that lowers
-    this cost. Final weights are 0 or 1.
+    ``gnc`` minimises least squares truncated at the 99 % point of chi-square, with the rank of the
+    closure's information as degrees of freedom, by graduated non-convexity (Yang et al. 2020, eq.
+    13 and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage). It starts
+    from the least-squares solution and from the initial poses, and takes the result with the lower
+    cost. A dropped closure costs its 99.9 % point, the limit of the gate. Then up to 20 dropped
+    closures are restored one by one if that lowers this cost. Final weights are 0 or 1.
 
     Parameters
     ----------
     robust : {"none", "dcs", "gnc"}
     loops : ndarray of bool, shape (m,), optional
-        Edges that may be false; all others keep the weight 1. By default those that do not join
+        Edges that may be false; all others have weight 1. By default the edges that do not join
         successive poses.
 
     Raises
     ------
     TrajectoryError
-        If the graph has no edges, falls into parts, has a number that is not finite, or if ``gnc``
-        sets aside every edge to some of its poses.
+        The graph has no edges, is not connected, contains a number that is not finite, or ``gnc``
+        drops all edges to some poses.
     """
     model.require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
     is_doubtful = ~graph.successive if loops is None else loops
@@ -140,7 +137,7 @@ def solve(
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
-            ("The pose graph contains a pose or measurement that is not finite or too large."),
+            "The pose graph contains a pose or measurement that is not finite or too large.",
             "Correct it, or remove the edge.",
         )
     plain_descent = _minimise(graph, start, _least_squares_kernel(np.ones(len(is_doubtful))))
@@ -173,12 +170,12 @@ def _minimise(
     tolerance: float = _TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Descent:
-    """Walk down from some poses, as GTSAM's LevenbergMarquardtOptimizer does."""
+    """Minimise the cost from given poses, as GTSAM's LevenbergMarquardtOptimizer."""
     damping, iterations = _INITIAL_DAMPING, 0
     weights, costs = kernel(state.chi2)
     cost = float(np.sum(costs))
     while iterations < max_iterations and cost > _TOLERANCE:
-        # d r / d x_j = J, d r / d x_i = -J A with A the adjoint of x_j's view of x_i
+        # d r / d x_j = J, d r / d x_i = -J A, with A the adjoint of x_i relative to x_j
         jacobian = lie.right_jacobian_inverse(state.residual)
         first_jacobian = jacobian @ lie.adjoint(lie.inverse(state.relative))
         matrix, gradient = normal_equations(
@@ -192,7 +189,7 @@ def _minimise(
             drop, predicted_drop, is_flat = 0.0, 0.0, False
             step = solve_with(matrix, gradient, damping)
             if step is not None:
-                # how much it lowers the linearised cost
+                # decrease of the linearised cost
                 predicted_drop = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 tangent = np.concatenate([np.zeros(graph.freedom), step[:, 0]])
                 motion = lie.exp(tangent.reshape(len(graph), -1))
@@ -219,7 +216,7 @@ def _least_squares_kernel(weights: Array) -> Kernel:
 
 
 def _dcs_kernel(is_doubtful: BoolArray) -> Kernel:
-    """Dynamic covariance scaling of the doubtful edges."""
+    """Return the kernel of dynamic covariance scaling for the doubtful edges."""
 
     def kernel(chi2_: Array) -> tuple[Array, Array]:
         is_beyond = is_doubtful & (chi2_ > DCS_PHI)
@@ -232,7 +229,7 @@ def _dcs_kernel(is_doubtful: BoolArray) -> Kernel:
 def _solve_gnc(
     graph: PoseGraph, start: Residuals, plain_descent: _Descent, is_doubtful: BoolArray
 ) -> tuple[_Descent, Array]:
-    """Truncated least squares over the doubtful edges, from two starts."""
+    """Solve truncated least squares over the doubtful edges, from two starts."""
     _, scaled = model.scale_to_unit_diagonal(graph.information)
     freedom = np.sum(np.linalg.eigvalsh(scaled) > model.MIN_OBSERVED_EIGENVALUE, axis=1)
     bound = np.full(len(is_doubtful), np.inf)
@@ -258,19 +255,19 @@ def _solve_gnc(
         iteration_count += trial.iterations
         if (cost := truncated_cost(trial.state, trial_weights)) < lowest:
             lowest, descent, weights = cost, trial, trial_weights
-    model.require_connected(graph, weights > 0.0, "the edges that gnc did not set aside")
+    model.require_connected(graph, weights > 0.0, "the edges that gnc did not drop")
     return _Descent(descent.state, descent.cost, iteration_count, descent.converged), weights
 
 
 def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Descent, Array]:
-    """One descent of graduated non-convexity (Yang 2020, algorithm 1, eq. 13 and 14)."""
+    """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     state, iteration_count = start, 0
-    # Infinite bounds are edges that are not doubted
+    # edges with an infinite bound are not doubtful
     excess = 2.0 * state.chi2 / bound - 1.0
     if np.max(excess) > 0.0:
         control = 1.0 / float(np.max(excess))
         for _ in range(_GNC_STAGES):
-            ratio = np.maximum(state.chi2 / bound, 1e-200)  # where the weight is 1 anyway
+            ratio = np.maximum(state.chi2 / bound, 1e-200)  # lower limit; the weight is 1 there
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
             stage = _minimise(
                 graph, state, _least_squares_kernel(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS
@@ -283,7 +280,7 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
     for _ in range(_TLS_ROUNDS):
         descent = _minimise(graph, state, _least_squares_kernel(weights))
         state, iteration_count = descent.state, iteration_count + descent.iterations
-        # Lowers the truncated cost every time, so it ends
+        # each round lowers the truncated cost, so the loop ends
         new_weights = (state.chi2 <= bound).astype(float)
         if np.array_equal(new_weights, weights):
             break

@@ -1,4 +1,4 @@
-"""Linear least squares over the poses of a graph: sparse normal equations, and their solution."""
+"""Sparse normal equations of linear least squares over the poses of a graph."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from scipy.sparse.linalg import splu
 from px4fuse.arrays import Array
 from px4fuse.trajectory.graph.model import PoseGraph
 
-# scipy's SuperLU writes past its work space where these exceed its own defaults (10 and 20, found
-# with valgrind on scipy 1.17); single columns as relaxed supernodes also fill in least
+# relax and panel_size of scipy's SuperLU: values above its defaults (10 and 20) write past its work
+# space (found with valgrind on scipy 1.17); relax 1 gives the least fill-in
 _RELAX, _PANEL = 1, 4
 Matrix = sparse.csc_array[np.float64]
 
@@ -23,13 +23,13 @@ def normal_equations(
     value: Array,
     first_value: Array | float = 0.0,
 ) -> tuple[Matrix, Array]:
-    """Normal equations of ``A x_i + B x_j = value`` for every edge; x of the first pose is held.
+    """Return the normal equations of ``A x_i + B x_j = value`` for all edges; the first x is fixed.
 
     Parameters
     ----------
     graph : PoseGraph
     of_first, of_second, information : ndarray, shape (m, d, d)
-        A, B, and how much the parts of each equation count.
+        A, B, and the weight of each equation.
     value : ndarray, shape (m, d, k)
     first_value : ndarray, shape (d, k), or 0
 
@@ -53,11 +53,11 @@ def normal_equations(
 
 
 def solve_with(matrix: Matrix, right: Array, damping: float = 0.0) -> Array | None:
-    """Solve normal equations, with something added to their diagonal; None where singular."""
+    """Solve normal equations with damping on the diagonal; None if singular."""
     try:
         factors = splu(
             matrix + damping * sparse.eye_array(matrix.shape[0], format="csc"),
-            # on the graphs of the benchmark it fills in 1.1 to 1.9 times less than COLAMD
+            # 1.1 to 1.9 times less fill-in than COLAMD on the graphs of the benchmark
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
             relax=_RELAX,
