@@ -110,9 +110,8 @@ def test_a_remedy_of_our_filter_that_the_truth_contradicts_is_not_given() -> Non
     blind = replace(comparison, axes=axes)
     typed = "px4fuse compare LOG --sigma-z 0.2."
     assert remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=0.1) == typed
-    assert remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1).startswith(
-        "Leave"
-    )
+    unconfirmed = remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1)
+    assert unconfirmed.startswith("No change advised")
 
 
 # ---------------------------------------------------------------- of EKF2
@@ -189,9 +188,9 @@ def test_confirmed_refused_and_not_replayed(sample: Analysis) -> None:
     model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(sample, ekf2_model=replace(model, agreement=agreement))
-    assert "Not replayed: the model does not reproduce what EKF2 logged: they part." in words(
-        doubtful, EKF2_EVP_NOISE=0.2
-    )
+    said = words(doubtful, EKF2_EVP_NOISE=0.2)
+    assert "Not replayed: " in said
+    assert said.endswith("they part.")
 
 
 def test_what_the_data_ask_for(sample: Analysis) -> None:
@@ -238,7 +237,7 @@ def only(name: str, analysis: Analysis) -> Finding:
 def test_a_delay_that_the_replay_refutes_is_not_proposed(sample: Analysis) -> None:
     """The stamps of the sample are right; a clock estimate that says otherwise is refuted."""
     finding = only("ekf2_ev_delay_wrong", offset(sample, -0.15))
-    assert finding.remedy.startswith("Correct the stamps at the sender: EKF2_EV_DELAY 150 is no")
+    assert "EKF2_EV_DELAY 150 does not help" in finding.remedy
     # neither is ours, which the truth refutes as well
     found = [finding.id for finding in source_clock.detect(offset(sample, -0.15))]
     assert found == ["ekf2_ev_delay_wrong"]
