@@ -1,4 +1,4 @@
-"""Inputs: regular files within a limit, and one line for everything else."""
+"""Reading of inputs: regular files up to a size limit; one error line for all others."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ posix = pytest.mark.skipif(os.name == "nt", reason="devices, pipes and sockets a
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Files of every kind, and things that are no regular files; they are only read."""
+    """Files of each kind, a sparse file, a pipe, a device and a socket; tests only read them."""
     folder = tmp_path_factory.mktemp("desk")
     shutil.copy(SAMPLES / "aisle_uwb.ulg", folder / "l.ulg")
     shutil.copy(SAMPLES / "loop_slam.tum", folder / "s.tum")
@@ -40,13 +40,13 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (folder / "zero").symlink_to("/dev/zero")
     with socket.socket(socket.AF_UNIX) as listening:
         here = Path.cwd()
-        os.chdir(folder)  # the name of a socket may not be long
+        os.chdir(folder)  # the path of a socket has a maximum length
         listening.bind("socket")
         os.chdir(here)
         yield folder
 
 
-# What reads a file: commands with {} for the file, of which two welcome a folder of logs there
+# Commands that read a file ({}); OF_FOLDERS accept a folder of logs, too
 OF_FOLDERS = "verify r.pdf {}", "grade r.pdf --logs {} -o out"
 OF_FILES = (
     "info {}", "compare {} -o out/c.pdf", "tune {}", "sync {}", "extract {} -o out", "loop {}",
@@ -60,7 +60,7 @@ READERS = OF_FILES + OF_FOLDERS
 
 
 def refusal(monkeypatch, capsys, desk: Path, command: str) -> str:
-    """What a command says on one line, soon and without writing anything."""
+    """Return the error of a command; assert one line, no other output, and no long wait."""
     monkeypatch.chdir(desk)
     before = sorted(desk.iterdir())
     with patience():
@@ -77,31 +77,31 @@ def refusal(monkeypatch, capsys, desk: Path, command: str) -> str:
 @pytest.mark.parametrize("command", READERS)
 def test_read_special_file_is_refused(desk, monkeypatch, capsys, command, what) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format(what))
-    assert f"{what}: not a regular file" in err
+    assert f"{what} is not a regular file" in err
 
 
 @pytest.mark.parametrize("command", READERS)
 def test_read_10_gb_file_is_refused_without_reading(desk, monkeypatch, capsys, command) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format("sparse"))
-    assert "sparse: 10,000 MB, more than the limit of " in err
+    assert "sparse: the file has 10,000 MB; the limit is " in err
 
 
 @posix
 def test_files_by_sha256_ignores_special_and_huge_files(desk, monkeypatch, capsys):
     found = []
 
-    def believed(work, reports, **_):
+    def verify_nothing(work, reports, **_):
         (report,) = reports
         found.append(work.keywords["logs"][log_sha256(report)])
         yield 0, Verdict("verified", (), with_log=True, page_status="same")
 
-    monkeypatch.setattr(workers, "run_bounded", believed)
+    monkeypatch.setattr(workers, "run_bounded", verify_nothing)
     monkeypatch.chdir(desk)
     with patience():
         code, out, err = run_main(monkeypatch, capsys, "verify", "r.pdf", ".")
     assert (code, err) == (0, "")
     assert "r.pdf: verified" in out
-    assert found == [Path("l.ulg")]  # the log beside them
+    assert found == [Path("l.ulg")]
 
 
 # --- the limit, and its option ---
@@ -112,7 +112,7 @@ def test_max_size_applies_to_one_command(desk, monkeypatch, capsys) -> None:
     assert 1_000_000 < (desk / "l.ulg").stat().st_size < 10_000_000
     before = max_log_bytes.get()
     err = refusal(monkeypatch, capsys, desk, "info l.ulg --max-size 1")
-    assert "MB, more than the limit of 1.00 MB" in err
+    assert "MB; the limit is 1.00 MB" in err
     assert "--max-size MB" in err
     assert max_log_bytes.get() == before
     assert run_main(monkeypatch, capsys, "info", "l.ulg", "--max-size", "10")[0] == 0
@@ -122,7 +122,7 @@ def test_read_file_at_limit_is_read_completely(tmp_path) -> None:
     path = tmp_path / "x"
     path.write_bytes(b"x" * 100)
     assert len(read_bytes_limited(path, LogError, 100)) == 100
-    with pytest.raises(LogError, match=r"x: 0\.00 MB, more than the limit"):
+    with pytest.raises(LogError, match=r"x: the file has 0\.00 MB; the limit"):
         read_bytes_limited(path, LogError, 99)
 
 
@@ -130,7 +130,7 @@ def test_read_file_at_limit_is_read_completely(tmp_path) -> None:
 def test_read_file_of_size_0_stops_at_limit() -> None:
     path = Path("/proc/kallsyms")
     assert path.stat().st_size == 0
-    with pytest.raises(LogError, match="more than the limit"):
+    with pytest.raises(LogError, match="the limit is"):
         read_bytes_limited(path, LogError, 1000)
 
 
@@ -140,7 +140,7 @@ def test_read_text_accepts_utf8_and_utf16(tmp_path, encoding) -> None:
     path.write_bytes("σ = 1\n".encode(encoding))
     assert read_text(path, LogError, 100) == "σ = 1\n"
     path.write_bytes(b"ab\xff")
-    with pytest.raises(LogError, match=r"t: not a text file in UTF-8 \(byte 2\)"):
+    with pytest.raises(LogError, match=r"t is not a UTF-8 text file \(byte 2\)"):
         read_text(path, LogError, 100)
 
 
@@ -165,7 +165,7 @@ def test_read_error_name_with_line_feed_is_one_line(tmp_path, desk, monkeypatch,
 @pytest.mark.parametrize("path", ["folder", ".", "..", "/"])
 def test_read_folder_is_refused_with_its_name(desk, monkeypatch, capsys, command, path) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format(path))
-    assert f"{path}: is a folder. Give a file." in err
+    assert f"{path} is a folder. Give a file." in err
 
 
 def test_errors_are_printed_on_one_line() -> None:

@@ -1,4 +1,4 @@
-"""Records are facts: nothing is changed in one once it is made."""
+"""All record types of the package are immutable."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pytest
 
 import px4fuse
 
-# Buffers that are filled while something is read, written, replayed or compared
-FILLED = {"Packer", "_Fusion", "_Walk"}
+# Mutable buffers, which are filled while reading, writing or replaying
+BUFFERS = {"Packer", "_Fusion", "_Walk"}
 
 
 def classes() -> Iterator[type]:
-    """Every record type of the package."""
+    """Yield every class of the package."""
     for module in walk_packages(px4fuse.__path__, "px4fuse."):
         if module.name.endswith("__main__"):
             continue
@@ -26,16 +26,16 @@ def classes() -> Iterator[type]:
                 yield value
 
 
-RECORDS = [one for one in classes() if dataclasses.is_dataclass(one)]
-STRUCTS = [one for one in classes() if issubclass(one, msgspec.Struct)]
+RECORDS = [kind for kind in classes() if dataclasses.is_dataclass(kind)]
+STRUCTS = [kind for kind in classes() if issubclass(kind, msgspec.Struct)]
 
 
 def test_records_of_package_are_frozen() -> None:
     assert len(RECORDS) > 50
     assert len(STRUCTS) > 50
-    thawed = {one.__name__ for one in RECORDS if not one.__dataclass_params__.frozen}  # type: ignore[attr-defined]
-    thawed |= {one.__name__ for one in STRUCTS if not one.__struct_config__.frozen}
-    assert thawed == FILLED
+    mutable = {kind.__name__ for kind in RECORDS if not kind.__dataclass_params__.frozen}  # type: ignore[attr-defined]
+    mutable |= {kind.__name__ for kind in STRUCTS if not kind.__struct_config__.frozen}
+    assert mutable == BUFFERS
 
 
 def test_settings_assignment_raises() -> None:

@@ -1,4 +1,4 @@
-"""What is typed or handed in wrongly: one line that says what to do, and nothing written."""
+"""Invalid input of all commands: one line with an action on standard error, and no output."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def straight(step_m: float) -> bytes:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
-    """Flights, positions, a trajectory, a pose graph, and everything that is none of these."""
+    """Valid and invalid logs, position files, trajectories, pose graphs and reports."""
     folder = tmp_path_factory.mktemp("desk")
     binary = np.random.default_rng(0).bytes(5000)
     for name, content in {
@@ -61,15 +61,15 @@ def desk(tmp_path_factory):
     return folder
 
 
-# Command and a part of what it must say
+# Command, and a part of its error message
 REFUSED = {
     # settings
     "no noise": ("compare a.ulg --sigma-a 0", "--sigma-a 0 is out of range"),
     "noise of NaN": ("compare a.ulg --sigma-z nan", "--sigma-z"),
     "endless offset": ("compare a.ulg --clock-offset inf", "--clock-offset"),
     "heading of NaN": ("compare a.ulg --heading nan", "--heading"),
-    "beyond the flight": ("compare a.ulg --start 500", "empty"),
-    "end before start": ("compare a.ulg --start 50 --end 40", "empty"),
+    "beyond the flight": ("compare a.ulg --start 500", "no positions between 500 s and"),
+    "end before start": ("compare a.ulg --start 50 --end 40", "no positions between 50 s and 40 s"),
     "no such source": ("compare a.ulg --position-source nonsense", "no such source"),
     "notes that nest": (
         "compare a.ulg --notes deep.md",
@@ -80,41 +80,61 @@ REFUSED = {
     "a file as a folder": ("compare a.ulg -o n.md/r.pdf", "n.md"),
     "no such axis": ("compare a.ulg --axis up", "up"),
     "no such option": ("compare a.ulg --no-such-option", "--no-such-option"),
-    "auto at constant speed": ("compare straight.ulg --clock-offset auto", "not determinable: "),
+    "auto at constant speed": (
+        "compare straight.ulg --clock-offset auto",
+        "--clock-offset SECONDS",
+    ),
     # slips, and what to type instead
     "slip of a command": ("comapre x.ulg", "Did you mean 'compare'?"),
     "no command": ("l.ulg --dt 0.2", "px4fuse compare l.ulg --dt 0.2"),
     "slip of an option": ("compare l.ulg --sigmaz 1", "--sigma-z"),
-    "metres with a unit": ("compare l.ulg --sigma-z 10cm", "give metres, as 0.1"),
-    "seconds with a unit": ("tune l.ulg --start 20s", "give seconds, as 20"),
-    "offset with a unit": ("sync l.ulg --clock-offset -120ms", "seconds, as -0.12, or auto"),
+    "metres with a unit": (
+        "compare l.ulg --sigma-z 10cm",
+        "not a number in metres. Give for example 0.1.",
+    ),
+    "seconds with a unit": (
+        "tune l.ulg --start 20s",
+        "not a number in seconds. Give for example 20.",
+    ),
+    "offset with a unit": ("sync l.ulg --clock-offset -120ms", "Give for example -0.12, or auto."),
     "negative heading": ("compare l.ulg --heading -30", "not between 0 and 360"),
-    "heading of words": ("compare l.ulg --heading north", "give degrees, as 30"),
+    "heading of words": (
+        "compare l.ulg --heading north",
+        "not a number in degrees. Give for example 30.",
+    ),
     "heading of a simulation": ("simulate -o s.ulg --heading 361", "--heading 361 is out of range"),
-    "speed with a unit": ("simulate -o s.ulg --speed 3.6km/h", "give metres per second, as 1"),
-    "drift with a unit": ("loop l.ulg --drift '1 m'", "give metres, as 1"),
-    "delay with a unit": ("whatif l.ulg --set EKF2_EV_DELAY=0.1s", "give milliseconds, as 100"),
+    "speed with a unit": (
+        "simulate -o s.ulg --speed 3.6km/h",
+        "not a number in metres per second.",
+    ),
+    "drift with a unit": (
+        "loop l.ulg --drift '1 m'",
+        "not a number in metres. Give for example 1.",
+    ),
+    "delay with a unit": ("whatif l.ulg --set EKF2_EV_DELAY=0.1s", "in milliseconds. Give 100."),
     "system of a ULog": ("compare a.ulg --system 1", "--system is for MAVLink"),
-    "a ULog as MAVLink": ("compare a.ulg --mavlink a.ulg", "--mavlink a.ulg: this is a ULog"),
-    "itself again": ("compare a.tlog --mavlink a.tlog", "the same recording twice"),
+    "a ULog as MAVLink": ("compare a.ulg --mavlink a.ulg", "--mavlink a.ulg is a ULog"),
+    "itself again": ("compare a.tlog --mavlink a.tlog", "is the same recording as LOG"),
     "far time offset": ("evaluate l.ulg:vio s.tum --time-offset 9e5", "give --time-offset auto"),
     "loop of no drift": ("loop l.ulg --drift 0", "--drift 0 is outside"),
-    # simulations, pages, and what nothing comes of
-    "simulation as PDF": ("simulate -o flight.pdf", "ends in .ulg"),
-    "log and answer": ("simulate -o x.ulg --answer x.ulg", "name the same file"),
+    # simulations, pages and invalid logs
+    "simulation as PDF": ("simulate -o flight.pdf", "ending in .ulg"),
+    "log and answer": ("simulate -o x.ulg --answer x.ulg", "the same file name"),
     "page of nothing": ("explore missing.ulg", "missing.ulg"),
-    "page as PDF": ("explore a.ulg -o page.pdf", "ends in .html"),
+    "page as PDF": ("explore a.ulg -o page.pdf", "ending in .html"),
+    "page of three": ("explore a.ulg a.ulg a.ulg", "unexpected extra argument"),
+    "page of two and more": ("explore a.ulg a.ulg --mavlink a.tlog", "unexpected extra argument"),
     "too long a name": (f"info a.ulg --json {'x' * 300}.json", "File name too long"),
     "no name": ("extract a.ulg -o ''", "the name is empty"),
     "no name of a log": ("batch '' -o out", "the name of a log is empty"),
     **{
-        f"{name} by {command}": (f"{command} {name}.ulg", f"px4fuse: {name}.ulg: ")
+        f"{name} by {command}": (f"{command} {name}.ulg", f"px4fuse: {name}.ulg")
         for name in ("missing", "empty", "bad")
         for command in ("compare", "info", "extract -o tables", "tune", "sync")
     },
     # practice, verify and whatif
     "no such level": ("practice --level 4", "4 is not in the range"),
-    "practice as PDF": ("practice -o a.pdf", "ends in .html"),
+    "practice as PDF": ("practice -o a.pdf", "ending in .html"),
     "practice of nothing": ("practice --flights 0", "0 is not in the range"),
     "practice by no seed": ("practice --seed -1", "-1 is not in the range"),
     "verify nothing": ("verify none.pdf", "none.pdf"),
@@ -124,21 +144,21 @@ REFUSED = {
         f"what if {typed}": (f"whatif missing.ulg {typed}", said)  # before the log is read
         for typed, said in (
             ("--set EKF2_BARO_DELAY=1", ", ".join(PARAMETERS)),
-            ("--set EKF2_EVP_NOISE", "give NAME=VALUE"),
+            ("--set EKF2_EVP_NOISE", "is not NAME=VALUE"),
             ("--set EKF2_EVP_NOISE=much", "'much' is not a number"),
             ("--set EKF2_EVP_NOISE=nan", "outside PX4's range"),
             ("--set EKF2_EVP_GATE=3 --set EKF2_EVP_GATE=4", "given twice"),
-            ("--sweep EKF2_EVP_NOISE=0.1", "give NAME=LOW:HIGH"),
+            ("--sweep EKF2_EVP_NOISE=0.1", "Use NAME=LOW:HIGH"),
             ("--sweep EKF2_EVP_NOISE=0.2:0.1", "the first value must be the smaller one"),
             ("--sweep EKF2_EVP_NOISE=0.1:0.2:1", "not between 2 and 200"),
             ("--set EKF2_EVP_NOISE=0.1 --sweep EKF2_EVP_NOISE=0.1:0.2", "set and swept"),
-            ("--from 60", "--from says when --without begins"),
+            ("--from 60", "--from requires --without AID"),
         )
     },
     # batch and grade
-    "batch of nothing": ("batch empty -o o", "no logs there"),
-    "batch of what is missing": ("batch none.ulg -o o", "no logs there"),
-    "batch of a pattern": ("batch x*.ulg -o o", "no logs there"),
+    "batch of nothing": ("batch empty -o o", "no logs found"),
+    "batch of what is missing": ("batch none.ulg -o o", "no logs found"),
+    "batch of a pattern": ("batch x*.ulg -o o", "no logs found"),
     "batch without logs": ("batch -o o", "no logs"),
     "batch to nowhere": ("batch a.ulg", "-o"),
     "batch into a file": ("batch a.ulg -o n.md", "is not a folder"),
@@ -147,9 +167,9 @@ REFUSED = {
     "memory of words": ("batch a.ulg -o o --memory lots", "--memory"),
     "batch from a bucket": ("batch s3://bucket/logs -o o", 'pip install "s3fs"'),
     "batch from nonsense": ("batch nonsense://x -o o", "nonsense"),
-    "nothing to grade": ("grade", "nothing to grade"),
-    "grade to nowhere": ("grade in", "say with -o"),
-    "grade into what is graded": ("grade in -o in/out", "lies inside"),
+    "nothing to grade": ("grade", "no submissions were given"),
+    "grade to nowhere": ("grade in", "requires an output folder"),
+    "grade into what is graded": ("grade in -o in/out", "is inside the input in"),
     "grade into a report": ("grade in -o in/a.pdf", "is not a folder"),
     "no rubric": ("grade in -o out --rubric missing.toml", "missing.toml"),
     "no key": ("grade in -o out --key missing.json", "missing.json"),
@@ -164,7 +184,7 @@ REFUSED = {
         for name, typed, said in (
             ("short secret", "--secret-file abc.txt", "can be guessed"),
             ("no secret file", "--secret-file none", "cannot be read"),
-            ("seed of a class", "--seed 3", "--seed is for a single flight"),
+            ("seed of a class", "--seed 3", "--seed is not available with --assignment"),
             ("too many for a loop", "--kind mixed --mistakes 2", "0 to 1"),
             ("preview without a secret", "--preview", "requires --secret-file"),
             ("key inside", "--answer f/k.json", "students' folder"),
@@ -177,11 +197,11 @@ REFUSED = {
     "PDF": ("loop f.pdf", "f.pdf: a PDF, not a flight log"),
     "times that go back": ("loop nonmono.tum", "nonmono.tum, line 102"),
     "not a number": ("loop nan.tum -o f.pdf", "nan.tum, line 51"),
-    "no motion": ("loop still.tum", "still.tum: the path is 0.00 m long"),
-    "closure outside": ("loop s.tum --closure 10,5000", "within the path"),
+    "no motion": ("loop still.tum", "still.tum: the path is only 0.00 m long"),
+    "closure outside": ("loop s.tum --closure 10,5000", "on the path"),
     "closure of one time": ("loop s.tum --closure 10", "'10' is not T1,T2"),
     "closure of four": ("loop s.tum --closure 1,2,3,4", "is not T1,T2"),
-    "closure backwards": ("loop s.tum --closure 50,10", "within the path"),
+    "closure backwards": ("loop s.tum --closure 50,10", "on the path"),
     "closure of no width": ("loop s.tum --closure 10,50,0", "SIGMA 0 is outside"),
     "closure of NaN": ("loop s.tum --closure 1,nan", "is not T1,T2"),
     "landing of words": ("loop s.tum --landed-at junk", "'junk' is not FORWARD,RIGHT"),
@@ -189,27 +209,30 @@ REFUSED = {
     "landing, and open": ("loop s.tum --landed-at 1,2 --open", "exclude each other"),
     "open, and nothing to correct": ("loop s.tum --open --tum o.tum", "no corrected path"),
     "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
-    "no such part": ("loop l.ulg:slam", "'slam' is not a part of a flight"),
-    "part of a trajectory": ("loop s.tum:vio", "s.tum: a trajectory file has no part 'vio'"),
-    "frame of a flight": ("loop l.ulg --frame enu", "--frame enu is for trajectory files"),
-    "no PDF": ("loop s.tum -o r.txt", "r.txt: the report is a PDF"),
-    "path and graph": ("loop s.tum --tum x --g2o x", "two outputs name the same file"),
-    "path to standard output": ("loop s.tum --tum -", "only --json can print"),
-    "reference a graph": ("loop s.tum --reference g.g2o", "g.g2o: a pose graph, not a trajectory"),
+    "no such part": ("loop l.ulg:slam", "'slam' is not a track of a flight"),
+    "part of a trajectory": ("loop s.tum:vio", "s.tum is a trajectory file and has no track 'vio'"),
+    "frame of a flight": ("loop l.ulg --frame enu", "--frame enu is only for trajectory files"),
+    "no PDF": ("loop s.tum -o r.txt", "r.txt: the output is a PDF"),
+    "path and graph": ("loop s.tum --tum x --g2o x", "two outputs have the same file name"),
+    "path to standard output": ("loop s.tum --tum -", "only --json can write to standard output"),
+    "reference a graph": (
+        "loop s.tum --reference g.g2o",
+        "g.g2o is a pose graph, not a trajectory",
+    ),
     "graph with a bad edge": ("loop bad.g2o", "bad.g2o, line 2"),
-    "part of a graph": ("loop g.g2o:vio", "a pose graph has no part 'vio'"),
-    "report of a graph": ("loop g.g2o -o r.pdf", "not for a pose graph"),
-    "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: not a PX4 ULog"),
+    "part of a graph": ("loop g.g2o:vio", "a pose graph has no track 'vio'"),
+    "report of a graph": ("loop g.g2o -o r.pdf", "not available for a pose graph"),
+    "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin is neither a PX4 ULog"),
     "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "no poses match in time"),
     "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
-    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "give seconds, as 0.1, or auto"),
+    "offset of words": ("evaluate s.tum s.tum --time-offset abc", "Give for example 0.1, or auto."),
     "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
     "RPE over half a frame": ("evaluate s.tum s.tum --rpe 1.5f", "frames come whole"),
     "RPE over too many": (f"evaluate s.tum s.tum --rpe {'9' * 26}f", "is not a distance"),
-    "page as text": ("evaluate s.tum s.tum -o page.txt", "ends in .pdf"),
+    "page as text": ("evaluate s.tum s.tum -o page.txt", "ending in .pdf"),
 }
 
-# What a command reads, it does not write over
+# Commands with an input as output, by how the output names the input
 SPARED = {
     "path": "loop s.tum --tum s.tum",
     "results by soft link of a part": "loop l.ulg:vio --json soft.json",
@@ -245,16 +268,16 @@ def test_commands_invalid_input_print_one_line_and_write_nothing(
     assert err.startswith("px4fuse: ")
     assert len(err.splitlines()) == 1
     assert said in err
-    assert "`" not in err  # options, not the arguments of Python
-    assert "1.79525e+09" not in err  # times can be told apart
+    assert "`" not in err  # options instead of arguments in backticks
+    assert "1.79525e+09" not in err  # UNIX times have all digits
     assert contents(desk) == before
 
 
 def test_estimates_without_result_exit_with_2(desk, monkeypatch, capsys):
     monkeypatch.chdir(desk)
     for command, said in (
-        ("tune a.ulg --start 126", "no noise could be determined"),
-        ("sync a.ulg --end 3", "no clock offset could be determined"),
+        ("tune a.ulg --start 126", "SIGMA_A and SIGMA_Z cannot be estimated"),
+        ("sync a.ulg --end 3", "the time offset cannot be estimated"),
     ):
         code, _, err = run_main(monkeypatch, capsys, *command.split())
         assert (code, len(err.splitlines()), said in err) == (2, 1, True), err

@@ -1,4 +1,4 @@
-"""The results contract: all that is written is read back; strangers' results are read strictly."""
+"""Contract of the results: written results are read back; untrusted results are checked."""
 
 import json
 import math
@@ -33,7 +33,7 @@ SCHEMA = schema()
 
 
 def assert_valid(text: str) -> None:
-    """Valid under the schema, and the same after it was read back."""
+    """Assert that the text is valid under the schema and unchanged after reading."""
     jsonschema.Draft202012Validator(SCHEMA).validate(json.loads(text))
     assert to_json(read_results(text.encode())) == text
 
@@ -64,15 +64,15 @@ def test_schema_accepts_results_only(one):
     ],
     ids=lambda options: next(iter(options)),
 )
-def test_results_of_every_command_validate_and_render(sample_flight, options):
+def test_results_of_other_settings_validate_and_render(sample_flight, options):
     made = document(sample_flight, **({"start_s": 40.0, "end_s": 70.0} | options))
     text = to_json(made[1])
     assert_valid(text)
     assert render(*made, text).startswith(b"%PDF-")
 
 
-def test_results_without_truth_have_no_zero_for_missing(sample_flight):
-    """One second of flight: no consistency statement, but its reason."""
+def test_results_too_few_updates_have_reason_not_zero(sample_flight):
+    """One second of flight is too short for a test of consistency."""
     _, made = document(sample_flight, start_s=40.0, end_s=41.0)
     north = made.axes["north"]
     assert isinstance(north.filters["kf"], UnjudgedFilter)
@@ -89,7 +89,7 @@ def test_to_json_rejects_nan_and_infinity():
             to_json(broken)
 
 
-# -- what strangers hand in ------------------------------------------------------------------------
+# -- untrusted results -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -111,10 +111,10 @@ def test_to_json_rejects_nan_and_infinity():
         (b'{"schema": {"name": "px4fuse-other", "version": "2.0"}}', "no results of px4fuse"),
         (b'{"schema": {"name": ["px4fuse-results"], "version": 1}}', "no results of px4fuse"),
         (b'{"schema": "px4fuse-results"}', "no results of px4fuse"),
-        (b'[{"a": 1, "b": {}, "a": 2}]', "a key stands there twice"),
+        (b'[{"a": 1, "b": {}, "a": 2}]', "a key is repeated"),
         (b"[]", "no results of px4fuse"),
         (b"1", "no results of px4fuse"),
-        (b'{"schema": {"name": "px4fuse-loop", "version": "1.0"}}', "follows version 1.0"),
+        (b'{"schema": {"name": "px4fuse-loop", "version": "1.0"}}', "uses schema version 1.0"),
         (b'{"schema": {"name": "px4fuse-loop", "version": "3.0"}}', "missing required field"),
     ],
     ids=range(21),
@@ -156,7 +156,7 @@ def test_read_results_cleans_keys_like_texts():
 
 
 def test_to_json_numbers_have_ten_significant_digits():
-    """Further digits depend on the processor; times of the UNIX clock keep microseconds."""
+    """Further digits depend on the processor; UNIX times keep microseconds."""
     written = json.loads(to_json({"a": [1 / 3, 2e-7 / 3], "unix_s": 1795251250.2020127, "n": 3}))
     assert written == {"a": [0.3333333333, 6.666666667e-8], "unix_s": 1795251250.202013, "n": 3}
     for text in (EXAMPLE, LOOP):
@@ -165,7 +165,7 @@ def test_to_json_numbers_have_ten_significant_digits():
 
 
 def test_results_number_outside_bounds_is_absent_with_reason():
-    """Optional numbers go alone, required ones with the part that may be missing."""
+    """An optional number is left out alone, a required one with its record."""
     results = read_results(json.dumps(EXAMPLE).encode())
     assert within_bounds(results) is results
     axis = results.axes["aisle"]
@@ -175,9 +175,7 @@ def test_results_number_outside_bounds_is_absent_with_reason():
     found = within_bounds(replace(results, axes={"aisle": wrong}))
     filters = found.axes["aisle"].filters
     assert isinstance(filters["kf"], UnjudgedFilter)
-    assert (
-        filters["kf"].reason == "axes.aisle.filters.kf.nis_mean is -3, its bounds are 0 and 1e+06"
-    )
+    assert filters["kf"].reason == "axes.aisle.filters.kf.nis_mean is -3 (allowed: 0 to 1e+06)"
     assert filters["kf"].truth == kf.truth
     assert filters["ekf2"] == replace(ekf2, sigma_p_median_m=None)
     assert [one.what for one in found.missing[len(results.missing) :]] == [

@@ -1,4 +1,4 @@
-"""Bounded work: what hangs, crashes or eats memory is lost alone."""
+"""Worker processes: a job that hangs, crashes or uses too much memory fails alone."""
 
 from __future__ import annotations
 
@@ -19,12 +19,14 @@ MEMORY = 1_500_000_000
 
 
 def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
-    heard = list(
+    outcomes = list(
         run_bounded(act, jobs, processes=processes, timeout_s=timeout_s, memory_bytes=memory_bytes)
     )
     assert not multiprocessing.active_children()
-    assert [index for index, _ in sorted(heard, key=lambda one: one[0])] == [*range(len(jobs))]
-    return [result for _, result in sorted(heard, key=lambda one: one[0])], heard
+    assert [index for index, _ in sorted(outcomes, key=lambda outcome: outcome[0])] == [
+        *range(len(jobs))
+    ]
+    return [result for _, result in sorted(outcomes, key=lambda outcome: outcome[0])], outcomes
 
 
 def test_run_bounded_failed_job_does_not_affect_others():
@@ -44,21 +46,21 @@ def test_run_bounded_failed_job_does_not_affect_others():
     ]
     results, _ = run(jobs)
     assert [results[n] for n in (0, 3, 10)] == [1, 4, 9]
-    assert results[1] == JobFailure("the process that read it ended (exit code 3).")
+    assert results[1] == JobFailure("the worker process ended (exit code 3).")
     assert results[2] == JobFailure("ValueError: a b[2J")
     assert results[4] == JobFailure("x.ulg: empty.")
     assert isinstance(results[5], JobFailure)
-    assert results[6] == JobFailure("its result could not be read (ValueError).")
+    assert results[6] == JobFailure("the result could not be unpickled (ValueError).")
     assert results[7] == bytes(30_000_000)
     assert results[8] == "1"
-    assert results[9] == JobFailure("the process that read it ended (exit code 0).")
+    assert results[9] == JobFailure("the worker process ended (exit code 0).")
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
 def test_run_bounded_hanging_job_ends_at_time_limit():
     results, _ = run([("hang", 0), ("square", 2), ("hang", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]
-    late = JobFailure("it took longer than 3 s and was ended.")
+    late = JobFailure("the time limit of 3 s was exceeded.")
     assert results[0::2] == [late, late]
 
 
@@ -66,8 +68,8 @@ def test_run_bounded_hanging_job_ends_at_time_limit():
 def test_run_bounded_large_job_ends_at_memory_limit():
     jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
     results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
-    assert results == [4, JobFailure("it needed more memory than one file may take."), 9]
-    # the next job would not find enough memory in that process
+    assert results == [4, JobFailure("the memory limit for one file was exceeded."), 9]
+    # after a memory error the process is replaced
     jobs = [("process", 0), ("hog", 10 * MEMORY), ("process", 0)]
     (before, _, after), _ = run(jobs, processes=1, memory_bytes=MEMORY)
     assert before != after
@@ -85,7 +87,7 @@ def test_run_bounded_unknown_function_fails_each_job(monkeypatch):
     monkeypatch.setitem(sys.modules, "test_workers_is_not_here", sys.modules[__name__])
     results, _ = run([("square", 1), ("square", 2)])
     assert all(
-        isinstance(each, JobFailure) and "before it began" in each.reason for each in results
+        isinstance(result, JobFailure) and "during its start" in result.reason for result in results
     )
 
 
@@ -110,7 +112,7 @@ if __name__ == "__main__":
 
 
 def hanging(folder):
-    """A program whose worker hangs after it has told its process id."""
+    """Start a program that prints the id of its worker process, which then hangs."""
     script = folder / "script.py"
     script.write_text(INTERRUPTED.format(tests=os.path.dirname(__file__)))  # noqa: PTH120
     pipe = subprocess.PIPE
@@ -118,7 +120,7 @@ def hanging(folder):
 
 
 def test_worker_does_not_import_from_current_folder(tmp_path):
-    """An instructor grades inside the folder of submissions; one of them is called types.py."""
+    """A submitted types.py must not be executed if grade runs in its folder."""
     script = tmp_path / "program" / "script.py"
     script.parent.mkdir()
     script.write_text(INTERRUPTED.format(tests=os.path.dirname(__file__)).replace("hang", "square"))  # noqa: PTH120
@@ -138,7 +140,7 @@ def test_worker_parent_killed_ends_hanging_job(tmp_path):
     with hanging(tmp_path) as parent:
         parent.stdout.readline()
         parent.kill()
-        # its workers have the other ends of these pipes, which end with the last of them
+        # the pipes are closed when the last worker has ended
         parent.communicate(timeout=30)
 
 

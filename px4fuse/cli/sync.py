@@ -42,7 +42,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
             else advice["Next"].capitalize()
         )
         raise MissingDataError(
-            f"{name}: the time offset cannot be estimated from this flight ({clock_result.reason})",
+            f"{name}: the time offset cannot be estimated from this flight: {clock_result.reason}",
             remedy,
         )
     results = sync_results(request, compared, clock_result)

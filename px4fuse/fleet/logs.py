@@ -89,8 +89,8 @@ def _logs_in(pattern: str) -> list[FoundLog]:
         ) from error
     if not infos:
         raise SettingsError(
-            f"{pattern} contains no logs ({', '.join(SUFFIXES)}).",
-            "Give a log, or a folder with logs.",
+            f"{pattern}: no logs found",
+            f"Give existing logs, or folders with logs ({', '.join(SUFFIXES)}).",
         )
     found_logs = []
     for path, info in infos.items():
