@@ -1,1 +1,1 @@
-"""Two recordings of one flight made one, and a position file placed into a flight."""
+"""Joining of two recordings of a flight, and alignment of a position file with a flight."""

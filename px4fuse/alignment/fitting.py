@@ -1,4 +1,4 @@
-"""One track fitted to another: lag by cross-correlation, then lag, yaw and origin."""
+"""Fit of a position track to a reference: lag by cross-correlation, then lag, yaw and origin."""
 
 from dataclasses import dataclass, replace
 
@@ -11,31 +11,30 @@ from px4fuse.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.offset import STEP_S
 
-WINDOW_S = 1.0  # by which the least squares may leave the correlation's peak
-# Concordance below which nothing was matched
+WINDOW_S = 1.0  # largest shift of the least squares from the correlation peak
+# concordance correlation below which a match is rejected
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-MIN_MISFIT = 1e-4  # better matches are as good as this one, so that the longer of them counts
-SEPARATE_LAG_S = 3.0  # at this distance a lag is another one, even on a plateau
-RESIDUAL_FLOOR_M = 0.05  # what the grid's steps leave of a perfect match
-MAX_DISTANCE_M = 1.0  # a larger one counts as this where fits are compared: it may be NLOS
+MIN_MISFIT = 1e-4  # lower limit of 1 - concordance; of better matches the longer one counts
+SEPARATE_LAG_S = 3.0  # distance of two lags that count as separate peaks
+RESIDUAL_FLOOR_M = 0.05  # residual of a perfect match, because of the grid
+MAX_DISTANCE_M = 1.0  # limit of residuals in the comparison of fits; larger ones may be outliers
 
 
 @dataclass(frozen=True)
 class Peak:
-    """Peak of the cross-correlation.
+    """Peak of the cross-correlation between position file and reference.
 
     Attributes
     ----------
     lag_s : float
-        Time of the flight at the file's first sample.
+        Flight time of the first sample of the file.
     concordance : float
-        2·Re(e^{-iψ}cov) / (var + var): a correlation that also falls where one of the two moves
-        further than the other; 1 only where they are equal but for an offset. NaN where the lag
-        was given.
+        Concordance correlation 2·Re(e^{-iψ}cov) / (var + var): 1 if the tracks are equal up to an
+        offset; smaller if their extents differ. NaN if the lag was given.
     second_peak_s : float
-        The best lag elsewhere, relative to this one; NaN where there is none.
+        Best lag elsewhere, relative to this one; NaN without another peak.
     second_peak_ratio : float
-        Its residual (RMS) over that of the peak.
+        Residual (RMS) of that lag over the residual of the peak.
     """
 
     lag_s: float
@@ -51,16 +50,17 @@ class Fit(Peak):
     Attributes
     ----------
     concordance : float
-        That of the peak; where the clock was given, the fit's own.
+        Value of the peak; if the time offset was given, value of the fit.
     yaw_rad : float
     lag_sigma_s, yaw_sigma_rad : float or None
-        None where it was not free.
+        Standard deviations; None if the parameter was given.
     origin_m : ndarray, shape (3,)
         North, east, down.
     coherence : complex
-        Normalised covariance of reference and file before the yaw: its angle is the best yaw.
+        Normalised covariance of reference and file before rotation; its angle is the best yaw.
     horizontal_rms_m, rms_m : float
-        Capped residual: per horizontal axis; and of the vector, with height where both have it.
+        RMS of the truncated residuals: per horizontal axis, and of the vector (with height if both
+        contain it).
     """
 
     lag_sigma_s: float | None
@@ -73,20 +73,20 @@ class Fit(Peak):
 
 
 def correlation_peak(file: SampledTrack, reference: SampledTrack, yaw_rad: float | None) -> Peak:
-    """Lag of greatest likelihood gain over all lags on the grid, yaw free where None.
+    """Find the lag with the greatest likelihood gain on the grid; yaw is free if None.
 
-    With a free offset the residual sum of squares over an overlap of N grid points is
-    Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov); against two tracks that have nothing in common the
-    log-likelihood grows by -N·ln(1 - concordance), which is maximised: a long overlap with an
-    excellent match beats a short one in which two straight lines match as well.
+    With a free origin the residual sum of squares over an overlap of N grid points is
+    Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). Relative to two independent tracks the log-likelihood
+    increases by -N·ln(1 - concordance), which is maximised. A long overlap with an excellent match
+    is preferred to a short one in which two straight lines match equally well.
 
     Raises
     ------
     NoMatchError
-        No lag has enough overlap.
+        No lag has sufficient overlap.
     """
     if not file.valid.any() or not reference.valid.any():
-        raise NoMatchError("too little is left between gaps to be matched")
+        raise NoMatchError("too few samples between gaps to match the tracks")
     found = moments(file.horizontal_m, reference.horizontal_m, file.valid, reference.valid)
     count, covariance, power = found.count, found.covariance, found.power_a + found.power_b
     min_count = min(np.count_nonzero(file.valid), np.count_nonzero(reference.valid))
@@ -94,8 +94,8 @@ def correlation_peak(file: SampledTrack, reference: SampledTrack, yaw_rad: float
         tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / STEP_S, min_count / 2.0)
     )
     if not has_overlap.any():
-        raise NoMatchError("too little is left between gaps to be matched")
-    has_overlap &= power > 1e-9 * np.max(power)  # else rounding errors correlate
+        raise NoMatchError("too few samples between gaps to match the tracks")
+    has_overlap &= power > 1e-9 * np.max(power)  # exclude rounding errors
     real_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
@@ -107,7 +107,7 @@ def correlation_peak(file: SampledTrack, reference: SampledTrack, yaw_rad: float
     def lag(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file.valid) + 1) * STEP_S
 
-    # a rival lies where the concordance has fallen to half in between, or far away
+    # another peak: the concordance falls to one half in between, or the lag is far away
     outside = np.flatnonzero(concordance < 0.5 * concordance[best])
     low = np.max(outside[outside < best], initial=-1)
     high = np.min(outside[outside > best], initial=len(count))
@@ -118,7 +118,7 @@ def correlation_peak(file: SampledTrack, reference: SampledTrack, yaw_rad: float
     peak = Peak(lag(best), float(concordance[best]))
     if not is_other_peak.any():
         return peak
-    # per axis; the floor keeps two perfect matches equal
+    # per axis; the floor makes two perfect matches equal
     square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
     residual = np.sqrt(square + RESIDUAL_FLOOR_M**2)
     second_peak = int(np.argmin(np.where(is_other_peak, residual, np.inf)))
@@ -134,35 +134,35 @@ def least_squares_fit(
     *,
     clock_free: bool,
 ) -> Fit:
-    """Robust least squares (soft L1) over origin and, where free, lag and yaw.
+    """Fit origin and, if free, lag and yaw by robust least squares (soft L1).
 
-    The origin is always free, even where it is not used: an offset of the file would otherwise
-    pass for a lag wherever the vehicle flies more one way than the other. Covariance:
-    σ²(JᵀJ)⁻¹ at the optimum with σ from the median residual, times 1 + 2Σρ, the factor by which
-    autocorrelated residuals count for fewer (ρ summed up to its first zero).
+    The origin is always free, even if it is not used: otherwise an offset of the file would be
+    mistaken for a lag if the vehicle flies mostly in one direction. Covariance: σ²(JᵀJ)⁻¹ at the
+    optimum, with σ from the median residual, times 1 + 2Σρ for autocorrelated residuals (ρ summed
+    to its first zero).
 
     Raises
     ------
     NoMatchError
-        Too few samples lie within the reference.
+        Too few samples overlap the reference.
     """
     start, is_known = reference.at(file.time_s + peak.lag_s)
     used = is_known & file.valid
     if np.count_nonzero(used) < tracks.MIN_SAMPLES:
         raise NoMatchError(
-            f"{np.count_nonzero(used)} of the file's positions fall on the reference"
+            f"only {np.count_nonzero(used)} positions of the file overlap the reference in time"
         )
     time = file.time_s[used] + peak.lag_s
     z, target = file.horizontal_m[used], (start[:, 0] + 1j * start[:, 1])[used]
     centre = np.mean(z)
-    z = z - centre  # decorrelates yaw and origin
+    z = z - centre  # makes yaw and origin uncorrelated
     power = float(np.sqrt(np.var(z) * np.var(target)))
     coherence = complex(np.vdot(z, target) / len(z) / power) if power > 0 else 0j
     mean_square = float(np.var(z) + np.var(target)) / 2.0
     horizontal = reference.horizontal_m
 
     def unpack(x: Array) -> tuple[complex, float, float]:
-        """Origin, lag beyond the start, yaw."""
+        """Return origin, lag relative to the start, and yaw."""
         shift = float(x[2]) if clock_free else 0.0
         return complex(x[0], x[1]), shift, float(x[-1]) if yaw_rad is None else yaw_rad
 
@@ -172,7 +172,7 @@ def least_squares_fit(
         return np.concatenate([r.real, r.imag])
 
     start_at = complex(np.mean(target))
-    # origin, and where they are free lag and yaw
+    # free parameters: origin, lag, yaw
     free_parameters = [True, True, clock_free, yaw_rad is None]
     x0 = np.array([start_at.real, start_at.imag, 0.0, float(np.angle(coherence))])[free_parameters]
     limit = np.array([np.inf, np.inf, WINDOW_S, np.inf])[free_parameters]
@@ -182,7 +182,9 @@ def least_squares_fit(
     r_complex = r[: len(z)] + 1j * r[len(z) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
-    information += 1e-9 * np.diag(np.diag(information) + 1e-12)  # singular: a huge variance
+    information += 1e-9 * np.diag(
+        np.diag(information) + 1e-12
+    )  # a singular matrix gives a huge variance
     variance = (
         np.diag(np.linalg.inv(information))
         * _robust_scale(r) ** 2
@@ -217,12 +219,12 @@ def least_squares_fit(
 
 
 def _robust_scale(residual: Array) -> float:
-    """Standard deviation by the median; never 0, for a perfect fit too."""
+    """Return the standard deviation from the median absolute residual, at least 1 mm."""
     return max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
 
 
 def _autocorrelation_factor(residual: Complex) -> float:
-    """1 + 2Σρ: how many autocorrelated residuals say as much as one independent one."""
+    """Return 1 + 2Σρ: number of correlated residuals per independent one."""
     limit = 3.0 * _robust_scale(np.abs(residual))
     clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
     rho = autocovariance(clipped)
@@ -234,5 +236,5 @@ def _autocorrelation_factor(residual: Complex) -> float:
 
 
 def truncated_rms(values_m: Array) -> float:
-    """Root mean square with large values counted as the largest that counts."""
+    """Return the RMS with values limited to MAX_DISTANCE_M."""
     return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_DISTANCE_M) ** 2)))

@@ -1,4 +1,4 @@
-"""Two recordings of one flight on one clock: what one lacks, the other gives."""
+"""Joining of two recordings of one flight: missing data are taken from the second."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -13,29 +13,29 @@ from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preferenc
 from px4fuse.readers.parts import collect_unavailable
 from px4fuse.recording import InputFile
 
-# Fields of records that are times
+# names of fields that contain times
 TIMES = ("time_s", "start_s", "end_s")
-# Both recordings must hold this much of the same time
+# s; smallest overlap of the recordings
 MIN_OVERLAP_S = 2.0
-# EKF2's position is sent as it is logged: what is left is interpolation between samples
+# m; larger differences of the EKF2 positions are not due to interpolation: different flights
 MAX_POSITION_DIFFERENCE_M = 0.5
 MIN_COMMON_SAMPLES = 5
 
 
 def join(flight: Flight, other: Flight) -> Flight:
-    """Join two recordings of one flight on the autopilot's boot clock.
+    """Join two recordings of one flight on the boot clock of the autopilot.
 
     Parameters
     ----------
     flight : Flight
-        Keeps its time zero and everything that it has.
+        Keeps its time zero and all of its data.
     other : Flight
-        Gives what ``flight`` lacks, and all its position tracks.
+        Adds data that ``flight`` lacks, and all of its position tracks.
 
     Raises
     ------
     MissingDataError
-        The two do not overlap in time, or are not of the same flight.
+        The recordings do not overlap in time, or are of different flights.
     """
     if other.log.sha256 == flight.log.sha256:
         raise MissingDataError(
@@ -46,10 +46,8 @@ def join(flight: Flight, other: Flight) -> Flight:
     low, high = max(0.0, shift_s), min(flight.log.duration_s, shift_s + other.log.duration_s)
     if high - low < MIN_OVERLAP_S:
         raise MissingDataError(
-            (
-                f"{flight.log.name} and {other.log.name} do not overlap in time: "
-                f"{_span(flight)} and {_span(other)} on the autopilot's boot clock."
-            ),
+            f"{flight.log.name} and {other.log.name} do not overlap in time: "
+            f"{_span(flight)} and {_span(other)} on the autopilot's boot clock.",
             "Give recordings of the same flight.",
         )
     shifted = shift_times(other, shift_s)
@@ -112,12 +110,12 @@ def _span(flight: Flight) -> str:
 
 
 def shift_times(part: Any, shift_s: float) -> Any:
-    """A flight, or a part, counted from another time zero: tables, and the times in its records.
+    """Shift all times of a flight or of a part: tables, and times in records.
 
     Parameters
     ----------
-    part : DataFrame, Series, record of such, or a tuple or mapping of records
-        Anything else stays as it is.
+    part : DataFrame, Series, record, or a tuple or mapping of records
+        Other values are returned unchanged.
     """
     if isinstance(part, pd.DataFrame | pd.Series):
         return part.set_axis(pd.Index(part.index.to_numpy() + shift_s, name="time_s"))
@@ -140,9 +138,10 @@ def shift_times(part: Any, shift_s: float) -> Any:
 
 
 def _agreement(flight: Flight, other: Flight) -> str:
-    """How well two recordings agree where both know the same thing.
+    """Compare the EKF2 positions of two recordings; raise MissingDataError if they differ.
 
-    Two flights may both count from a boot of their own, so that overlap alone proves nothing.
+    Overlap in time alone does not prove that the flight is the same, because each flight may count
+    from its own boot.
     """
     if isinstance(flight.ekf2, Ekf2) and isinstance(other.ekf2, Ekf2):
         state_here, other_state = flight.ekf2.state, other.ekf2.state
@@ -159,11 +158,9 @@ def _agreement(flight: Flight, other: Flight) -> str:
             median = float(np.median(distance_m))
             if median > MAX_POSITION_DIFFERENCE_M:
                 raise MissingDataError(
-                    (
-                        f"{flight.log.name} and {other.log.name} are different flights: their EKF2 "
-                        f"positions differ by {median:.2f} m (median)."
-                    ),
+                    f"{flight.log.name} and {other.log.name} are different flights: their EKF2 "
+                    f"positions differ by {median:.2f} m (median).",
                     "Give recordings of the same flight.",
                 )
-            return f"their EKF2 positions differ by {median:.3f} m (median)"
-    return "that they are of the same flight could not be checked: no EKF2 in both"
+            return f"EKF2 positions of both differ by {median:.3f} m (median)"
+    return "not verified that both are of the same flight: EKF2 is not in both"

@@ -1,4 +1,4 @@
-"""The position file matched with EKF2 or the IMU, in the frame that fits, or refused."""
+"""Matching of a position file with EKF2 or the IMU: choice of frame, yaw and time offset."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,30 +12,31 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTr
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.trajectory.offset import MIN_SECOND_PEAK_RATIO, STEP_S
 
-# nwu is enu turned by 90°
+# frames to try if yaw is free; nwu is enu rotated by 90°
 YAW_FREE_FRAMES = ("ned", "enu")
-MAX_SPAN_S = 86400.0  # a day takes five seconds on the tracks' grid
-# Concordance below which a match is rough: a warning says so, and it overrules nothing
+MAX_SPAN_S = 86400.0  # a day of positions takes five seconds
+# concordance correlation below which a match gets a warning and does not overrule options
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
-MAX_CLOCK_SIGMA_S = 0.5
-FRAME_RATIO = 1.3  # by which one frame must fit better than the next
-# A free yaw and origin that reduce the residual so much say that the file's frame is not EKF2's
+MAX_CLOCK_SIGMA_S = 0.5  # standard deviation of a time offset above which it is rejected
+FRAME_RATIO = 1.3  # smallest ratio of the residuals in the second best and the best frame
+# residual without and with free yaw and origin: above this ratio and size (m) the frame is
+# misaligned
 ROTATION_RATIO, ROTATION_RMS_M = 2.0, 0.3
 
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """A position file, and what is known of how it lies in the flight; what is None is sought.
+    """Position file with the known alignment parameters; None is estimated.
 
     Attributes
     ----------
     samples : DataFrame
-        Of the file, by its own clock.
+        Positions of the file, on its clock.
     frame : str or None
     yaw_rad : float or None
-        Of the file's frame against EKF2's.
+        Rotation of the frame of the file relative to EKF2's.
     lag_s : float or None
-        Time of the flight at the file's first sample.
+        Flight time of the first sample of the file.
     """
 
     samples: pd.DataFrame
@@ -46,22 +47,23 @@ class AlignmentProblem:
 
 @dataclass(frozen=True)
 class Match:
-    """The file in one frame, matched with one reference.
+    """Match of the file with one reference.
 
     Attributes
     ----------
-    reference : OwnTrack
+    reference : SampledTrack
     frame : str
     misfits_m : dict from frame to float
         Residual in each frame that was tried, best first.
     fit : Fit
-        With the yaw that was asked for, found where none was.
+        Fit with the given yaw, or with free yaw if none was given.
     free_yaw_fit : Fit
-        With the yaw found in any case.
+        Fit with free yaw.
     is_rotated : bool
-        Whether the file's frame is clearly not EKF2's, so that the clock is taken from ``free_yaw_fit``.
+        True if the frame of the file is misaligned; the time offset is then that of
+        ``free_yaw_fit``.
     better_frame : str
-        Frame in which the file fits without a turn, where that is not the one asked for.
+        Frame in which the file fits without rotation, if not the given one.
     """
 
     reference: SampledTrack
@@ -74,17 +76,17 @@ class Match:
 
     @property
     def clock(self) -> Fit:
-        """The fit that the clock is taken from."""
+        """Fit that determines the time offset."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
     def misfits(self) -> str:
-        """Residual in each frame, in words."""
+        """Residual in each frame, as text."""
         return ", ".join(f"{name} {misfit:.2f} m" for name, misfit in self.misfits_m.items())
 
 
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
-    """Match with the first reference that serves; None where none does and nothing is sought.
+    """Match with the first suitable reference; None if none is suitable and nothing is estimated.
 
     Raises
     ------
@@ -94,7 +96,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     known = {"clock_offset_s": problem.lag_s, "frame": problem.frame, "yaw_deg": problem.yaw_rad}
     missing_options = [f"`{name}`" for name, value in known.items() if value is None]
     reasons = []
-    # what is all given is at most compared, for which the IMU's band says too little
+    # if all is given, only compare with EKF2; the band-passed IMU is not sufficient for that
     reference_kinds = (tracks.ekf2_references, tracks.imu_references)
     for references in reference_kinds if missing_options else reference_kinds[:1]:
         try:
@@ -116,9 +118,9 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
     """Match with the best of the references, in the best of the frames."""
     samples, frame, yaw_rad = problem.samples, problem.frame, problem.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
-        raise NoMatchError("the file spans more than a day: cut it to the day of the flight")
+        raise NoMatchError("the position file spans more than one day; cut it to the flight")
     if tracks.horizontal_range_m(tracks.file_track(samples, "ned")) < tracks.MIN_MOTION_M:
-        raise NoMatchError("the file hardly moves")
+        raise NoMatchError("the positions in the file hardly change")
     frames = (frame,) if frame else YAW_FREE_FRAMES if yaw_rad is None else tuple(tracks.FRAMES)
     matches = []
     for reference in references:
@@ -151,14 +153,14 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
 
 
 def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -> bool:
-    """Whether the file fits clearly better with a yaw and origin of its own."""
+    """Return True if a free yaw and origin clearly reduce the residual."""
     return horizontal_rms_m > ROTATION_RATIO * free_yaw_fit.horizontal_rms_m and (
         horizontal_rms_m > ROTATION_RMS_M or reference == IMU
     )
 
 
 def is_good_fit(fit: Fit, reference: str) -> bool:
-    """Whether a fit is good enough to overrule what was asked for."""
+    """Return True if the fit exceeds GOOD_CONCORDANCE and no other lag fits equally well."""
     return (
         fit.concordance >= GOOD_CONCORDANCE[reference]
         and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
@@ -166,38 +168,35 @@ def is_good_fit(fit: Fit, reference: str) -> bool:
 
 
 def _check_match(match: Match) -> None:
-    """Refuse a match that is poor, or is not the only one.
-
-    Raises
-    ------
-    NoMatchError
-    """
+    """Raise NoMatchError if the match is poor or ambiguous."""
     name, fit = match.reference.name, match.clock
     if fit.concordance < MIN_CONCORDANCE[name]:
         raise NoMatchError(
-            f"the file does not follow the {name} (concordance {fit.concordance:.2f}, at least "
-            f"{MIN_CONCORDANCE[name]:g} is needed)"
+            f"the position file does not match the {name} (concordance correlation "
+            f"{fit.concordance:.2f}; at least {MIN_CONCORDANCE[name]:g} needed)"
         )
     clock_open = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
-        clock_open = f": offsets {abs(fit.second_peak_s):.1f} s apart fit the {name} equally well"
+        difference_s = abs(fit.second_peak_s)
+        clock_open = f"; offsets that differ by {difference_s:.1f} s fit the {name} equally well"
     elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
-        clock_open = f" (standard deviation of the offset above {MAX_CLOCK_SIGMA_S:g} s)"
+        clock_open = f" (its standard deviation exceeds {MAX_CLOCK_SIGMA_S:g} s)"
     if clock_open:
         raise NoMatchError(
-            f"the flight's path leaves the clock open{clock_open}", "Give `clock_offset_s`"
+            f"the time offset cannot be estimated from this path{clock_open}",
+            "Give `clock_offset_s`",
         )
     if len(match.misfits_m) > 1:
         best, second = (np.hypot(m, RESIDUAL_FLOOR_M) for m in [*match.misfits_m.values()][:2])
         if second < FRAME_RATIO * best:
             raise NoMatchError(
-                f"no frame fits the {name} clearly best ({match.misfits})",
+                f"no frame fits the {name} significantly better than the others ({match.misfits})",
                 f"Give `frame`{' or `yaw_deg` auto' if match.is_rotated else ''}",
             )
 
 
 def _fit_across_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
-    """Fit again to EKF2 with its resets treated as everything else in px4fuse treats them."""
+    """Repeat the fit to EKF2, with its resets corrected as in the comparison."""
     ekf2, clock = flight.ekf2, match.clock
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match

@@ -1,13 +1,13 @@
-"""An external position file placed into a flight: clock, frame, yaw and origin.
+"""Alignment of an external position file with a flight: time offset, frame, yaw and origin.
 
-A UWB computer records on its own clock and in its own frame. Both are found by matching its track
-with a reference in the log: EKF2's position, or, where that does not serve, the IMU's acceleration
-integrated twice, with both sides passed through the same filter.
+A UWB computer records on its own clock and in its own frame. The track of the file is matched with
+a reference in the log: EKF2's position or, if this is not suitable, the acceleration of the IMU
+integrated twice, with both sides band-passed.
 
-Horizontal positions are complex numbers here, north + i·east, so that a yaw is a factor e^{iψ}. The
-clock is found in two steps: over all lags by masked cross-correlation through the FFT (Padfield
-2012), then far below one sample by robust least squares. What is found is relative to the
-reference: an EKF2 that was fed with late positions is late itself, and the clock offset with it.
+Horizontal positions are complex numbers, north + i·east, so a yaw is a factor e^{iψ}. The time
+offset is found by masked cross-correlation over all lags (FFT, Padfield 2012), then refined below
+one sample by robust least squares. It is relative to the reference: if EKF2 fused late positions,
+EKF2 is late, and the time offset includes that.
 """
 
 from collections.abc import Iterator
@@ -30,12 +30,10 @@ from px4fuse.readers.parts import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
 from px4fuse.recording import InputFile
 
-# Another lag whose residual is not larger by this factor can hardly be told apart
-NEAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}  # the IMU's own noise leaves 1.4 to 1.7
-MIN_MIRRORED_CORRELATION = (
-    0.8  # correlation of the heights below minus which they run against each other
-)
-MAX_UNIX_DIFFERENCE_S = 60.0  # computers in a lab keep time better than this
+# ratio of residuals below which another lag fits nearly as well
+NEAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}  # IMU noise gives ratios of 1.4 to 1.7
+MIN_MIRRORED_CORRELATION = 0.8  # heights with a correlation below minus this have opposite z axes
+MAX_UNIX_DIFFERENCE_S = 60.0  # clocks of computers in a lab differ by less
 
 
 def align_position_file(
@@ -46,32 +44,32 @@ def align_position_file(
     yaw_deg: float | Literal["auto"] | None = None,
     clock_offset_s: float | None = None,
 ) -> Flight:
-    """Place an external position file into a flight, as its first position track.
+    """Add an external position file to a flight, as its first position track.
 
     Parameters
     ----------
     frame : {"ned", "enu", "nwu"}, optional
-        What the file's x, y, z are; by default what its column names say, or else what fits.
+        Axes x, y, z of the file; by default from the column names, else the frame that fits best.
     yaw_deg : float or "auto", optional
-        Rotation of the file about down, clockwise seen from above, after the frame. None is 0: the
-        file's frame is EKF2's but for the names of its axes. "auto" finds yaw and origin.
+        Rotation of the file about down, clockwise seen from above, after the frame conversion. None
+        is 0: the frame of the file equals EKF2's except for its axes. "auto" estimates yaw and
+        origin.
     clock_offset_s : float, optional
-        The autopilot's boot clock minus the file's; by default it is found, relative to the
-        reference. Where EKF2 was fed with late positions its track lags the vehicle, and the
-        offset that is found contains this lag.
+        Boot clock of the autopilot minus clock of the file; by default estimated relative to the
+        reference. If EKF2 fused late positions, its track lags, and the estimate includes this lag.
 
     Returns
     -------
     Flight
-        With the track first in ``positions``, the file in ``inputs``, and what the file's reader
-        decided in ``log.notes``. All of the file is kept, what lies outside the flight too.
+        With the track first in ``positions``, the file in ``inputs``, and the notes of its reader
+        in ``log.notes``. The whole file is kept, including samples outside of the flight.
 
     Raises
     ------
     SettingsError
-        The frame is unknown, or yaw or clock offset is not a finite number.
+        The frame is unknown, or yaw or time offset is not a finite number.
     MissingDataError
-        Clock, frame or yaw was to be found and cannot be, or file and log do not overlap in time.
+        A parameter cannot be estimated, or file and log do not overlap in time.
     """
     _check_options(frame, yaw_deg, clock_offset_s)
     samples = finite_rows(file.samples, ["x_m", "y_m"])
@@ -85,15 +83,13 @@ def align_position_file(
     boot_s = flight.log.boot_time_s
     spans = (
         f"the log covers {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s of the boot "
-        f"clock, the file {start_s:.2f} s to {end_s:.2f} s of its own {file.clock} clock"
+        f"clock, the file {start_s:.2f} s to {end_s:.2f} s of its {file.clock} clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
         raise MissingDataError(
-            (
-                f"{file.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
-                f"overlap the log ({spans})."
-            ),
+            f"{file.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
+            f"overlap the log ({spans}).",
             "Correct the offset, or omit it: px4fuse then estimates it.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
@@ -106,14 +102,15 @@ def align_position_file(
         flight, file, problem, match, frame, yaw_deg, clock_offset_s
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
-    rotation_words = f" turned by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
+    rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     track = PositionTrack(
         name=file.name,
         origin=POSITION_FILE,
-        description=f"external position file, {len(placed)} samples, {alignment.frame}{rotation_words}",
+        description=f"external position file, {len(placed)} samples, {alignment.frame}"
+        f"{rotation_text}",
         samples=placed,
         frame="NED",
-        clock=f"the file's own {file.clock} clock, {alignment.clock_offset_s:+.3f} s to the boot "
+        clock=f"{file.clock} clock of the file, {alignment.clock_offset_s:+.3f} s to the boot "
         f"clock, {clock_source}",
         topics=(file.name,),
         log=file.name,
@@ -135,7 +132,7 @@ def _check_options(
             f"Frame {frame} is not known.", f"Use one of {', '.join(tracks.FRAMES)}."
         )
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
-        raise SettingsError(f"`yaw_deg` {yaw_deg}: give degrees, or auto.")
+        raise SettingsError(f"`yaw_deg` {yaw_deg} is not valid: give degrees or auto.")
     for name, value in (("yaw_deg", yaw_deg), ("clock_offset_s", clock_offset_s)):
         if isinstance(value, float) and not np.isfinite(value):
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
@@ -150,15 +147,15 @@ def _describe_alignment(
     yaw_deg: float | Literal["auto"] | None,
     clock_offset_s: float | None,
 ) -> tuple[Alignment, pd.DataFrame]:
-    """Alignment, with the reason for each of its parts, and the placed samples."""
+    """Return the alignment, with the reason for each parameter, and the aligned samples."""
     samples, frame, is_yaw_free = problem.samples, problem.frame or "", problem.yaw_rad is None
     yaw_rad, lag_s = problem.yaw_rad or 0.0, problem.lag_s or 0.0
     yaw_sigma_deg = clock_sigma_s = correlation = None
     origin_m, reference = np.zeros(3), ""
     yaw_reason, clock_reason = "given with --position-yaw", "given with --clock-offset"
     if yaw_deg is None:
-        yaw_reason = "the file's frame is taken to be EKF2's"
-    frame_reason = "from the names of the file's columns"
+        yaw_reason = "assumed: frame of the file = frame of EKF2"
+    frame_reason = "from the column names of the file"
     if frame_option:
         frame_reason = "given with --position-frame"
     if match:
@@ -166,16 +163,16 @@ def _describe_alignment(
         if not (frame_option or file.frame):
             frame_reason = f"fits {reference} best; residuals: {match.misfits}"
             if is_yaw_free and frame == "enu":
-                frame_reason += "; nwu differs from enu only by the yaw, which was found"
+                frame_reason += "; nwu differs from enu only in yaw, which was estimated"
         if is_yaw_free:
             yaw_rad = match.fit.yaw_rad
             yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
-            yaw_reason = f"matched with {reference}"
+            yaw_reason = f"estimated against {reference}"
             origin_m = match.fit.origin_m if reference == EKF2_POSITION else origin_m
         if clock_offset_s is None:
             lag_s, clock_sigma_s = match.clock.lag_s, match.clock.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
-            clock_reason = f"matched with {reference}, so that a delay of that is part of it"
+            clock_reason = f"estimated against {reference}; includes the delay of {reference}"
         correlation = float((np.exp(-1j * yaw_rad) * match.clock.coherence).real)
     placed = tracks.placed_samples(samples, frame, yaw_rad, origin_m, lag_s)
     comparison = None if reference == IMU else _compare(flight, placed)
@@ -213,10 +210,10 @@ def _describe_alignment(
 
 
 def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None] | None:
-    """Distances (m) from EKF2 and correlation with it, horizontally.
+    """Return the horizontal distances (m) from EKF2, and the correlation with it.
 
-    The correlation is None where EKF2 hardly moves; all is None where it has no position at the
-    file's times.
+    The correlation is None if EKF2 hardly moves; the result is None if EKF2 has no position at the
+    times of the file.
     """
     if isinstance(flight.ekf2, Unavailable):
         return None
@@ -241,7 +238,7 @@ def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None]
 
 
 def _height_conflicts(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
-    """Whether the file's height runs against EKF2's: then its frame is another one."""
+    """Yield a message if the heights of file and EKF2 have opposite signs."""
     if isinstance(flight.ekf2, Unavailable):
         return
     down = flight.ekf2.state["down_m"]
@@ -255,15 +252,15 @@ def _height_conflicts(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
         and np.corrcoef(file_down_m, ekf2_down_m)[0, 1] <= -MIN_MIRRORED_CORRELATION
     ):
         yield (
-            "The file's height runs against EKF2's (one rises where the other sinks): its z points "
-            "the other way. Give another --position-frame."
+            "The heights of file and EKF2 change in opposite directions: the z axis of the file is "
+            "inverted. Give another --position-frame."
         )
 
 
 def _frame_conflicts(
     match: Match | None, comparison: tuple[Array, float | None] | None, yaw_rad: float
 ) -> Iterator[str]:
-    """Whether the file's frame is another one than EKF2's."""
+    """Yield a message if the frame of the file is misaligned with that of EKF2."""
     if match is None:
         return
     name, is_rotated = match.reference.name, match.is_rotated
@@ -274,16 +271,17 @@ def _frame_conflicts(
         )
     if is_rotated and match.better_frame:
         yield (
-            f"The file does not fit the {name} as {match.frame}, but it does as "
-            f"{match.better_frame}: give --position-frame {match.better_frame}."
+            f"The file does not fit the {name} in frame {match.frame}, but in "
+            f"{match.better_frame}. Give --position-frame {match.better_frame}."
         )
     elif is_rotated:
         yaw = np.degrees(np.angle(np.exp(1j * (match.free_yaw_fit.yaw_rad - yaw_rad))))
         shift = np.hypot(*match.free_yaw_fit.origin_m[:2])
-        frame_words = f"turned by {yaw:.1f}°" + (
-            f" and shifted by {shift:.1f} m" if comparison else ""
+        shift_text = f" and shifted by {shift:.1f} m" if comparison else ""
+        yield (
+            f"The frame of the file is rotated by {yaw:.1f}°{shift_text} relative to the {name}. "
+            "Give --position-yaw auto."
         )
-        yield f"The file's frame seems {frame_words} against the {name}: give --position-yaw auto."
 
 
 def _warnings(
@@ -295,33 +293,36 @@ def _warnings(
     correlation: float | None,
     clock_offset_s: float | None,
 ) -> Iterator[str]:
-    """What makes the match doubtful, what it cannot tell, and whether the flight is the same."""
+    """Yield warnings on a poor or ambiguous match, limits of the IMU, and different flights."""
     if match:
         name, fit = match.reference.name, match.clock
         if fit.concordance < matching.GOOD_CONCORDANCE[name]:
-            yield f"The file follows the {name} only roughly (concordance {fit.concordance:.2f})."
+            yield (
+                f"The position file matches the {name} only roughly (concordance correlation "
+                f"{fit.concordance:.2f})."
+            )
         if fit.second_peak_ratio < NEAR_RESIDUAL_RATIO[name]:
             yield (
-                f"A clock offset {fit.second_peak_s:+.1f} s from this one fits nearly as well, with a "
-                f"residual only {fit.second_peak_ratio:.1f} times as large: if this one is wrong, give "
+                f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well "
+                f"(residual {fit.second_peak_ratio:.1f} times larger). If this one is wrong, give "
                 "--clock-offset SECONDS."
             )
         if is_yaw_free and name == IMU:
             yield (
-                "The IMU tells the yaw to a few degrees only (1° to 6° off on simulated flights), "
-                "and not the origin of the file's frame, which was left at 0."
+                "With the IMU as reference the yaw is accurate to a few degrees (1° to 6° on "
+                "simulated flights). The origin of the file's frame is unknown and set to 0."
             )
     if not is_yaw_free and correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
         yield (
-            f"The file hardly follows the EKF2 position (correlation {correlation:.2f}): check "
-            "clock offset, frame and yaw."
+            f"The position file does not match the EKF2 position (correlation {correlation:.2f}). "
+            "Check time offset, frame and yaw."
         )
-    # where its UNIX clock is far from the log's it may be of another flight
+    # a large difference of UNIX times indicates another flight
     start_s = flight.log.start_unix_s
     if file.clock == "UNIX" and start_s is not None and clock_offset_s is not None:
-        apart_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
-        if apart_s >= MAX_UNIX_DIFFERENCE_S:
+        difference_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
+        if difference_s >= MAX_UNIX_DIFFERENCE_S:
             yield (
-                f"By their UNIX times file and log are {apart_s:.0f} s apart: is it the same "
-                "flight? Flights along one path match each other well."
+                f"The UNIX times of file and log differ by {difference_s:.0f} s. Check that both "
+                "are of the same flight: flights along one path match each other well."
             )

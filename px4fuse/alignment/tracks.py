@@ -1,4 +1,4 @@
-"""Tracks of a position file and of its references, on one time grid and in north, east, down."""
+"""Tracks of a position file and of its references, on one time grid, in north, east, down."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ from px4fuse.readers.parts import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.offset import STEP_S
 
-# Which of x, y, z is north, east, down, and with which sign
+# indices of north, east, down in x, y, z, and their signs
 FRAMES = {
     "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
     "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
@@ -25,19 +25,19 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-GAP_S = 0.5  # nothing is interpolated in an interval longer than this and three median ones
+GAP_S = 0.5  # longest interval that is interpolated, or three median intervals
 MIN_MOTION_M = 0.5
 MIN_SAMPLES = 10
-MIN_OVERLAP_S = 10.0  # or half of the shorter track
-# EKF2's output moves in steps at its updates; the low-pass over them has no delay
+MIN_OVERLAP_S = 10.0  # smallest overlap, or half of the shorter track
+# s; EKF2's output has steps at its updates; this smoothing has no delay
 SMOOTHING_S = 0.2
-# Where acceleration integrated twice resembles a position: below this band it drifts
+# band in which acceleration integrated twice equals a position; it drifts below
 BAND_HZ = (0.1, 1.0)
-BAND_EDGE_S, BAND_PADDING_S = 2.0, 10.0  # what the filter's transients spoil, and its padding
+BAND_EDGE_S, BAND_PADDING_S = 2.0, 10.0  # length of the filter transients, and padding
 
 
 class NoMatchError(Exception):
-    """A reference does not match; with a remedy where no other reference could do better."""
+    """Reason why a reference does not match; with a remedy if other references are no better."""
 
     def __init__(self, reason: str, remedy: str = "") -> None:
         super().__init__(reason)
@@ -51,13 +51,13 @@ class SampledTrack:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Of the flight; for the file from its first sample on.
+        Flight time; for the file the time since its first sample.
     position_m : ndarray, shape (n, 3)
         North, east, down; down may be NaN.
     valid : ndarray of bool, shape (n,)
         False inside gaps.
     name : str
-        Of a reference.
+        Name of a reference.
     """
 
     time_s: Array
@@ -71,14 +71,14 @@ class SampledTrack:
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
-        """Position at given times, and whether there is one (outside and in gaps there is none)."""
+        """Interpolate the position; also return the mask of times outside of gaps."""
         position = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
         valid = np.interp(time_s, self.time_s, self.valid.astype(float), 0.0, 0.0) > 0.999
         return np.stack(position, axis=1), valid
 
 
 def file_track(samples: pd.DataFrame, frame: str) -> SampledTrack:
-    """Read the file's axes as north, east, down; time from its first sample on."""
+    """Convert the axes of the file to north, east, down; time since its first sample."""
     order, sign = FRAMES[frame]
     time = samples.index.to_numpy()
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
@@ -86,40 +86,40 @@ def file_track(samples: pd.DataFrame, frame: str) -> SampledTrack:
 
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
-    """Resample to the grid that begins with the track, gaps marked."""
+    """Resample a track to a regular grid, with gaps marked."""
     grid = np.arange(track.time_s[0], track.time_s[-1], STEP_S)
     known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, GAP_S))
     return SampledTrack(grid, track.at(grid)[0], known)
 
 
 def remove_spikes(track: SampledTrack, window: int = 3) -> SampledTrack:
-    """Without single outliers, or more with a longer median."""
+    """Remove single outliers by a median filter; a longer window removes more."""
     return replace(track, position_m=median_filter(track.position_m, size=(window, 1)))
 
 
 def band_pass(position_m: Array) -> Array:
-    """Band-pass without delay."""
+    """Band-pass positions without delay."""
     sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / STEP_S, output="sos")
     padding = min(round(BAND_PADDING_S / STEP_S), len(position_m) - 1)
     return sosfiltfilt(sos, position_m, axis=0, padlen=padding)
 
 
 def remove_edges(track: SampledTrack) -> SampledTrack:
-    """Without what the filter's transients spoil, next to gaps too."""
+    """Mark the filter transients at the ends and gaps as invalid."""
     edge = round(BAND_EDGE_S / STEP_S)
     return replace(track, valid=binary_erosion(track.valid, np.ones(2 * edge + 1, dtype=bool)))
 
 
 def horizontal_range_m(track: SampledTrack) -> float:
-    """Larger horizontal range (m), noise and outliers left out."""
+    """Return the larger horizontal range (m), without noise and outliers."""
     return float(np.max(np.ptp(remove_spikes(track, 5).position_m[:, :2], axis=0)))
 
 
 def _ekf2_track(state: pd.DataFrame) -> SampledTrack:
-    """EKF2's position on the grid, smoothed."""
+    """Return EKF2's position on the grid, smoothed."""
     known = finite_rows(state, Columns.POSITION[:2])
     if len(known) < MIN_SAMPLES:
-        raise NoMatchError("EKF2 has no horizontal position in this log")
+        raise NoMatchError("no horizontal EKF2 position in the log")
     time, position = known.index.to_numpy(), known[Columns.POSITION].to_numpy()
     grid = resample_to_grid(SampledTrack(time, position, np.ones(len(known), dtype=bool)))
     smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / STEP_S, axis=0, mode="nearest")
@@ -127,9 +127,9 @@ def _ekf2_track(state: pd.DataFrame) -> SampledTrack:
 
 
 def ekf2_references(flight: Flight) -> list[SampledTrack]:
-    """EKF2's position as published and, where it was reset horizontally, without those resets.
+    """Return EKF2's position as published and, with horizontal resets, also without them.
 
-    Height is always as published: most of its resets correct an error of before take-off.
+    The height is always as published: most of its resets correct an error from before take-off.
     """
     if isinstance(flight.ekf2, Unavailable):
         raise NoMatchError("the log has no EKF2 position")
@@ -144,12 +144,12 @@ def ekf2_references(flight: Flight) -> list[SampledTrack]:
         states.append(state.assign(**(state[Columns.POSITION] - reset_sum_m)))
     references = [_ekf2_track(state) for state in states]
     if max(map(horizontal_range_m, references)) < MIN_MOTION_M:
-        raise NoMatchError("EKF2's position hardly moves")
+        raise NoMatchError("the EKF2 position hardly changes")
     return references
 
 
 def imu_references(flight: Flight) -> list[SampledTrack]:
-    """Acceleration integrated twice, band-passed after each integration."""
+    """Return the acceleration integrated twice, band-passed after each integration."""
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError("the log has no acceleration in NED")
@@ -157,7 +157,7 @@ def imu_references(flight: Flight) -> list[SampledTrack]:
     velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
     grid = resample_to_grid(SampledTrack(time, velocity, np.ones(len(time), dtype=bool)))
     if len(grid.time_s) * STEP_S < MIN_OVERLAP_S:
-        raise NoMatchError("the IMU's record is too short")
+        raise NoMatchError("the IMU data are too short")
     position = cumulative_trapezoid(band_pass(grid.position_m), dx=STEP_S, axis=0, initial=0)
     return [remove_edges(replace(grid, position_m=band_pass(position), name=IMU))]
 
@@ -165,12 +165,12 @@ def imu_references(flight: Flight) -> list[SampledTrack]:
 def placed_samples(
     samples: pd.DataFrame, frame: str, yaw_rad: float, origin_m: Array, lag_s: float
 ) -> pd.DataFrame:
-    """NED positions and variances: R·C·p + origin, and the diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ."""
+    """Return NED positions R·C·p + origin, and variances: diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ."""
     track = file_track(samples, frame)
     position = track.position_m.copy()
     order, _ = FRAMES[frame]
     variance = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, order] ** 2
-    if yaw_rad:  # at 0 a missing sigma of one axis is none of the other's
+    if yaw_rad:  # without rotation a missing sigma of one axis does not affect the other
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         turn = np.array([[c, -s], [s, c]])
         position[:, :2] = position[:, :2] @ turn.T
@@ -182,7 +182,7 @@ def placed_samples(
 
 
 def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> SampledTrack:
-    """EKF2's track with its resets treated as the placed file has it."""
+    """Return EKF2's track with its resets corrected for the comparison with the placed file."""
     track = PositionTrack("", POSITION_FILE, "", placed, "NED", "", ())
     segment = Segment(float(placed.index[0]), float(placed.index[-1]), "")
     return _ekf2_track(continuous_state(ekf2, track, segment)[0])

@@ -1,1 +1,1 @@
-"""A flight's odometry as a loop: part, closure, correction."""
+"""Loops of odometry: segment, loop closure, and correction of the path."""

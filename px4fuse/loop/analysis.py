@@ -1,4 +1,4 @@
-"""A loop from what was given: which part, where it ended, what it is scored against."""
+"""Loop analysis: segment, landing place, closures, corrections and their scores."""
 
 from collections.abc import Callable
 
@@ -17,14 +17,14 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, by_axis, cumulative_distance
 
-# Where stamps are UNIX time, a smaller time counts from the first pose
+# s; with UNIX timestamps, smaller times count from the first pose
 SMALLEST_STAMP_S = 1e6
-# A path that is shorter is no loop, whatever its ends
+# m; shortest path of a loop
 MIN_PATH_M = 2.0
-# What `compare` takes for a loop: this long, and ending within this share of its length
+# loops in compare: shortest path (m), and largest end distance as fraction of the path
 LOOP_MIN_PATH_M = 10.0
 LOOP_MAX_GAP_SHARE = 0.10
-# In m, or degrees: what is larger was mistyped
+# m or degrees; limit of options
 MAX_VALUE = 100.0
 
 
@@ -39,18 +39,18 @@ def analyse(
     Parameters
     ----------
     source : LoopSource
-        What was read.
+        Trajectory, and its flight.
     request : LoopRequest, optional
-        How it is measured; its times are as the trajectory counts, where those are UNIX time small
-        ones count from the first pose. Where it does not say where the vehicle landed, that is the
-        truth in the log where there is one, else the place of take-off.
+        Options. Times are on the clock of the trajectory; with UNIX timestamps, small times count
+        from the first pose. The landing place is by default that of the ground truth in the log,
+        else the take-off place.
     reference : Trajectory, optional
-        Scored against, besides the truth in the log.
+        Reference for the scores, besides the ground truth in the log.
 
     Raises
     ------
     TrajectoryError, SettingsError
-        The part is too short, a closure lies outside it, or a number is out of range.
+        The segment is too short, a closure is outside of it, or a number is out of range.
     """
     request = request or LoopRequest(source=source.trajectory.name)
     noise = OdometryNoise(request.position_drift_m, request.heading_drift_deg)
@@ -91,7 +91,7 @@ def analyse(
     graph, nodes, statement = pose_graph(path, frames, claims, noise)
     notes = [*z_down_trajectory.notes, statement]
     if isinstance(by_truth, str):
-        notes.append(f"the truth does not tell where it ended: {by_truth}")
+        notes.append(f"the landing place is not in the ground truth: {by_truth}")
     gated_closures = gate_closures(graph, claims)
     graph_corrections, gated_closures = solve_all(path, nodes, graph, gated_closures, progress)
     end_m, heading = path.position_m[-1] - path.position_m[0], part.heading_change_deg(path)
@@ -105,7 +105,7 @@ def analyse(
     corrected_by_distance = correct_paths_by_distance(
         path, distance, misclosure_m, heading_error, landing
     )
-    references = tuple(one for one in (truth, reference) if one is not None)
+    references = tuple(track for track in (truth, reference) if track is not None)
     error = error_axes = None
     if not isinstance(misclosure_m, Unavailable):
         error, error_axes = float(np.linalg.norm(misclosure_m)), by_axis(path.frame, misclosure_m)
@@ -143,10 +143,12 @@ def analyse(
 def _find_known_end(
     path: Trajectory, request: LoopRequest, by_truth: KnownEnd | str | None
 ) -> KnownEnd | Unavailable:
-    """Where it really ended: as measured, else by the truth in the log, else where it began."""
+    """Return the landing place: measured, by ground truth, or the take-off place."""
     if request.landed_at is not None:
         if not request.came_back:
-            raise SettingsError("`landed_at` and `came_back` exclude each other", "Leave one out.")
+            raise SettingsError(
+                "`landed_at` and `came_back` exclude each other.", "Omit one of them."
+            )
         return part.measured_end(path, request.landed_at)
     if not request.came_back:
         return Unavailable("closure error", "the loop is declared open (--open)", "Remove --open.")
@@ -154,23 +156,21 @@ def _find_known_end(
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
-    """Whether it follows a position that the flight was told, and no odometry."""
+    """Return True if the track follows an external position source without odometry."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
     no_odometry = isinstance(odometry_of(flight), Unavailable)
     return trajectory.kind in ("ekf2", "kf") and has_vision and no_odometry
 
 
 def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Indices of poses that are key frames, and the distance along them at each pose."""
+    """Return the indices of the key frames, and the distance along them at each pose."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     frames = key_frames(path.position_m, spacing_m)
     along = cumulative_distance(path.position_m[frames])
     if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
         raise TrajectoryError(
-            (
-                f"{path.name}: the path is only {along[-1]:.2f} m long (key frame spacing "
-                f"{spacing_m:g} m), too short for a loop."
-            ),
+            f"{path.name}: the path is only {along[-1]:.2f} m long (key frame spacing "
+            f"{spacing_m:g} m), too short for a loop.",
             "Choose a longer part (--from, --to) or a smaller --key-frames.",
         )
     return frames, np.interp(path.time_s, path.time_s[frames], along)
@@ -178,43 +178,43 @@ def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
 
 def _require_in_range(name: str, value: float, least: float) -> None:
     if not least <= value <= MAX_VALUE:
-        raise SettingsError(f"`{name}` {value:g} is outside {least:g} to {MAX_VALUE:g}.")
+        raise SettingsError(f"`{name}` {value:g} is out of range ({least:g} to {MAX_VALUE:g}).")
 
 
 def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
-    """Refuse a closure outside the path, one that leads back in time, and one without width."""
+    """Raise TrajectoryError if times or σ of a closure are out of range."""
     (low, high), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
     label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
     if not low <= times[0] < times[1] <= high:
         raise TrajectoryError(
-            f"{label}: both times must be in ascending order and on the path, which runs "
-            f"from {low:.2f} s to {high:.2f} s."
+            f"{label}: the times must be in ascending order and on the path "
+            f"({low:.2f} s to {high:.2f} s)."
         )
     if not 1e-4 <= closure.sigma_m <= MAX_VALUE:
-        raise TrajectoryError(f"{label}: SIGMA {closure.sigma_m:g} is outside 0.0001 to 100 m.")
+        raise TrajectoryError(
+            f"{label}: SIGMA {closure.sigma_m:g} is out of range (0.0001 to 100 m)."
+        )
 
 
 def _heading_error(end: KnownEnd | Unavailable, heading_deg: float | None) -> float | Unavailable:
-    """How far the heading is off at the end (°)."""
-    what = "heading misclosure"
+    """Return the heading error at the end (°), or Unavailable."""
+    what = "heading error of the loop"
     if isinstance(end, Unavailable):
         return end
     if heading_deg is None:
-        return Unavailable(what, "the trajectory has no orientations", "None needed.")
+        return Unavailable(what, "the trajectory has no orientations", "No action needed.")
     if end.heading_change_deg is None:
         return Unavailable(
-            f"{what}",
-            (
-                f"the final heading differs by {heading_deg:+.0f}° from the initial one, and "
-                "the true rotation is not known"
-            ),
+            what,
+            f"the final heading differs by {heading_deg:+.0f}° from the initial one, and "
+            "the true rotation is not known",
             "Give it as the third number of --landed-at FORWARD,RIGHT,DEG.",
         )
     return float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
 
 
 def truth_of(flight: Flight) -> Trajectory | None:
-    """Ground truth of a flight; None without any."""
+    """Return the ground truth of a flight; None if it is missing."""
     try:
         return trajectory_of(flight, "truth")
     except MissingDataError:
@@ -224,9 +224,9 @@ def truth_of(flight: Flight) -> Trajectory | None:
 def analyse_flight_loop(
     flight: Flight, progress: Callable[[str], None] = lambda _: None
 ) -> Loop | Unavailable:
-    """The loop that a flight's odometry holds, for ``px4fuse compare``.
+    """Analyse the loop of a flight's odometry, for ``px4fuse compare``.
 
-    Unavailable where there is no odometry, or where it does not come back near its start.
+    Unavailable without odometry, or if the odometry does not return near its start.
     """
     odometry = odometry_of(flight)
     try:
@@ -234,7 +234,7 @@ def analyse_flight_loop(
     except MissingDataError as error:  # too few poses, or none
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         return Unavailable(
-            "loop closure", f"{reason}", "A loop needs visual-inertial odometry, sent as ODOMETRY."
+            "loop closure", reason, "A loop needs visual-inertial odometry, sent as ODOMETRY."
         )
     segment, _ = part.choose_loop_segment(flight, trajectory, None, None)
     time = trajectory.time_s
@@ -246,10 +246,8 @@ def analyse_flight_loop(
     if 2.0 * extent < LOOP_MIN_PATH_M or gap > LOOP_MAX_GAP_SHARE * 2.0 * extent:
         return Unavailable(
             "loop closure",
-            (
-                f"the odometry ends {gap:.1f} m from its start and spans {extent:.1f} m, so "
-                "it is not a loop"
-            ),
+            f"the odometry ends {gap:.1f} m from its start and spans {extent:.1f} m, so "
+            "it is not a loop",
             "Fly back to the take-off place, or use px4fuse loop with --closure.",
         )
     return analyse(LoopSource(trajectory, flight), progress=progress)

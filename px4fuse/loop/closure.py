@@ -1,6 +1,6 @@
-"""Loop closure by hand: path length, misclosure, and its distribution by distance.
+"""Loop closure by distance: key frames, path length, and distribution of the closure error.
 
-Positions have z down here (NED, or forward-right-down at the start); see :func:`to_z_down`.
+Positions have z down (NED, or forward-right-down at the start); see :func:`to_z_down`.
 """
 
 from dataclasses import replace
@@ -13,32 +13,37 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
-# Which of x, y, z of a frame is forward or north, right or east, and down, and with which sign
+# by frame: indices of forward (north), right (east), down in x, y, z; signs; new frame; note
 _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
-    "ENU": ([1, 0, 2], [1.0, 1.0, -1.0], "NED", "east, north, up turned into north, east, down"),
+    "ENU": (
+        [1, 0, 2],
+        [1.0, 1.0, -1.0],
+        "NED",
+        "converted from east, north, up to north, east, down",
+    ),
     "camera": (
         [2, 0, 1],
         [1.0, 1.0, 1.0],
         "FRD",
-        "the camera's right, down, forward turned into forward, right, down",
+        "converted from the camera's right, down, forward to forward, right, down",
     ),
     "unknown": (
         [0, 1, 2],
         [1.0, -1.0, -1.0],
         "FRD",
-        "the frame is not stated: z is taken to be up",
+        "the frame is unknown; z is assumed to be up",
     ),
 }
-# Key frames are this share of the extent apart, between these bounds: the path of a hand-held
-# camera over a desk and of a flight through a hall both bend on the scale of their own size
+# key frame spacing as fraction of the extent, and its bounds (m): the curvature of a path scales
+# with its size, for a camera above a desk as for a flight in a hall
 SPACING_SHARE = 0.02
 MIN_SPACING_M, MAX_SPACING_M = 0.02, 0.5
 
 
 def to_z_down(trajectory: Trajectory) -> Trajectory:
-    """The same trajectory in a frame with z down.
+    """Convert a trajectory to a frame with z down.
 
-    A camera's orientation becomes that of a vehicle whose nose is where the camera looks.
+    The orientation of a camera becomes that of a vehicle with its nose in the direction of view.
     """
     if trajectory.frame not in _TO_Z_DOWN:
         return trajectory
@@ -53,7 +58,7 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
 
 
 def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
-    """What :func:`to_z_down` made of a trajectory in ``frame``, turned back into that frame."""
+    """Convert a trajectory of :func:`to_z_down` back to its original ``frame``."""
     if frame not in _TO_Z_DOWN or trajectory.frame in _TO_Z_DOWN:
         return trajectory
     order, sign, _, _ = _TO_Z_DOWN[frame]
@@ -61,7 +66,7 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
-    """The same poses in another frame; a camera's axes turn with its world."""
+    """Rotate poses to another frame; camera axes rotate with the frame."""
     turn = Rotation.from_matrix(matrix)
     rotated = replace(trajectory.moved(trajectory.position_m @ matrix.T, turn), frame=frame)
     if rotated.rotation is None or "camera" not in (trajectory.frame, frame):
@@ -70,16 +75,16 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
 
 
 def key_frame_spacing_m(position_m: Array) -> float:
-    """Distance between key frames that suits a path, shape (n, d), in m."""
+    """Return the default key frame spacing (m) of a path, shape (n, d)."""
     extent = float(np.linalg.norm(np.ptp(position_m, axis=0)))
     return float(np.clip(SPACING_SHARE * extent, MIN_SPACING_M, MAX_SPACING_M))
 
 
 def key_frames(position_m: Array, spacing_m: float) -> IntArray:
-    """Indices of poses that are at least ``spacing_m`` from the one before, both ends included.
+    """Return indices of poses with a distance of at least ``spacing_m``, including both ends.
 
-    Length along every sample of a noisy track is too long: each step of 30 Hz adds the noise of
-    two positions. Steps that are long against the noise do not.
+    The length along every sample of a noisy track is too large: at 30 Hz each step adds the noise
+    of two positions. Steps that are long compared with the noise avoid this.
     """
     frame_indices = [0]
     last = position_m[0]
@@ -89,27 +94,27 @@ def key_frames(position_m: Array, spacing_m: float) -> IntArray:
             frame_indices.append(index)
             last = position
     if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last) < spacing_m / 2.0:
-        frame_indices.pop()  # so that the last step is not one of noise alone
+        frame_indices.pop()  # so that the last step is not only noise
     return np.array([*frame_indices, len(position_m) - 1])
 
 
 def distribute_by_distance(
     position_m: Array, misclosure_m: Array, cumulative_m: Array | None = None
 ) -> Array:
-    """Correct a path in proportion to cumulative distance: the surveyors' compass rule.
+    """Correct a path in proportion to the distance: compass rule (Bowditch).
 
     p_k' = p_k - (s_k / s_n) · e
 
-    It is what a pose graph gives when the variance of a step's translation is proportional to its
-    length and orientation is perfect.
+    A pose graph gives the same result if the variance of each translation is proportional to its
+    length and the orientation is perfect.
 
     Parameters
     ----------
     position_m : ndarray, shape (n, d)
     misclosure_m : ndarray, shape (d,)
-        e, where the path ends minus where it should end.
+        Closure error e: measured end minus true end.
     cumulative_m : ndarray, shape (n,), optional
-        s, by default of the positions themselves.
+        Distance s, by default along the positions.
 
     Returns
     -------
@@ -125,9 +130,9 @@ def distribute_by_distance(
 
 
 def heading_change_rad(rotation: Rotation) -> float:
-    """Turn about the vertical that is part of a rotation within a frame with z down.
+    """Return the rotation about the vertical (rad) of a rotation in a frame with z down.
 
-    The twist of the swing-twist decomposition about z; positive is clockwise seen from above.
+    Twist of the swing-twist decomposition about z; positive is clockwise seen from above.
     """
     _, _, z, w = rotation.as_quat()
     return float(lie.wrap(2.0 * np.arctan2(z, w)))
@@ -136,12 +141,11 @@ def heading_change_rad(rotation: Rotation) -> float:
 def correct_by_distance(
     trajectory: Trajectory, cumulative_m: Array, misclosure_m: Array, misclosure_heading_rad: float
 ) -> Trajectory:
-    """Distribute a misclosure of position and heading by distance.
+    """Distribute the closure errors of position and heading by distance.
 
-    Orientations are turned back by the share of the heading misclosure that their distance gives
-    (slerp about the vertical), the steps between poses are turned with them, and what is left of
-    the misclosure of position is distributed by the compass rule. Without turning the steps the
-    shape would shear.
+    Each orientation is corrected by its share of the heading error (slerp about the vertical). The
+    steps between poses are rotated with them, because the shape would shear otherwise. The
+    remaining position error is distributed by the compass rule.
 
     Parameters
     ----------
@@ -150,9 +154,9 @@ def correct_by_distance(
     cumulative_m : ndarray, shape (n,)
         Distance along the path at each pose.
     misclosure_m : ndarray, shape (3,)
-        Where the path ends minus where it should end.
+        Measured end minus true end.
     misclosure_heading_rad : float
-        Heading at the end minus what it should be; 0 where that is not known.
+        Measured final heading minus true one; 0 if unknown.
     """
     position = trajectory.position_m
     share = cumulative_m / cumulative_m[-1]

@@ -1,4 +1,4 @@
-"""The paths of a loop: its closures judged, the path corrected in several ways, each scored."""
+"""Corrections of a loop: test of its closures, corrected paths, and scores of each path."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -24,7 +24,7 @@ from px4fuse.trajectory.model import Trajectory
 UNCORRECTED = "uncorrected"
 POSITIONS_ONLY = "by distance, positions only"
 BY_DISTANCE = "by distance, headings too"
-# What the ways are called
+# names of the corrections
 NAMES: Mapping[str, str] = {
     "uncorrected": UNCORRECTED,
     "by_distance_plain": POSITIONS_ONLY,
@@ -32,10 +32,10 @@ NAMES: Mapping[str, str] = {
     **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
 }
 SINGLE_LOOP = (
-    "A single loop has no redundancy: nothing else in the graph can contradict it, so that robust "
-    "solving can reject nothing and only the gate can."
+    "A single loop has no redundancy: only the gate can reject it, robust optimisation cannot."
 )
-# A corrected path, and the solution of the pose graph where it is of one; or why there is none
+# corrected path with the solution of the pose graph, if it is of one; or the reason why it is
+# missing
 Corrected = tuple[Trajectory, Solution | None] | Unavailable
 
 
@@ -46,7 +46,7 @@ def correct_paths_by_distance(
     heading: float | Unavailable,
     landing: Closure | None,
 ) -> dict[Way, Corrected]:
-    """Positions alone (the lesson's Example 2), and headings too."""
+    """Correct the path by distance: positions only (as in the lesson), and with headings."""
     if landing is not None and not landing.accepted:
         misclosure_m = _rejected_closure("correction by distance", landing)
     if isinstance(misclosure_m, Unavailable):
@@ -62,22 +62,18 @@ def correct_paths_by_distance(
 
 def _rejected_closure(what: str, closure: Closure) -> Unavailable:
     return Unavailable(
-        f"{what}",
-        (
-            f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g}); "
-            "enforcing it would deform the whole path"
-        ),
-        (
-            "Measure the landing place (--landed-at), leave the landing out (--open), "
-            "or increase --drift if this odometry drifts more."
-        ),
+        what,
+        f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g}); "
+        "enforcing it would deform the whole path",
+        "Measure the landing place (--landed-at), leave the landing out (--open), "
+        "or increase --drift if this odometry drifts more.",
     )
 
 
 def gate_closures(
     graph: PoseGraph | Unavailable, claims: Sequence[ClosureClaim]
 ) -> tuple[Closure, ...]:
-    """What odometry says of each closure: the last edges of the graph; none without a graph."""
+    """Test each closure (last edges of the graph) against odometry; empty without graph."""
     if isinstance(graph, Unavailable):
         return ()
     edges = np.arange(len(graph.first) - len(claims), len(graph.first))
@@ -99,10 +95,10 @@ def solve_all(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[Way, Corrected], tuple[Closure, ...]]:
-    """Solve the graph with all closures, with the good ones, and robustly, which weighs them."""
+    """Optimise the graph with all closures, with the accepted ones, and robustly."""
     found: dict[Any, Corrected] = {}
     if isinstance(graph, Unavailable) or not closures:
-        none = Unavailable("pose graph", "there is no closure", "Give one with --closure.")
+        none = Unavailable("pose graph", "no loop closure", "Give one with --closure.")
         why = graph if isinstance(graph, Unavailable) else none
         found |= {f"pose_graph_{name}": why for name in SOLUTIONS}
         return found, ()
@@ -112,7 +108,7 @@ def solve_all(
     rejected[loops] = [not closure.accepted for closure in closures]
     for name, label in SOLUTIONS.items():
         way, robust = f"pose_graph_{name}", ROBUST.get(name, "none")
-        progress(f"solving: {label}")
+        progress(f"optimising: {label}")
         if robust != "none" and len(closures) < 2:
             more = "Give further closures with --closure."
             found[way] = Unavailable(label, SINGLE_LOOP, more)
@@ -136,7 +132,7 @@ def solve_all(
 def _interpolate_corrections(
     path: Trajectory, nodes: IntArray, before: Array, after: Array
 ) -> Trajectory:
-    """All poses of a path, each moved as the nodes before and after it were."""
+    """Correct all poses by interpolating the corrections of the neighbouring nodes."""
     turn = Rotation.from_quat(after[:, 3:]) * Rotation.from_quat(before[:, 3:]).inv()
     left = np.searchsorted(nodes, np.arange(len(path)), side="right") - 1
     left = np.clip(left, 0, len(nodes) - 2)
@@ -156,7 +152,7 @@ def score_all(
     corrected_paths: Mapping[Way, Corrected],
     references: tuple[Trajectory, ...],
 ) -> dict[Way, CorrectedPath | Unavailable]:
-    """The odometry, and every path, scored; the clocks are matched once, on the odometry."""
+    """Score odometry and corrected paths; time offsets are estimated once, on the odometry."""
     offsets: dict[str, float] = {}
 
     def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:

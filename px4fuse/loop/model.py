@@ -1,4 +1,4 @@
-"""What is known of a loop, as it is computed and written: ends, closures, corrected paths."""
+"""Results of a loop analysis: landing place, closures, corrected paths."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,7 +15,7 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisLengths, Frame, Kind, Trajectory
 
-# How a path is corrected; the part after "pose_graph_" as in `trajectory.graph.analysis.SOLUTIONS`
+# correction of a path; after "pose_graph_" a key of trajectory.graph.analysis.SOLUTIONS
 Way = Literal[
     "uncorrected",
     "by_distance_plain",
@@ -29,19 +29,19 @@ LANDING = "landing"
 
 
 class KnownEnd(Record, frozen=True, kw_only=True):
-    """Where the vehicle really ended, seen from where it began.
+    """True landing place relative to the take-off place.
 
     Attributes
     ----------
     displacement_m : mapping from the name of an axis to float
     heading_change_deg : float or None
-        From the first heading to the last, clockwise; None where it is not known.
+        Final heading minus initial heading, clockwise; None if unknown.
     sigma_m, sigma_heading_deg : float
-        Standard deviations; that of the heading where it is known.
+        Standard deviations; the latter None if the heading is unknown.
     source : str
-        Who says so.
+        Origin of the landing place.
     assumed : bool
-        Whether nobody knows.
+        True if the take-off place is assumed.
     """
 
     displacement_m: AxisLengths
@@ -53,28 +53,28 @@ class KnownEnd(Record, frozen=True, kw_only=True):
 
     @property
     def displacement(self) -> Array:
-        """In the frame of the trajectory, shape (3,), in m."""
+        """Displacement in the frame of the trajectory (m), shape (3,)."""
         return np.array(list(self.displacement_m.values()))
 
 
 class OdometryNoise(Record, frozen=True, omit_defaults=False):
-    """Drift of an odometry as random walks over distance and over time.
+    """Drift of odometry: random walks over distance and over time.
 
     Attributes
     ----------
     position_m : float
-        Standard deviation of position, each axis, after 100 m by steps of translation alone.
+        Standard deviation of the position per axis after 100 m, by errors of translation only.
     heading_deg : float
-        Standard deviation of heading after 100 m.
+        Standard deviation of the heading after 100 m.
     position_m_per_root_s, heading_deg_per_root_s : float
-        The same for the time that passes, hovering included (m/√s, °/√s).
+        Drift over time, also while hovering (m/√s, °/√s).
     tilt_share : float
-        Drift of roll and pitch against that of heading: gravity holds them.
+        Drift of roll and pitch relative to that of heading; gravity limits it.
 
     Notes
     -----
-    The defaults are what indoor visual-inertial odometry reaches: about 1 % of the distance
-    (Delmerico and Scaramuzza 2018; Intel's data sheet of the T265 states the same).
+    The defaults are those of indoor visual-inertial odometry: about 1 % of the distance (Delmerico
+    and Scaramuzza 2018; Intel's data sheet of the T265 states the same).
     """
 
     position_m: NotNegative = 1.0
@@ -85,22 +85,22 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
 
 
 class Closure(Record, frozen=True, kw_only=True):
-    """Two times at one place, what the gate says of it, and its weights in robust solutions.
+    """Loop closure: two times at the same place, with gate result and robust weights.
 
     Attributes
     ----------
     time_1_s, time_2_s : float
-        In the trajectory's own time.
+        On the clock of the trajectory.
     sigma_m : float
         Standard deviation of the displacement, each axis.
     source : str
         "landing", or "given".
     distance_m : float
-        By which the odometry misses it.
+        Closure error of the odometry.
     d2, degrees_of_freedom, p, accepted
-        As :class:`~px4fuse.trajectory.graph.covariance.GateResult` has them.
+        See :class:`~px4fuse.trajectory.graph.covariance.GateResult`.
     weight_dcs, weight_gnc : float or None
-        What robust solving gives it, 0 to 1; None where there is no redundancy.
+        Weights of robust optimisation, 0 to 1; None without redundancy.
     """
 
     time_1_s: float
@@ -122,7 +122,7 @@ class Closure(Record, frozen=True, kw_only=True):
 
 
 class Correction(Record, frozen=True, kw_only=True):
-    """How far a path was moved, the pose graph's costs, and scores by reference."""
+    """Size of a correction, cost of the pose graph, and scores by reference."""
 
     moved_max_m: NotNegative
     moved_rms_m: NotNegative
@@ -134,18 +134,18 @@ class Correction(Record, frozen=True, kw_only=True):
 
 
 class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
-    """A corrected path, or the odometry itself.
+    """Corrected path, or the odometry.
 
     Attributes
     ----------
-    scores : mapping from the reference's name to Evaluation or Unavailable
+    scores : mapping from the name of the reference to Evaluation or Unavailable
     name : str
     trajectory : Trajectory
-        All poses of the part, corrected.
+        All poses of the segment, corrected.
     moved_m : ndarray, shape (n,)
-        How far each pose moved.
+        Size of the correction of each pose.
     solution : Solution or None
-        Of a pose graph.
+        Solution of the pose graph.
     """
 
     schema_type = Correction
@@ -159,13 +159,12 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
 
 
 class LoopResult(Record, frozen=True, kw_only=True):
-    """A path that truly returns.
+    """Loop: path, landing place, closure errors and corrections, for the results.
 
-    ``closure_error_m`` is how far its end is from where the vehicle really ended;
-    ``closure_percent`` the same in per cent of the path; ``absolute`` says that the track follows
-    a positioning system and does not drift. ``by_distance_plain`` of the corrections moves
-    positions alone, as the lesson's Example 2; ``by_distance`` turns headings too, where it is
-    known how far they are off.
+    ``closure_error_m``: distance between measured and true end; ``closure_percent``: the same in
+    per cent of the path length; ``absolute``: the track follows a positioning system and does not
+    drift. Correction ``by_distance_plain`` changes positions only (Example 2 of the lesson);
+    ``by_distance`` also headings, if their error is known.
     """
 
     track: str
@@ -193,7 +192,7 @@ class LoopResult(Record, frozen=True, kw_only=True):
 
 
 class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
-    """The result of ``px4fuse loop``: what is written, and the paths.
+    """Result of ``px4fuse loop``, with the paths.
 
     Attributes
     ----------
@@ -201,12 +200,12 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
     nodes : ndarray of int, shape (k,)
         Key frames, as indices of poses.
     distance_m : ndarray, shape (n,)
-        Along the path at each pose, by key frames.
+        Distance along the key frames at each pose.
     graph : PoseGraph or Unavailable
-        With all closures, before it is solved.
+        With all closures, before optimisation.
     references : tuple of Trajectory
     original_frame : Frame
-        That of the trajectory as it was given.
+        Frame of the trajectory as given.
     """
 
     schema_type = LoopResult
@@ -221,18 +220,18 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def odometry(self) -> CorrectedPath:
-        """The part between take-off and landing as it was measured, in a frame with z down."""
+        """Uncorrected path from take-off to landing, in a frame with z down."""
         return self.paths["uncorrected"]
 
     @property
     def paths(self) -> dict[Way, CorrectedPath]:
-        """Every path that there is, the odometry first."""
+        """Available paths, the odometry first."""
         every = self.corrections.items()
         return {way: path for way, path in every if isinstance(path, CorrectedPath)}
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """The paths worth a row: each once."""
+        """Paths for reports, without duplicates."""
         same: set[Way] = set()
         if all(closure.accepted for closure in self.closures):
             same.add("pose_graph_all")
@@ -242,22 +241,22 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def best(self) -> CorrectedPath:
-        """The gated solution of the pose graph, else by distance, else the odometry."""
+        """Gated solution of the pose graph, else correction by distance, else odometry."""
         ways: tuple[Way, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
         return next(self.paths[way] for way in ways if way in self.paths)
 
     @property
     def is_end_assumed(self) -> bool:
-        """Whether the misclosure rests on the assumption that it landed where it took off."""
+        """True if the closure error assumes landing at the take-off place."""
         return isinstance(self.known_end, KnownEnd) and self.known_end.assumed
 
     def solved_graph(self) -> PoseGraph:
-        """The pose graph with all its closures, its poses those of the best solution there is.
+        """Return the pose graph with all closures and the poses of the best solution.
 
         Raises
         ------
         MissingDataError
-            There is no graph.
+            The graph is missing.
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")

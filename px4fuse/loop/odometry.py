@@ -1,4 +1,4 @@
-"""How odometry drifts, and the pose graph that follows from it."""
+"""Odometry drift, and the pose graph of a path with its closures."""
 
 from collections.abc import Sequence
 
@@ -14,35 +14,35 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# The reported variances of an odometry tell its drift only where they grow along the path
+# ratio of late to early reported variances above which they are used as drift
 MIN_VARIANCE_GROWTH = 2.0
-# Stated variances are floored at this share of the default drift: an edge must have a variance
+# lower limit of reported variances, as fraction of the default drift: edges need a variance
 FLOOR_SHARE = 1e-2
-END_SHARE = 0.1
-# A closure that was given, or that of the landing and where that was
+END_SHARE = 0.1  # fraction of the path whose variances count as early, and as late
+# closure, and its landing place if it is that of the landing
 ClosureClaim = tuple[GivenClosure, KnownEnd | None]
 
 
 def odometry_variances(
     path: Trajectory, nodes: IntArray, noise: OdometryNoise
 ) -> tuple[Array, Array, str]:
-    """Variances of the steps between nodes of a path.
+    """Compute the variances of the steps between nodes of a path.
 
     Parameters
     ----------
     nodes : ndarray of int, shape (k,)
-        Poses that become nodes of the graph.
+        Poses that are nodes of the graph.
     noise : OdometryNoise
-        Taken where the trajectory does not report variances that grow.
+        Used if the reported variances of the trajectory do not grow.
 
     Returns
     -------
     translation : ndarray, shape (k - 1,)
         m², each axis.
     rotation : ndarray, shape (k - 1, 3)
-        rad², about the body's axes.
+        rad², about the body axes.
     statement : str
-        Where they are from.
+        Origin of the variances.
     """
     length = np.diff(cumulative_distance(path.position_m[nodes]))
     duration = np.diff(path.time_s[nodes])
@@ -51,24 +51,24 @@ def odometry_variances(
     heading = heading + np.radians(noise.heading_deg_per_root_s) ** 2 * duration
     tilt = noise.tilt_share**2 * heading
     rotation = np.column_stack([tilt, tilt, heading])
-    noise_origin = "the defaults" if noise == OdometryNoise() else "as set"
-    format_noise = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
-    statements = [f"drift of the odometry: {format_noise} (one standard deviation, {noise_origin})"]
+    noise_origin = "default" if noise == OdometryNoise() else "as given"
+    noise_text = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
+    statements = [f"odometry drift: {noise_text} (1 σ, {noise_origin})"]
     reported = _variance_growth(path.position_variance_m2, nodes)
     if reported is not None:
         translation = np.maximum(reported.mean(axis=1), FLOOR_SHARE * translation)
-        statements.append("translation as the log's own position variances grow")
+        statements.append("translation: growth of the logged position variances")
     elif path.position_variance_m2 is not None:
-        statements.append("the log's own position variances do not grow, so they tell no drift")
+        statements.append("the logged position variances do not grow and are not used as drift")
     rotation_growth = _variance_growth(path.rotation_variance_rad2, nodes)
     if rotation_growth is not None:
         rotation = np.maximum(rotation_growth, FLOOR_SHARE * rotation)
-        statements.append("rotation as the log's own orientation variances grow")
+        statements.append("rotation: growth of the logged orientation variances")
     return translation, rotation, "; ".join(statements)
 
 
 def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
-    """Growth of reported variances from node to node, shape (k - 1, 3); None without any."""
+    """Return the growth of variances between nodes, shape (k - 1, 3); None if small."""
     if variance is None:
         return None
     tenth = max(1, int(END_SHARE * len(variance)))
@@ -82,28 +82,30 @@ def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
 def pose_graph(
     path: Trajectory, frames: IntArray, claims: Sequence[ClosureClaim], noise: OdometryNoise
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
-    """Pose graph of a path: an edge from node to node by odometry, and one per closure.
+    """Build the pose graph of a path: edges between successive nodes, and per closure.
 
     Parameters
     ----------
     path : Trajectory
-        In a frame with z down; there is no graph of one without orientations.
+        In a frame with z down; with orientations.
     frames : ndarray of int, shape (f,)
         Key frames, as indices of poses.
-    claims : sequence of closure and, where it is that of the landing, where that was
+    claims : sequence of ClosureClaim
+        Closures, with the landing place for that of the landing.
 
     Returns
     -------
     graph : PoseGraph or Unavailable
-        Odometry edges first, closures after them in order.
+        Odometry edges first, then closures in order.
     nodes : ndarray of int, shape (k,)
-        Poses that are its nodes: the key frames, and those nearest to the times of the closures.
+        Poses that are nodes: key frames, and those nearest to the times of closures.
     statement : str
-        Where the variances are from.
+        Origin of the variances.
     """
     if path.rotation is None:
-        what = "the trajectory has no orientations"
-        return Unavailable("pose graph", what, "Give one that has."), frames, ""
+        reason = "the trajectory has no orientations"
+        remedy = "Use a trajectory with orientations."
+        return Unavailable("pose graph", reason, remedy), frames, ""
     times = np.array([(closure.time_1_s, closure.time_2_s) for closure, _ in claims]).reshape(-1, 2)
     at = np.abs(path.time_s - times[..., None]).argmin(axis=-1)
     nodes = np.union1d(frames, at).astype(np.intp)

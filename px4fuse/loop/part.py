@@ -1,4 +1,4 @@
-"""Which part of a trajectory is the loop, and where the vehicle really ended."""
+"""Segment of a trajectory that is the loop, and the true landing place."""
 
 from dataclasses import replace
 
@@ -14,27 +14,27 @@ from px4fuse.loop.model import KnownEnd
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, by_axis
 
-# Poses on the ground are averaged over this long, if they stay within this far of each other
+# s, m; averaging time of poses on the ground, and their largest range
 REST_S = 1.0
 REST_RANGE_M = 0.15
-# A vehicle that ends within this of its first heading was set down as it stood
+# a smaller heading change is assumed to be zero in truth
 SAME_HEADING_DEG = 15.0
 
 
 def cut_trajectory(trajectory: Trajectory, segment: Segment, at_rest: bool = False) -> Trajectory:
-    """The poses of a part of a trajectory; those on the ground at its ends averaged into one.
+    """Cut a trajectory to a segment; poses on the ground at its ends are averaged.
 
     Raises
     ------
     TrajectoryError
-        Fewer than three poses are in the part.
+        The segment contains fewer than three poses.
     """
     time = trajectory.time_s
     inside = (time >= segment.start_s) & (time <= segment.end_s)
     if inside.sum() < MIN_POSES:
         raise TrajectoryError(
-            f"{trajectory.name}: {int(inside.sum())} poses between {segment.start_s:.2f} s and "
-            f"{segment.end_s:.2f} s are too few (at least {MIN_POSES}); the trajectory runs from "
+            f"{trajectory.name}: only {int(inside.sum())} poses between {segment.start_s:.2f} s "
+            f"and {segment.end_s:.2f} s (at least {MIN_POSES} are needed). The trajectory is from "
             f"{time[0]:.2f} s to {time[-1]:.2f} s."
         )
     part = trajectory[inside]
@@ -44,7 +44,7 @@ def cut_trajectory(trajectory: Trajectory, segment: Segment, at_rest: bool = Fal
     quaternions = None if part.rotation is None else part.rotation.as_quat()
     for index, low in ((0, segment.start_s - REST_S), (-1, segment.end_s)):
         resting = trajectory[(time >= low) & (time <= low + REST_S)]
-        # not where it moves
+        # only if the vehicle is at rest
         if not len(resting) or np.linalg.norm(np.ptp(resting.position_m, axis=0)) > REST_RANGE_M:
             continue
         position[index] = resting.position_m.mean(axis=0)
@@ -57,26 +57,26 @@ def cut_trajectory(trajectory: Trajectory, segment: Segment, at_rest: bool = Fal
 def choose_loop_segment(
     flight: Flight | None, trajectory: Trajectory, start_s: float | None, end_s: float | None
 ) -> tuple[Segment, bool]:
-    """The part between first take-off and last landing, and whether the vehicle rests at its ends.
+    """Return the segment from take-off to landing; True if the vehicle rests at its ends.
 
     Parameters
     ----------
     flight : Flight or None
-        That the trajectory is part of; without one, all of the trajectory is the part.
+        Flight of the trajectory; without it the segment is the whole trajectory.
     start_s, end_s : float or None
-        Override either end.
+        Override an end.
 
     Raises
     ------
     SettingsError
-        The part is empty.
+        The segment is empty.
     """
     low, high = span = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     at_rest = False
     if flight is None:
         reason = "the whole trajectory"
     elif isinstance(flight.airborne, Unavailable) or not flight.airborne:
-        reason = "the whole track: no land detector says that it flies"
+        reason = "the whole track (no land detector in the log)"
     else:
         low, high = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
         reason = "from take-off to landing, by the land detector"
@@ -88,10 +88,8 @@ def choose_loop_segment(
         reason = "chosen with --from or --to"
     if not low < high:
         raise SettingsError(
-            (
-                f"No poses between {low:.12g} s and {high:.12g} s; the track runs from "
-                f"{span[0]:.2f} s to {span[1]:.2f} s."
-            ),
+            f"No poses between {low:.12g} s and {high:.12g} s; the track is from "
+            f"{span[0]:.2f} s to {span[1]:.2f} s.",
             "Change --from or --to.",
         )
     inside = max(low, span[0]), min(high, span[1])
@@ -101,29 +99,29 @@ def choose_loop_segment(
 
 
 def heading_change_deg(path: Trajectory) -> float | None:
-    """Last heading minus first, clockwise; None without orientations."""
+    """Return final minus initial heading (°), clockwise; None without orientations."""
     if path.rotation is None:
         return None
     return float(np.degrees(heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
 
 
 def assumed_end(path: Trajectory) -> KnownEnd:
-    """The vehicle ends where it began; with the same heading if the odometry nearly says so."""
+    """Return the take-off place as landing place; equal heading if odometry nearly agrees."""
     change = heading_change_deg(path)
     same = change is not None and abs(change) <= SAME_HEADING_DEG
-    heading = "with the same heading" if same else "its heading there is not known"
+    heading = " with the same heading" if same else "; final heading unknown"
     return KnownEnd(
         displacement_m=by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if same else None,
         sigma_m=0.10,
         sigma_heading_deg=5.0 if same else None,
-        source=f"assumed: it landed where it took off{', ' if same else '; '}{heading}",
+        source=f"assumed: landing at the take-off place{heading}",
         assumed=True,
     )
 
 
 def measured_end(path: Trajectory, landed: Landing) -> KnownEnd:
-    """Where the vehicle landed, measured with a tape from the place where it took off."""
+    """Return the landing place that was measured relative to the take-off place."""
     forward_m, right_m, turned_deg = structs.astuple(landed)
     heading = 0.0
     if path.rotation is not None:
@@ -135,9 +133,9 @@ def measured_end(path: Trajectory, landed: Landing) -> KnownEnd:
         heading_change_deg=turned_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if turned_deg is None else 2.0,
-        source=f"measured: it landed {abs(forward_m):g} m {'behind' if forward_m < 0 else 'ahead'} "
-        f"and {abs(right_m):g} m to the {'left' if right_m < 0 else 'right'} of where it took off "
-        "(--landed-at)",
+        source=f"measured: landing {abs(forward_m):g} m "
+        f"{'behind' if forward_m < 0 else 'ahead'} and {abs(right_m):g} m "
+        f"{'left' if right_m < 0 else 'right'} of the take-off place (--landed-at)",
         assumed=False,
     )
 
@@ -145,9 +143,9 @@ def measured_end(path: Trajectory, landed: Landing) -> KnownEnd:
 def true_end(
     path: Trajectory, truth: Trajectory, segment: Segment, at_rest: bool
 ) -> KnownEnd | str:
-    """Where the vehicle really ended, by the ground truth in the same log, or why not.
+    """Return the landing place by the ground truth in the log, or the reason why it is unknown.
 
-    The truth is turned into the odometry's frame by their headings at the start.
+    The ground truth is rotated into the odometry frame by the headings at the start.
     """
     try:
         true_path = cut_trajectory(truth, segment, at_rest)
@@ -160,13 +158,15 @@ def true_end(
         ned_displacement_m = Rotation.from_rotvec(turn * DOWN).apply(ned_displacement_m)
         change = heading_change_deg(true_path)
     elif path.frame != true_path.frame:
-        return "the truth has no orientation by which to turn it into the odometry's frame"
+        return (
+            "the ground truth has no orientation, so it cannot be rotated into the odometry frame"
+        )
     return KnownEnd(
         displacement_m=by_axis(path.frame, ned_displacement_m),
         heading_change_deg=change,
         sigma_m=0.02,
         sigma_heading_deg=None if change is None else 0.5,
-        source=f"the ground truth in the log ({truth.name}): it landed {landed_m:.2f} m from where "
-        "it took off",
+        source=f"ground truth in the log ({truth.name}): landing {landed_m:.2f} m from the "
+        "take-off place",
         assumed=False,
     )

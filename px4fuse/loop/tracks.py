@@ -1,4 +1,4 @@
-"""Trajectories from files of their own, or out of a flight: odometry, EKF2, our filter, truth."""
+"""Trajectories from files, or tracks of a flight log: odometry, EKF2, KF, ground truth."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,9 +28,9 @@ _G2O = (b"VERTEX_", b"EDGE_", b"FIX")
 
 
 def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
-    """The track that is an odometry: external vision with an orientation that turns.
+    """Return the odometry of a flight: external vision with a varying orientation.
 
-    A positioning system such as UWB sends no orientation, or always the same one.
+    Positioning systems such as UWB send no orientation, or a constant one.
     """
     for track in flight.positions:
         if track.origin.is_vision and track.orientation is not None:
@@ -39,29 +39,29 @@ def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
     return Unavailable(
         "visual-inertial odometry",
         f"the log has no external vision with orientation (position sources: {have})",
-        ("Send the odometry to PX4 as ODOMETRY, and set SDLOG_PROFILE to 129 to log it."),
+        "Send the odometry to PX4 as ODOMETRY, and set SDLOG_PROFILE to 129 to log it.",
     )
 
 
 def trajectory_of(flight: Flight, part: FlightPart) -> Trajectory:
-    """One part of a flight as a trajectory.
+    """Return a track of a flight as trajectory.
 
     Parameters
     ----------
     flight : Flight
     part : {"vio", "ekf2", "kf", "truth"}
-        "kf" is our filter, along north, east and down, with the autopilot's attitude.
+        "kf": KF along north, east and down, with the attitude of the autopilot.
 
     Raises
     ------
     MissingDataError
-        The log lacks it; the text says what would have logged it.
+        The log lacks the track; the message states how to log it.
     """
     if part == "kf":
         return _kf_trajectory(flight)
     found = {"vio": odometry_of(flight), "truth": flight.truth, "ekf2": flight.ekf2}[part]
     if isinstance(found, PositionTrack):
-        # where the log does not say, x is taken to be forward at the start
+        # without a frame in the log, x is assumed to be forward at the start
         frame: Frame = "NED" if found.frame == "NED" else "FRD"
         note = f"{found.name}: {found.description}"
         return _trajectory(flight, part, found.samples, found.orientation, (note,), frame)
@@ -69,7 +69,7 @@ def trajectory_of(flight: Flight, part: FlightPart) -> Trajectory:
         return _trajectory(flight, part, found.samples, found.attitude, (found.name,))
     if not isinstance(found, Ekf2):
         raise MissingDataError(f"{flight.log.name}:{part}: {found.reason}", f"{found.remedy}")
-    state, notes = found.state, ["EKF2's position as published"]
+    state, notes = found.state, ["EKF2 position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
         log_segment = Segment(0.0, flight.log.duration_s, "the whole log")
@@ -84,7 +84,7 @@ def _kf_trajectory(flight: Flight) -> Trajectory:
     position = pd.DataFrame({name: axis.replay.steps["position_m"] for name, axis in columns})
     used = kf_comparison.settings
     noises = f"SIGMA_A {used.sigma_a_m_s2:g} m/s², SIGMA_Z {used.sigma_z_m:g} m"
-    note = f"our filter over {kf_comparison.source.name}, {noises}"
+    note = f"KF with the positions {kf_comparison.source.name}, {noises}"
     return _trajectory(flight, "kf", position, flight.attitude, (note,))
 
 
@@ -96,7 +96,7 @@ def _trajectory(
     notes: tuple[str, ...],
     frame: Frame = "NED",
 ) -> Trajectory:
-    """Poses at the times of the positions, the orientation interpolated to them (slerp)."""
+    """Make a trajectory at the times of the positions, with interpolated orientation (slerp)."""
     samples = finite_rows(samples, Columns.POSITION)
     rotation, rotation_variance = None, None
     if isinstance(orientation, pd.DataFrame):
@@ -113,7 +113,7 @@ def _trajectory(
                 rotation_variance = np.column_stack(columns)
     if len(samples) < MIN_POSES:
         raise MissingDataError(
-            f"{flight.log.name}:{part}: {len(samples)} poses are too few (at least {MIN_POSES})."
+            f"{flight.log.name}:{part}: only {len(samples)} poses (at least {MIN_POSES} needed)."
         )
     return Trajectory(
         name=f"{flight.log.name}:{part}",
@@ -132,7 +132,7 @@ def _trajectory(
 
 
 def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
-    """Reported variances, shape (n, 3); None where there are none, or some are missing."""
+    """Return reported variances, shape (n, 3); None if any is missing."""
     if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
     return samples[columns].to_numpy(np.float64)
@@ -140,25 +140,25 @@ def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | No
 
 @dataclass(frozen=True)
 class LoopSource:
-    """A trajectory and, where it is part of one, the flight."""
+    """Trajectory and, for a track of a flight log, the flight."""
 
     trajectory: Trajectory
     flight: Flight | None
 
 
 def file_name(source: Path) -> str:
-    """What a source is called in a file name: ``flight_vio`` of ``flight.ulg:vio``."""
+    """Return the stem of output file names: ``flight_vio`` for ``flight.ulg:vio``."""
     path, part = split_part(str(source))
     return path.stem if part is None else f"{path.stem}_{part}"
 
 
 def split_part(argument: str) -> tuple[Path, FlightPart | None]:
-    """File and part of ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth``.
+    """Split ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth`` into file and track.
 
     Raises
     ------
     TrajectoryError
-        What follows the colon is no part.
+        The text after the colon is not a track.
     """
     full_path = Path(argument)
     path, colon, part = argument.rpartition(":")
@@ -175,12 +175,12 @@ def split_part(argument: str) -> tuple[Path, FlightPart | None]:
 
 
 def is_g2o(path: Path) -> bool:
-    """Whether a file is a pose graph in g2o's format.
+    """Return True if a file is a pose graph in g2o format.
 
     Raises
     ------
     TrajectoryError
-        It cannot be read.
+        The file cannot be read.
     """
     head = read_head(path, _HEAD_BYTES, TrajectoryError)
     return decode_text(head) is not None and any(
@@ -195,39 +195,36 @@ def read_source(
     frame: Frame | None = None,
     system: int | None = None,
 ) -> LoopSource:
-    """Read a trajectory from a file, or a part of a flight log.
+    """Read a trajectory from a file, or a track of a flight log.
 
     Parameters
     ----------
     argument : str
-        As :func:`split_part` takes it.
-    default : Part, optional
-        Part of a log that is taken where none is named; by default its odometry, or EKF2's track
-        where it has none.
+        See :func:`split_part`.
+    default : FlightPart, optional
+        Track of a log if none is named; by default its odometry, else EKF2's track.
     frame : Frame, optional
-        What a file's axes are, where that is known better than its reader can tell.
+        Frame of a trajectory file; by default detected.
     system : int, optional
         MAVLink system id.
 
     Raises
     ------
     TrajectoryError, LogError, MissingDataError
-        It cannot be read, or lacks the part.
+        The source cannot be read, or lacks the track.
     SettingsError
-        A flight log states its frame.
+        ``frame`` is given for a flight log.
     """
     path, part = split_part(argument)
     head = read_head(path, _HEAD_BYTES, TrajectoryError)
     if not head:
-        raise TrajectoryError(
-            f"{display_name(path)}: the file is empty", "Copy or export it again."
-        )
+        raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")
     if is_g2o(path):
         raise TrajectoryError(
             f"{display_name(path)} is a pose graph, not a trajectory.",
             f"Optimise it with px4fuse loop {display_name(path)}.",
         )
-    if decode_text(head) is not None:  # and so no flight log
+    if decode_text(head) is not None:  # text, so not a flight log
         if part is not None:
             raise TrajectoryError(
                 f"{display_name(path)} is a trajectory file and has no track {part!r}.", "Omit it."
@@ -236,10 +233,8 @@ def read_source(
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
         raise SettingsError(
-            (
-                f"--frame {frame.lower()} is only for trajectory files; {display_name(path)} "
-                "is a flight log, which defines its frame."
-            ),
+            f"--frame {frame.lower()} is only for trajectory files; {display_name(path)} "
+            "is a flight log, which defines its frame.",
             "Omit --frame.",
         )
     flight = read_log(path, system=system)

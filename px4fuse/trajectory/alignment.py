@@ -25,7 +25,7 @@ MAX_PLANE_RATIO, MAX_LINE_RATIO = 1.0, 2.0
 
 
 class Transform(Record, frozen=True):
-    """Similarity transform from the frame of the estimate to that of the reference: x ↦ scale · R x + t.
+    """Similarity transform x ↦ scale · R x + t, from the estimate's frame to the reference's.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ def _require_determined(
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
         limit = MAX_LINE_RATIO
         motion = f"motion is along a line: {length:.2g} m (RMS), across it"
-        instead = "--alignment yaw if z is vertical in both, or --alignment none"
+        instead = "`alignment` yaw if z is vertical in both, or `alignment` none"
     if extent_m < max(MIN_SPREAD_M, MIN_SHARE * length) or residual_m > limit * extent_m:
         raise TrajectoryError(
             f"Alignment {kind} cannot be estimated: the {motion} {extent_m:.2g} m, and the "

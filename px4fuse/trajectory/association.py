@@ -96,7 +96,7 @@ def associate(
             f"{time[-1]:.3f} s{added}, the reference {reference.name} from {first:.3f} to "
             f"{last:.3f} s.",
             "Check that both are of the same flight. If their clocks differ, give "
-            "--time-offset auto.",
+            "`time_offset_s` auto.",
         )
     outside = int(((time < first - end_tolerance_s) | (time > last + end_tolerance_s)).sum())
     steps = np.diff(time[pose_indices])

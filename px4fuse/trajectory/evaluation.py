@@ -201,7 +201,7 @@ def evaluate(
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
-    """Choose the alignment by the kinds of the two trajectories; return it with the reason, a sentence.
+    """Choose the alignment by the kinds of the trajectories; also return the reason, a sentence.
 
     Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
     is aligned in rotation and position, and in scale if it is monocular or the scale factor error

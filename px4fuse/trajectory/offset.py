@@ -119,7 +119,8 @@ def _search(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
     fits.sort(key=lambda fit: fit.misfit)
     if not fits:
         return _not_determinable(
-            "the offsets with correlated speeds do not fit the positions, or the overlap is too short"
+            "the offsets with correlated speeds do not fit the positions, or the overlap is "
+            "too short"
         )
     best = fits[0]
     similar_fits = [fit for fit in fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best.misfit]

@@ -331,7 +331,7 @@ def _resolved(value: Any) -> Any:
 
 
 def _kind(value: Any) -> type:
-    """Return the type of a PDF value: name is not string, stream not dictionary, flag not number."""
+    """Return the type of a PDF value; a name is not a string, a stream not a dictionary."""
     kinds = StreamObject, DictionaryObject, ArrayObject, NameObject
     if isinstance(value, TextStringObject | ByteStringObject):
         return str

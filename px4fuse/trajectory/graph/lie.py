@@ -102,7 +102,7 @@ def log(pose: Array) -> Array:
 
 
 def adjoint(pose: Array) -> Array:
-    """Return the adjoints: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45; Sola 2018, 159).
+    """Return the adjoints, ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45).
 
     Returns
     -------
@@ -147,7 +147,7 @@ def right_jacobian_inverse(tangent: Array) -> Array:
 
 
 def _commutator(tangent: Array) -> Array:
-    """Return ``ad`` of tangents: derivative of ``adjoint(exp(t tangent))`` at t = 0 (Barfoot 2017, 7.33)."""
+    """Return ``ad``, the derivative of ``adjoint(exp(t xi))`` at t = 0 (Barfoot 2017, 7.33)."""
     if tangent.shape[-1] == 3:
         x, y, theta = np.moveaxis(tangent, -1, 0)
         return from_elements((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
