@@ -1,4 +1,4 @@
-"""What README and documentation tell a newcomer to type works word for word."""
+"""Commands and examples in README and documentation run without changes."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def blocks(page: str, kind: str) -> list[str]:
 
 
 def commands(page: str) -> list[str]:
-    """Lines of a page to type, without the readers of pipes."""
+    """Return the px4fuse commands of a page, without the part after a pipe."""
     lines = [line for text in blocks(page, "sh") for line in text.splitlines()]
     return [line.split(" | ")[0] for line in lines if line.startswith("px4fuse ")]
 
 
 @pytest.fixture
 def at_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder that looks like a fresh clone, so that outputs do not land in this one."""
+    """Change to a folder with the content of a new clone, which receives the outputs."""
     samples = ROOT / "sample_logs"
     shutil.copytree(samples, tmp_path / "sample_logs")
     shutil.copytree(samples, tmp_path / "installed" / "px4fuse_samples")
@@ -52,12 +52,12 @@ def typed(line: str) -> str:
     return done(*shlex.split(line, comments=True)[1:]).output
 
 
-@pytest.mark.usefixtures("no_drawing", "at_root")  # tests of their own draw each kind of report
+@pytest.mark.usefixtures("no_drawing", "at_root")  # other tests draw the reports
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)])
 def test_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> None:
-    """What README has too is typed there."""
+    """Commands that are also in README run once, for README."""
     if page == "docs/instructors.md":
-        pytest.skip("a test of its own makes what its commands need")
+        pytest.skip("test_instructor_commands_run_in_order makes the files for these commands")
     monkeypatch.setattr(run, "run_bounded", in_turn)
     typed_there = commands("README.md") if page != "README.md" else []
     for number, line in enumerate(line for line in commands(page) if line not in typed_there):
@@ -75,7 +75,7 @@ def test_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("drawn_once", "at_root")
-def test_the_instructors_four_commands_run_in_order(monkeypatch) -> None:
+def test_instructor_commands_run_in_order(monkeypatch) -> None:
     in_this_process(monkeypatch)
     Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")
     Path("notes.md").write_text("# What I found\n\nThe stamps are late.\n")
@@ -91,7 +91,7 @@ def test_the_instructors_four_commands_run_in_order(monkeypatch) -> None:
 @pytest.mark.usefixtures("at_root")
 @pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
 def test_python_examples_run(page: str, capsys) -> None:
-    """In the page's order, on the tables that its own command extracts."""
+    """Examples run in the order of the page, on the tables that its px4fuse extract writes."""
     mpl.use("Agg")
     for line in commands(page):
         if line.startswith("px4fuse extract"):
@@ -103,12 +103,12 @@ def test_python_examples_run(page: str, capsys) -> None:
         numbers = re.findall(r"-?\d+\.\d+", said)
         assert numbers
         assert all(abs(float(number)) < 1e3 for number in numbers)
-        assert len(said.splitlines()) < 150 or "gain" in said  # no table is printed whole
+        assert len(said.splitlines()) < 150 or "gain" in said  # long tables are shortened
     pyplot.close("all")
 
 
 @pytest.mark.parametrize(("page", "most"), [("README.md", 3), ("docs/lab.md", 2)])
-def test_the_lab_has_a_command_for_each_step(page: str, most: int) -> None:
+def test_lab_has_commands_for_each_step(page: str, most: int) -> None:
     steps = re.split(r"\n\*\*\d\. ", PAGES[page].split("The lab in five steps\n")[-1])[1:]
     assert len(steps) == 5
     for number, step in enumerate(steps, 1):
@@ -117,7 +117,7 @@ def test_the_lab_has_a_command_for_each_step(page: str, most: int) -> None:
         assert page == "README.md" or f"reports/example/lab_{number}.png)" in step
 
 
-def test_pictures_are_small_and_made_by_the_script() -> None:
+def test_pictures_are_small_and_in_the_script() -> None:
     script = (ROOT / "tests" / "benchmarks" / "readme_pictures.py").read_text(encoding="utf-8")
     pictures = re.findall(r"!\[[^]]+\]\((\S+\.png)\)", README + PAGES["docs/lab.md"])
     assert len({Path(picture).name for picture in pictures}) == 7
@@ -128,7 +128,7 @@ def test_pictures_are_small_and_made_by_the_script() -> None:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shells_complete_as_said(shell, monkeypatch, capsys) -> None:
+def test_shell_completion_works_as_documented(shell, monkeypatch, capsys) -> None:
     said = PAGES["docs/commands.md"]
     assert all(f"`px4fuse {command}" in said for command in COMMANDS)
     assert f"_PX4FUSE_COMPLETE={shell}_source px4fuse" in said or f"`{shell}_source`" in said
@@ -153,7 +153,7 @@ def test_linked_files_and_headings_exist(page: str) -> None:
     for target in targets:
         target = target.partition("<")[2].removesuffix(">") or target  # noqa: PLW2901 - a download
         name, _, heading = target.partition("#")
-        if "//" in target or name.startswith("made/"):  # the build makes and checks these
+        if "//" in target or name.startswith("made/"):  # the build creates and checks these
             continue
         path = folder / name if name else ROOT / page
         assert path.exists(), target
@@ -164,8 +164,8 @@ def test_linked_files_and_headings_exist(page: str) -> None:
         assert not heading or heading in anchors, target
 
 
-def test_the_index_shows_the_readme_with_absolute_links() -> None:
-    """By the rules that the build gives its plugin."""
+def test_package_index_readme_has_absolute_links() -> None:
+    """Apply the substitutions of the build plugin."""
     import tomllib
 
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
