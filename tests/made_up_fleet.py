@@ -1,4 +1,4 @@
-"""A fleet as px4fuse batch writes it, made up: what its page and its reports are tested on."""
+"""Artificial table of px4fuse batch for tests of its page."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ DAMAGED = ("not a ULog file", "Give the log as the flight controller wrote it.")
 
 
 def made_up(count: int, seed: int = 1) -> pd.DataFrame:
-    """Logs of three vehicles over a year: every tenth fails, every twelfth cannot be judged.
+    """Make logs of three vehicles over a year: every tenth failed, every twelfth is not compared.
 
-    The first vehicle's SIGMA_Z triples in the middle of the year; the second one's clock jumps.
+    SIGMA_Z of the first vehicle triples in the middle of the year; the clock of the second jumps.
     """
     rng = np.random.default_rng(seed)
     rows = []
@@ -40,7 +40,7 @@ def made_up(count: int, seed: int = 1) -> pd.DataFrame:
         }  # fmt: skip
         if number % 12 == 7:
             rows.append(
-                row | {"status": "not judged", "reason": NOT_LOGGED[0], "remedy": NOT_LOGGED[1]}
+                row | {"status": "not compared", "reason": NOT_LOGGED[0], "remedy": NOT_LOGGED[1]}
             )
             continue
         sigma = 0.1 * (3.0 if late and number % 3 == 0 else 1.0) * np.exp(rng.normal(0.0, 0.1))

@@ -1,4 +1,4 @@
-"""The command line as a student types it: outputs, one clear line for bad input, exit codes."""
+"""Command line: outputs, environment, exit codes and sample logs."""
 
 import json
 import os
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("analysed_once")
 
 
 def test_libraries_use_one_thread_unless_set_by_user(monkeypatch, capsys):
-    """More of them only wait for each other: twice the CPU time of `tune`, in the same time."""
+    """With more threads, tune takes twice the CPU time and the same wall time."""
     environment = {"OPENBLAS_NUM_THREADS": "3"}
     monkeypatch.setattr(os, "environ", environment)
     assert run_main(monkeypatch, capsys, "--version")[0] == 0
@@ -29,9 +29,9 @@ def test_libraries_use_one_thread_unless_set_by_user(monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, sample_log) -> tuple[Path, str]:
-    """One report of the sample log, with awkward text in every place that takes text."""
-    folder = tmp_path_factory.mktemp("made")
+def report(tmp_path_factory, sample_log) -> tuple[Path, str]:
+    """Report of the sample log with special characters in name, id and notes."""
+    folder = tmp_path_factory.mktemp("report")
     notes = folder / "notes.md"
     notes.write_text(
         "# What I saw\n\nCosts $5 and $x^2$ or \\frac{1}{2}; **bold**, _under_, <b>tag</b>.\n"
@@ -46,8 +46,8 @@ def made(tmp_path_factory, sample_log) -> tuple[Path, str]:
     return folder, result.output
 
 
-def test_compare_report_attaches_results_without_paths(made):
-    folder, said = made
+def test_compare_report_attaches_results_without_paths(report):
+    folder, said = report
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
     assert "vehicle_visual_odometry" in said
     assert len(said.splitlines()) <= 42, "the summary must stay short"
@@ -59,11 +59,11 @@ def test_compare_report_attaches_results_without_paths(made):
     assert results["settings"]["sigma_z_m"] == 0.12
 
 
-def test_compare_report_prints_special_characters(made):
-    pages = [page.extract_text() for page in pypdf.PdfReader(made[0] / "report.pdf").pages]
+def test_compare_report_prints_special_characters(report):
+    pages = [page.extract_text() for page in pypdf.PdfReader(report[0] / "report.pdf").pages]
     assert "Ana $x$ Müller" in pages[0]
     assert "Costs $5 and x^2 or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)
-    assert sum("line line line" in page for page in pages) > 1  # long notes run on
+    assert sum("line line line" in page for page in pages) > 1  # long notes need several pages
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -73,7 +73,7 @@ def test_compare_fail_on_sets_exit_code(tmp_path, sample_log, severity, code):
 
 
 def test_help_imports_no_slow_library():
-    """--help answers at once: it may import neither pandas nor matplotlib nor scipy."""
+    """--help is fast only without the imports of pandas, matplotlib and scipy."""
     code = (
         "import sys\n"
         "from px4fuse.cli import cli\n"
@@ -99,7 +99,7 @@ def test_compare_accepts_invalid_bytes_and_long_student_id(tmp_path, sample_log)
 
 @pytest.fixture
 def samples_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the distribution of the sample flights puts them, and an empty folder."""
+    """Install the sample logs as their package does, and change to an empty folder."""
     shutil.copytree(ROOT / "sample_logs", tmp_path / "site" / "px4fuse_samples")
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     (tmp_path / "here").mkdir()
@@ -109,12 +109,12 @@ def samples_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("samples_installed")
 def test_sample_writes_logs_and_prints_next_command() -> None:
     assert done("sample").output.splitlines()[0].split(maxsplit=1) == [
-        "Next", f"px4fuse compare {Path('sample_logs') / 'aisle_uwb.ulg'}"
+        "Run", f"px4fuse compare {Path('sample_logs') / 'aisle_uwb.ulg'}"
     ]  # fmt: skip
-    made, shipped = (contents(folder / "sample_logs") for folder in (Path(), ROOT))
-    assert made.items() <= shipped.items()
-    assert made.keys() >= {"aisle_uwb.ulg", "aisle_uwb.tlog", "loop_vio.ulg", "loop_slam.tum"}
-    done("sample")  # they are the same
+    report, shipped = (contents(folder / "sample_logs") for folder in (Path(), ROOT))
+    assert report.items() <= shipped.items()
+    assert report.keys() >= {"aisle_uwb.ulg", "aisle_uwb.tlog", "loop_vio.ulg", "loop_slam.tum"}
+    done("sample")  # identical files may be overwritten
 
 
 @pytest.mark.usefixtures("samples_installed")
@@ -122,7 +122,7 @@ def test_sample_existing_other_file_is_refused() -> None:
     Path("flights").mkdir()
     Path("flights/loop_slam.tum").write_text("mine")
     said = refused("sample", "-o", "flights")
-    assert "loop_slam.tum: another file of that name is there; nothing was written" in said
+    assert "loop_slam.tum already exists and is another file. Nothing was written." in said
     assert contents(Path("flights")) == {"loop_slam.tum": b"mine"}
 
 
@@ -133,7 +133,7 @@ def test_sample_without_package_prints_install_command(monkeypatch) -> None:
 
 @pytest.mark.parametrize(("words", "loaded"), [("info", False), ("extract -o out", True)])
 def test_commands_without_tables_do_not_import_pyarrow(words, loaded, sample_log, tmp_path):
-    """In a process of its own: here everything is loaded already."""
+    """Run in a new process, as the modules are loaded in this one."""
     typed = [*words.split(), str(sample_log)]
     script = (
         f"import sys; sys.argv[1:] = {typed!r}\nfrom px4fuse.cli import main\n"
@@ -146,7 +146,7 @@ def test_commands_without_tables_do_not_import_pyarrow(words, loaded, sample_log
 
 
 def test_commands_legacy_code_page_open_files_as_utf8(tmp_path: Path) -> None:
-    """With a console of Windows' western code page, and a decimal comma where there is one."""
+    """Use the Western code page of a Windows console and a locale with a decimal comma."""
     (tmp_path / "l.ulg").write_bytes(tiny_log(1))
     typed = [
         "compare l.ulg -o r.pdf", "extract l.ulg -o t", "explore l.ulg",

@@ -1,4 +1,4 @@
-"""Differences of two comparisons: numbers, findings, and verdicts that are worse."""
+"""Differences between two comparisons: numbers, findings, and verdicts that are worse."""
 
 from __future__ import annotations
 
@@ -52,16 +52,16 @@ def test_number_changes_of_one_side_are_listed():
 
 
 def flown(seed: int, *mistakes: str, **scenario) -> DiffInput:
-    """A simulated flight as an input."""
+    """Compare a simulated flight, as an input of diff."""
     flight = simulate_flight(Scenario(seed=seed, **scenario), parse(mistakes))
     request = ComparisonRequest(
         log="f.ulg", sigma_a_m_s2=RIGHT.sigma_a_m_s2, sigma_z_m=RIGHT.sigma_z_m
     )
     found = results(request, explain(compare(flight, RIGHT)))
-    return given(read_results(to_json(found).encode()))
+    return as_input(read_results(to_json(found).encode()))
 
 
-def given(found: ComparisonResults) -> DiffInput:
+def as_input(found: ComparisonResults) -> DiffInput:
     return DiffInput("f.json", "results", found)
 
 
@@ -105,11 +105,11 @@ def test_changes_of_ekf2_noise_are_worse_in_nis_of_ekf2(clean):
 
 
 def with_kf(side: DiffInput, **fields) -> DiffInput:
-    """The same results, with some fields of the KF summary along north replaced."""
+    """Replace fields of the KF summary along north in the results."""
     axis = side.results.axes["north"]
     summary = structs.replace(axis.filters["kf"], **fields)
     axis = structs.replace(axis, filters={**axis.filters, "kf": summary})
-    return given(replace(side.results, axes={**side.results.axes, "north": axis}))
+    return as_input(replace(side.results, axes={**side.results.axes, "north": axis}))
 
 
 def nees(side: DiffInput, value: float) -> DiffInput:
@@ -146,14 +146,14 @@ def test_changes_with_new_error_are_worse(clean):
     late = flown(505, "clock-offset=0.25")
     errors = {one.id for one in late.results.findings if one.severity == "error"}
     assert errors
-    alone = given(replace(clean.results, findings=late.results.findings))
-    worse = changes(given(replace(clean.results, findings=())), alone).worse
+    alone = as_input(replace(clean.results, findings=late.results.findings))
+    worse = changes(as_input(replace(clean.results, findings=())), alone).worse
     assert set(worse) == {f"New finding of severity error: {one}." for one in errors}
     assert changes(alone, clean).worse == ()
     # the same finding with a higher severity is new
     raised = tuple(structs.replace(one, severity="error") for one in clean.results.findings)
     assert raised
-    assert changes(clean, given(replace(clean.results, findings=raised))).worse
+    assert changes(clean, as_input(replace(clean.results, findings=raised))).worse
 
 
 # -- the list of measures --------------------------------------------------------------------------
@@ -202,7 +202,7 @@ def test_measures_of_aids_leave_out_position_source(clean):
 
 
 def test_changes_without_an_axis_list_its_numbers(clean):
-    part = given(replace(clean.results, axes={"north": clean.results.axes["north"]}))
+    part = as_input(replace(clean.results, axes={"north": clean.results.axes["north"]}))
     found = by_path(changes(clean, part))
     assert found["axes.down.filters.kf.nis_mean"][1] is None
     assert all(b is None for _, b in found.values())

@@ -26,7 +26,7 @@ def settings(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("settings")
     files = folder / "usual.pdf", folder / "small.pdf"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pdf, "render", page_of)  # nobody looks at their pages
+        patch.setattr(pdf, "render", page_of)  # a fast replacement for the report
         done("compare", LOG, "--axis", "aisle", "-o", files[0])
         done("compare", LOG, "--axis", "aisle", "--sigma-z", 0.03, "-o", files[1])
     return files
@@ -46,7 +46,7 @@ def test_diff_of_two_settings_lists_setting_and_numbers(settings, changed):
     paths = {number["path"] for number in changed["numbers"]}
     assert "axes.aisle.filters.kf.nis_mean" in paths
     assert "axes.aisle.filters.ekf2.nis_mean" not in paths
-    # Python gives the same
+    # the Python function returns the same
     found = px4fuse.diff(*settings)
     assert {one.path for one in found.numbers} == paths
     assert list(found.worse) == changed["worse"]
@@ -101,11 +101,11 @@ def test_diff_unsuitable_inputs_are_refused(settings, tmp_path):
     for a, b, said in (
         (usual, usual, "the same file"),
         (usual, link, "the same file"),
-        (usual, loop, "loop.json: holds px4fuse-loop"),
-        (loop, usual, "loop.json: holds px4fuse-loop"),
-        (usual, old, "version 1.0 of the results' schema"),
-        (usual, other, "holds no results of px4fuse"),
-        (usual, printed, "no results.json is attached"),
+        (usual, loop, "loop.json contains px4fuse-loop"),
+        (loop, usual, "loop.json contains px4fuse-loop"),
+        (usual, old, "uses schema version 1.0"),
+        (usual, other, "contains no results of px4fuse"),
+        (usual, printed, "o results.json is attached"),
         (usual, tmp_path / "missing.ulg", "missing.ulg: cannot be read"),
         (tmp_path, usual, "is a folder"),
         (text, usual, "notes.txt"),

@@ -1,4 +1,4 @@
-"""Environments that no command can change: a result, or one line with the cause."""
+"""Unusual environments: commands give a result, or one line with the cause."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux has the l
 def started(
     arguments: str, *, before: str = "", folder: Path, **environment: str
 ) -> tuple[int, str, str]:
-    """A command in a shell of its own, after another one: exit code, output, errors."""
+    """Run px4fuse in a new shell after a shell command; return exit code, output and errors."""
     ended = subprocess.run(
         ["sh", "-c", f'{before} exec "$0" -m px4fuse {arguments}', sys.executable],
         cwd=folder, env=os.environ | environment, capture_output=True, check=False,
@@ -66,7 +66,7 @@ def test_deleted_current_folder_is_named(tmp_path, command) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
     code, out, err = started(command.format(log=LOG), before='rmdir "$PWD";', folder=gone)
-    said = "px4fuse: the current folder no longer exists, nothing was written. "
+    said = "px4fuse: the current folder no longer exists; nothing was written. "
     assert (code, out, err) == (2, "", f"{said}Change to another folder.\n")
 
 
@@ -75,7 +75,7 @@ def test_small_memory_limit_is_named(tmp_path) -> None:
     for command in (f"compare {LOG} -o r.pdf", f"explore {LOG} -o r.html", f"info {LOG}"):
         code, out, err = started(command, before="ulimit -v 400000;", folder=tmp_path)
         assert (code, out) == (2, "")
-        assert err.startswith("px4fuse: the memory limit is 410 MB, at least 800 MB")
+        assert err.startswith("px4fuse: the memory limit is 410 MB; px4fuse needs at least 800 MB")
         assert len(err.splitlines()) == 1
     assert started("--help", before="ulimit -v 400000;", folder=tmp_path)[0] == 0
     assert contents(tmp_path) == {}
@@ -91,7 +91,7 @@ def test_exhausted_memory_is_one_line(monkeypatch, capsys, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)
     code, out, err = run_main(monkeypatch, capsys, "info", LOG, "--json", "i.json")
     assert (code, out) == (2, "")
-    assert err.startswith("px4fuse: not enough memory, nothing was written. Close other programs")
+    assert err.startswith("px4fuse: not enough memory; nothing was written. Close other programs")
     assert len(err.splitlines()) == 1
 
 
@@ -101,5 +101,5 @@ def test_failed_estimate_writes_no_file(monkeypatch, capsys, tmp_path, command) 
     words = command.format(log=LOG).split()
     code, out, err = run_main(monkeypatch, capsys, *words, "--json", "j.json")
     assert (code, out, len(err.splitlines())) == (2, "", 1)
-    assert "could be determined: " in err
+    assert "cannot be estimated" in err
     assert contents(tmp_path) == {}

@@ -1,4 +1,4 @@
-"""``px4fuse extract``: what is written is what was read, described, and enough for the lesson."""
+"""``px4fuse extract``: tables, data dictionary, flight.json, and the lesson's example on them."""
 
 import json
 import re
@@ -25,7 +25,7 @@ from px4fuse.recording import ClockMap, Dropout, InputFile
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.scenario import make_scenario
 
-# As it stands in the documentation: the lesson's Example 1 on one's own flight
+# Example 1 of the lesson on the tables of a flight, as printed in the documentation
 PAGE = (REPOSITORY / "docs" / "python.md").read_text(encoding="utf-8")
 (LESSON,) = re.findall(r"```python\n(import numpy.*?)```", PAGE, re.DOTALL)
 
@@ -46,12 +46,12 @@ def written(tmp_path_factory, sample_log) -> Path:
 
 
 def read(path: Path) -> pd.DataFrame:
-    # pandas' fast reader may miss the last bit; this one uses Python's own float()
+    # the fast reader of pandas may differ in the last bit; this one uses float()
     return pd.read_csv(path, engine="python")
 
 
 def rich_flight() -> Flight:
-    """A flight with every part that a table can be made of."""
+    """Make a flight with all parts for which a table exists."""
     resets = Reset(5.0, "position", (0.5, 0.0, -1.0)), Reset(6.0, "velocity", (0, 1, 0))
     ekf2 = Estimator(resets=resets, instances=((-np.inf, 0), (9.0, 1)))
     flight = aisle_flight(duration_s=20.0, ekf2=ekf2, dropouts=(Dropout(3.0, 0.2),))
@@ -60,7 +60,7 @@ def rich_flight() -> Flight:
     return replace(flight, clocks=(clock,), inputs=(file,))
 
 
-# ---- what was read is what is written ---------------------------------------------------------
+# ---- tables -----------------------------------------------------------------------------------
 
 
 def test_extract_csv_reads_back_identical_floats(written, sample_flight):
@@ -73,7 +73,7 @@ def test_extract_csv_reads_back_identical_floats(written, sample_flight):
     } | {f"position_{track.name}": track.samples for track in sample_flight.positions}  # fmt: skip
     for name, frame in expected.items():
         table, content = read(written / f"{name}.csv"), (written / f"{name}.csv").read_bytes()
-        assert content.isascii()  # UTF-8 whatever the spreadsheet guesses
+        assert content.isascii()  # readable by spreadsheets with any encoding
         assert not re.search(rb"\r|nan|inf", content)
         assert table.columns[0] == "time_s"
         np.testing.assert_array_equal(table["time_s"], frame.index, strict=False)
@@ -114,21 +114,21 @@ def test_tables_contain_resets_instances_clocks_and_spans():
     assert tables["dropouts"].to_numpy().tolist() == [[3.0, 0.2]]
     assert dict(tables["parameters"].to_numpy().tolist()) == dict(flight.log.parameters)
     clock = tables["clocks"].dropna(axis=1).iloc[0].to_dict()
-    told = structs.asdict(flight.clocks[0])
-    assert clock == {name: value for name, value in told.items() if value is not None}
+    expected = structs.asdict(flight.clocks[0])
+    assert clock == {name: value for name, value in expected.items() if value is not None}
 
 
 def test_tables_contain_ekf2_parameters_and_orientation(sample_flight):
-    """EKF2's own parameters, and the orientation of odometry."""
+    """Parameters of EKF2, and the orientation from odometry."""
     flight = read_log(REPOSITORY / "sample_logs" / "loop_vio.ulg")
     tables = extraction.tables(flight)
     values = dict(tables["parameters"].to_numpy().tolist())
     assert values.items() >= flight.ekf2.record.parameters.items()
     assert values["EKF2_GYR_NOISE"] == pytest.approx(0.015)
-    turned = tables["orientation_vehicle_visual_odometry"]
-    (track,) = [one for one in flight.positions if one.orientation is not None]
-    np.testing.assert_array_equal(turned[list("wxyz")], track.orientation[list("wxyz")])
-    assert len(turned) == len(tables["position_vehicle_visual_odometry"])
+    orientation = tables["orientation_vehicle_visual_odometry"]
+    (track,) = [track for track in flight.positions if track.orientation is not None]
+    np.testing.assert_array_equal(orientation[list("wxyz")], track.orientation[list("wxyz")])
+    assert len(orientation) == len(tables["position_vehicle_visual_odometry"])
     assert not any(name.startswith("orientation") for name in extraction.tables(sample_flight))
 
 
@@ -173,13 +173,13 @@ def test_flight_json_lists_log_streams_and_missing_data(written, sample_flight):
     assert about["schema"] == {"name": "px4fuse-flight", "version": "1.0"}
     assert about["log"]["sha256"] == sample_flight.log.sha256
     assert about["streams"]["imu"]["topics"] == ["sensor_combined"]
-    told = {part["what"] for part in about["missing"]}
-    assert told >= {part.what for part in sample_flight.missing}
+    expected = {part["what"] for part in about["missing"]}
+    assert expected >= {part.what for part in sample_flight.missing}
     for position in about["positions"]:
         assert (written / f"{position['table']}.csv").exists()
 
 
-# ---- what is not there ------------------------------------------------------------------------
+# ---- missing data -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("dropped", "lost"), [
@@ -193,8 +193,8 @@ def test_extract_unavailable_part_has_no_table_and_is_listed(tmp_path, dropped, 
     said = extract(path, "-o", tmp_path / "out")
     written = {file.stem for file in (tmp_path / "out").glob("*.csv")}
     assert written == whole - lost | {"data_dictionary"}
-    if dropped != "vehicle_visual_odometry":  # others stand in for that one
-        assert "Not in this log: " in said
+    if dropped != "vehicle_visual_odometry":  # another track replaces this one
+        assert "Not exported: " in said
 
 
 # ---- names and folders ------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def test_extract_parquet_contains_the_same_tables(tmp_path, sample_log, sample_f
 def test_lesson_example_on_tables_matches_compare(
     tmp_path, monkeypatch, capsys, sample_log, sample_flight
 ):
-    """The ten lines round every measurement to the DT grid; else they are our filter."""
+    """The example is KF, except that it rounds the time of each measurement to the DT grid."""
     monkeypatch.chdir(tmp_path)
     extract(sample_log, "-o", "reports/tables")
     exec(compile(LESSON, "python.md", "exec"), {})
@@ -252,11 +252,11 @@ def test_lesson_example_on_tables_matches_compare(
     printed = [[float(number) for number in re.findall(r"-?\d+\.\d+", line)] for line in lines]
     time, position, velocity, gain = np.array(printed).T
     north = compare(sample_flight, Settings(), axes=("north",), start_s=0.0)["north"]
-    # both settled, and off the ground
+    # both filters have settled, and the vehicle is airborne
     inside = (time > 5.0) & (time < 125.0)
-    ours = state_at(north.replay, time[inside])
-    moved = np.abs(ours[1]).max() * 0.1  # how far the vehicle gets in the 0.1 s of rounding
-    assert np.abs(position[inside] - ours[0]).max() < 2.0 * moved
-    assert np.sqrt(np.mean((velocity[inside] - ours[1]) ** 2)) < 0.1
+    kf_state = state_at(north.replay, time[inside])
+    step_m = np.abs(kf_state[1]).max() * 0.1  # m; motion within the 0.1 s of rounding
+    assert np.abs(position[inside] - kf_state[0]).max() < 2.0 * step_m
+    assert np.sqrt(np.mean((velocity[inside] - kf_state[1]) ** 2)) < 0.1
     settled = north.replay.updates["gain_position"].loc[20.0:120.0].median()
     assert np.median(gain[inside]) == pytest.approx(settled, rel=0.1)

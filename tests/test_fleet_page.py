@@ -1,4 +1,4 @@
-"""The fleet's page in a real browser: five thousand logs, and names that would come to life."""
+"""Page of px4fuse batch in a browser: filters, 5000 logs, and untrusted text."""
 
 from __future__ import annotations
 
@@ -40,25 +40,27 @@ def test_page_compared_log_lists_its_missing_results() -> None:
     table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
     text = html_text(table, "Bench", "px4fuse 1")
     inside = parts(content(text)["rows"][0])
-    assert inside["Not judged"][2] == ["EKF2, down: no heights"]
-    assert inside["What to set"][2] == ["Set it."]
-    judged = table.loc[table["axis"] == "down", "log"].nunique()
-    assert f'<option value="remedy:Set it.">Set it. ({judged})' in text
+    assert inside["Missing results"][2] == ["EKF2, down: no heights"]
+    assert inside["Actions"][2] == ["Set it."]
+    count = table.loc[table["axis"] == "down", "log"].nunique()
+    assert f'<option value="remedy:Set it.">Set it. ({count})' in text
 
 
 def test_logs_of_uses_horizontal_axes() -> None:
-    def ours(rows: pd.DataFrame) -> float:
+    def kf_factor(rows: pd.DataFrame) -> float:
         return float(logs_of(rows)[0]["factors"]["kf"])
 
     first = made_up(3).iloc[:3].copy()
     north, east, _ = first["kf_nis_mean"]
-    assert ours(first) == pytest.approx((2.0 / (north + east)) ** 0.5)  # both have as many updates
-    # weighted by how many updates there are
+    assert kf_factor(first) == pytest.approx(
+        (2.0 / (north + east)) ** 0.5
+    )  # equal numbers of updates
+    # weighted by the number of updates
     first["updates"] *= pd.Series((3, 1, 1))
-    assert ours(first) == pytest.approx((4.0 / (3.0 * north + east)) ** 0.5)
+    assert kf_factor(first) == pytest.approx((4.0 / (3.0 * north + east)) ** 0.5)
     aisle = first.iloc[:1].assign(axis="aisle", kf_nis_mean=4.0, position_rmse_m=9.0)
     both = pd.concat([aisle, first])
-    assert ours(both) == pytest.approx(0.5)
+    assert kf_factor(both) == pytest.approx(0.5)
     assert logs_of(both)[0]["position_rmse_m"] == 9.0
 
 
@@ -80,7 +82,7 @@ def test_page_without_compared_logs_is_complete() -> None:
     failed = table[table["status"] == "failed"].reset_index(drop=True)
     text = html_text(failed, "B", "px4fuse 1")
     assert text == html_text(failed, "B", "px4fuse 1")  # the same table gives the same page
-    assert parts(content(text)["rows"][0])["What to set"][2] == [DAMAGED[1]]
+    assert parts(content(text)["rows"][0])["Actions"][2] == [DAMAGED[1]]
 
 
 def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
@@ -98,7 +100,7 @@ def test_page_text_of_logs_is_escaped(text: str) -> None:
         assert not re.search("[\x1b\u202e]", made)
         return [(tag, sorted(attributes)) for tag, attributes in Elements(made).found]
 
-    # what parts findings makes more of them
+    # ";" and "/" separate findings and folders
     assert shape(text.replace(";", ",").replace("/", "|")) == shape("x")
 
 
@@ -128,7 +130,7 @@ def page(browser: Browser, tmp_path: Path) -> Browser:
 
 
 def head(title: str) -> str:
-    titles = ("Log", "Date", "Vehicle", "Firmware", "Status", "ours", "EKF2", "SIGMA_Z")
+    titles = ("Log", "Date", "Vehicle", "Firmware", "Status", "KF", "EKF2", "SIGMA_Z")
     return f".list > thead th:nth-child({titles.index(title) + 1}) button"
 
 
@@ -136,8 +138,8 @@ COUNT = "document.querySelector('.count').textContent"
 
 
 def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
-    # what the table shows as "3 × too small" is sorted by the factor behind it
-    page.click(head("ours"))
+    # the column shows "3 × too small" and is sorted by the factor
+    page.click(head("KF"))
     page.click("tbody tr:first-child .name")
     factors = {log["name"]: log["factors"]["kf"] for log in logs_of(made_up(240)) if log["factors"]}
     assert page.names()[:3] == sorted(factors, key=lambda name: factors[name])[:3]
@@ -179,7 +181,7 @@ def test_page_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None
     browser.write("v1.14")
     assert browser.ask(rows) == MAX_PAGE_ROWS
     browser.click("#all")
-    # stepping goes over the end of a page, and back
+    # the keys j and k go to the next page and back
     browser.click(".list > tbody > tr:last-child .name")
     name = browser.names()[-1]
     browser.press("j", "j")

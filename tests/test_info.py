@@ -1,4 +1,4 @@
-"""What ``px4fuse info`` says of logs that are whole, poor, damaged or not flights at all."""
+"""``px4fuse info`` on complete, incomplete and damaged logs, and on files that are no flights."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("quick_filter")
 
 @pytest.fixture(autouse=True)
 def screen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A terminal of the usual width: in a pipe lines do not wrap."""
+    """Set the width of a terminal; in a pipe lines do not wrap."""
     monkeypatch.setenv("COLUMNS", str(WIDTH))
 
 
@@ -41,8 +41,8 @@ def info(*arguments: str | Path) -> str:
 
 
 def widest(text: str) -> int:
-    """Of all lines but the command, which is to be copied."""
-    return max(len(line) for line in text.splitlines() if not line.startswith("Compare"))
+    """Return the length of the longest line, except for the command to paste."""
+    return max(len(line) for line in text.splitlines() if not line.startswith("Run"))
 
 
 def inventory_of(log: Log, tmp_path: Path) -> Inventory:
@@ -69,7 +69,7 @@ def test_inventory_rows_match_flight_contents(sample_flight):
     frames = {
         "IMU": sample_flight.imu, "attitude": sample_flight.attitude, "EKF2 state": ekf2.state,
         "EKF2 variance": ekf2.variance, "innovations": ekf2.innovations["north"],
-        "fusion flags": ekf2.fusing, "truth": sample_flight.truth.samples,
+        "fusion flags": ekf2.fusing, "ground truth": sample_flight.truth.samples,
     }  # fmt: skip
     for part, frame in frames.items():
         row = source(inventory, part)
@@ -86,17 +86,17 @@ def test_inventory_rows_match_flight_contents(sample_flight):
 
 
 def test_inventory_counts_match_compare(sample_flight):
-    """The counts are of the very samples that compare uses."""
+    """The counts are those of the samples that compare uses."""
     inventory = take_inventory(sample_flight)
     comparison = compare(sample_flight)
     assert all(ability.possible for ability in inventory.abilities)
     assert inventory.segment == comparison.segment
     assert "estimator_aid_src_ev_pos at a higher rate" in remedies(inventory)[0]
     assert "external vision, position 2 Hz, " in ability(inventory, "aids").reason
-    said = ability(inventory, "EKF2 innovations").reason
+    reason = ability(inventory, "EKF2 consistency").reason
     for axis in comparison.axes.values():
         if not isinstance(axis.ekf2_innovations, Unavailable):
-            assert f"{axis.axis.name} {len(axis.ekf2_innovations)}" in said
+            assert f"{axis.axis.name} {len(axis.ekf2_innovations)}" in reason
         assert f"{len(axis.ekf2_state)} samples" in ability(inventory, "EKF2 states").reason
 
 
@@ -104,7 +104,7 @@ def test_inventory_counts_match_compare(sample_flight):
 
 
 def strict(text: str) -> dict:
-    """Without NaN and its like."""
+    """Parse JSON; NaN and infinity fail the test."""
     return json.loads(text, parse_constant=pytest.fail)
 
 
@@ -116,7 +116,7 @@ def test_info_json_is_written_to_stdout_or_file(
     assert found["log"]["sha256"] == sample_flight.log.sha256
     (chosen,) = [row["name"] for row in found["sources"] if row.get("chosen")]
     assert chosen == choose_source(sample_flight)[0].name
-    assert "start_utc" not in found, "what is not known is absent"
+    assert "start_utc" not in found, "an unknown value is absent"
     printed = info(sample_log, "--json", target)
     assert widest(printed.partition("Wrote")[0]) <= WIDTH
     assert len(printed.splitlines()) <= 50
@@ -129,14 +129,14 @@ def test_info_json_is_written_to_stdout_or_file(
 
 
 @pytest.mark.parametrize(("topic_", "part", "lost"), [
-    ("sensor_combined", "IMU", {"acceleration", "what if"}),
+    ("sensor_combined", "IMU", {"acceleration", "what-if"}),
     ("vehicle_local_position", "EKF2 state",
-     {"EKF2 states", "EKF2 variances", "EKF2 innovations", "aids", "what if"}),
+     {"EKF2 states", "EKF2 variances", "EKF2 consistency", "aids", "what-if"}),
 ])  # fmt: skip
 def test_inventory_missing_topic_disables_analyses(tmp_path, topic_, part, lost):
     inventory = inventory_of(make_log().drop(topic_), tmp_path)
     assert topic_ in source(inventory, part).unavailable
-    assert {can.name for can in inventory.abilities if not can.possible} - {"truth"} == lost
+    assert {can.name for can in inventory.abilities if not can.possible} - {"error"} == lost
     assert all(f"no topic {topic_}" in ability(inventory, name).reason for name in lost)
     assert remedies(inventory).count("Record with SDLOG_PROFILE bit 0 (default).") == 1
 
@@ -192,16 +192,16 @@ def test_info_log_without_take_off_is_described(tmp_path):
     inventory = inventory_of(log, tmp_path)
     assert inventory.flight.airborne == ()
     assert ability(inventory, "compare").possible
-    assert "never, by the land detector" in info(tmp_path / "made.ulg")
+    assert "never (land detector)" in info(tmp_path / "made.ulg")
 
 
 def test_inventory_mocap_as_source_is_no_ground_truth(tmp_path):
     log = make_log().add(odometry("vehicle_mocap_odometry", 10.0, 16))
-    assert ability(inventory_of(log, tmp_path), "truth").possible
+    assert ability(inventory_of(log, tmp_path), "error").possible
     flight = read_log(log.drop("vehicle_visual_odometry").write(tmp_path / "made.ulg"))
     inventory = take_inventory(flight)
     assert source(inventory, "position").name == "vehicle_mocap_odometry"
-    assert not ability(inventory, "truth").possible
+    assert not ability(inventory, "error").possible
 
 
 # ---- gaps -------------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ def test_inventory_gaps_have_count_and_durations(tmp_path):
 
 @pytest.mark.parametrize("flight", [
     aisle_flight(duration_s=20.0),
-    aisle_flight(duration_s=0.3),  # too short to be compared
+    aisle_flight(duration_s=0.3),  # too short for compare
     aisle_flight(duration_s=20.0, imu=None),
     aisle_flight(duration_s=20.0, attitude_hz=None),
     aisle_flight(duration_s=20.0, ekf2=None),
@@ -242,7 +242,7 @@ def test_inventory_gaps_have_count_and_durations(tmp_path):
     replace(aisle_flight(duration_s=20.0), positions=()),
 ])  # fmt: skip
 def test_inventory_analyses_agree_with_compare(flight: Flight):
-    """Without streams, as a reader may give it; every no is one of compare's own."""
+    """The flights have no streams; an analysis is possible exactly if compare performs it."""
     inventory = take_inventory(flight)
     strict(json.dumps(to_plain(inventory)))
     try:
@@ -256,14 +256,14 @@ def test_inventory_analyses_agree_with_compare(flight: Flight):
         ("acceleration", north.axis.acceleration),
         ("EKF2 states", north.ekf2_state),
         ("EKF2 variances", north.ekf2_variance),
-        ("EKF2 innovations", north.filters["ekf2"]),
-        ("truth", north.truth),
+        ("EKF2 consistency", north.filters["ekf2"]),
+        ("error", north.truth),
     ):
         assert ability(inventory, name).possible != isinstance(part, Unavailable), name
 
 
 def test_info_prints_dropouts_and_senders_without_sequence(monkeypatch, tmp_path, sample_flight):
-    """Others stand in the golden texts; the start here is beyond the calendar."""
+    """The golden files test other logs; the UNIX time of this one is out of range."""
     senders = (Sender(1, 197, "visual odometry", 99, None, False),)
     dropouts = (Dropout(3.0, 0.25), Dropout(7.0, 0.5))
     log = replace(sample_flight.log, format="MAVLink tlog", senders=senders, dropouts=dropouts,

@@ -1,4 +1,4 @@
-"""Inputs are never replaced: no output of any command goes to a file that the command reads."""
+"""Protection of inputs: no command writes to a file that it reads."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_output_at_input_is_refused_by_every_path(desk, tmp_path, monkeypatch, c
 
 @pytest.fixture
 def class_desk(tmp_path, monkeypatch) -> Path:
-    """Reports that were handed in, in a folder whose name is that of grade's own."""
+    """Submitted reports in a folder with the same name as an output folder of grade."""
     folder = tmp_path / "h" / "reports"
     folder.mkdir(parents=True)
     (folder / "1001.pdf").write_bytes(report_of("Ada", "1001"))
@@ -109,7 +109,7 @@ def test_verify_keeps_a_log_of_a_folder(tmp_path, monkeypatch) -> None:
     shutil.copy(REPORT, "a.pdf")
     before = hashed(tmp_path)
     said = refused("verify", "a.pdf", "d", "--json", "d/aisle.ulg")
-    assert said.startswith("d/aisle.ulg: is an input of this command")
+    assert said.startswith("d/aisle.ulg is an input of this command")
     assert hashed(tmp_path) == before
 
 
@@ -118,7 +118,7 @@ def test_batch_into_folder_of_logs_is_refused(tmp_path, monkeypatch) -> None:
     (tmp_path / "d" / "in").mkdir(parents=True)
     shutil.copy(SAMPLES / "aisle_uwb.ulg", "d/in/fleet.ulg")
     for logs in ("d", "d/in/fleet.ulg", "d/*/*.ulg"):
-        assert "-o d: contains an input" in refused("batch", logs, "-o", "d")
+        assert "-o d contains an input" in refused("batch", logs, "-o", "d")
 
 
 # --- the register ---
@@ -133,7 +133,7 @@ def test_write_to_registered_file_is_refused(tmp_path) -> None:
     path.write_text("mine")
     with inputs_protected():
         read_text(path, OutputError, 100)
-        with pytest.raises(OutputError, match="a: is an input"):
+        with pytest.raises(OutputError, match="a is an input"):
             write_all({other: b"x", path: b"x"})
         assert not other.exists()
     write_all({path: b"x"})
@@ -141,7 +141,7 @@ def test_write_to_registered_file_is_refused(tmp_path) -> None:
 
 
 def test_file_system_without_inodes_compares_paths(tmp_path, monkeypatch) -> None:
-    """As one that ignores upper and lower case, and gives every file the inode 0."""
+    """Simulate a file system that ignores case and gives every file the inode 0."""
     from px4fuse.input_files import add_input, check_output_folder, check_outputs, inputs_protected
 
     real, real_names = Path.stat, Path.iterdir

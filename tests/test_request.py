@@ -1,4 +1,4 @@
-"""What a command line is parsed into, and the command line that is written from it."""
+"""Requests: parsing of a command line, and formatting of a command line from a request."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ LOOPS = st.builds(
 
 
 def parsed(command: str) -> Request:
-    """The request that a shell, click and the command make of a command line."""
+    """Parse a command line like a shell, click and the command."""
     program, name, file, *options = shlex.split(command)
     assert program == "px4fuse"
     made = compare if name == "compare" else loop
@@ -72,10 +72,10 @@ def parsed(command: str) -> Request:
         "output", "json_path", "fail_on", "checks", "student", "student_id", "notes", "answers",
         "tum", "g2o",
     )  # fmt: skip
-    given_ = {key: value for key, value in context.params.items() if key not in own}
+    values = {key: value for key, value in context.params.items() if key not in own}
     if name == "compare":
-        return comparison_request(given_.pop("log"), given_)
-    return loop_request(given_.pop("source"), given_)
+        return comparison_request(values.pop("log"), values)
+    return loop_request(values.pop("source"), values)
 
 
 @settings(deadline=None)
@@ -122,13 +122,13 @@ def test_request_invalid_json_is_refused(recorded: object, says: str) -> None:
     ],
 )
 def test_request_has_a_field_for_every_option(command, declared, kinds) -> None:
-    """An option that the request forgets would be missing from every record."""
+    """An option that is not in the request would be missing in the results."""
     about_outputs = {
         "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",
         "--tum", "--g2o", "--robust", "--max-size", "--show",
     }  # fmt: skip
     options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
-    asked = {option.name for option in declared.values()}
-    # --open is of a loop that did not close, and elsewhere of what was written
-    assert options - about_outputs - ({"--open"} - asked) == asked
+    request_options = {option.name for option in declared.values()}
+    # --open means an open loop in px4fuse loop, and opens the output in other commands
+    assert options - about_outputs - ({"--open"} - request_options) == request_options
     assert set(declared) <= {field for kind in kinds for field in kind.__struct_fields__}

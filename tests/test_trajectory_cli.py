@@ -57,7 +57,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
-    """Everything that ``px4fuse loop`` writes of the sample flight."""
+    """All files that ``px4fuse loop`` writes for the sample flight."""
     folder = tmp_path_factory.mktemp("made")
     return folder, make(folder)
 
@@ -105,13 +105,13 @@ def test_loop_report_is_reproducible_without_paths(made, tmp_path):
 def test_loop_tum_file_has_the_reported_ate(made, found, reference) -> None:
     gated = found["loop"]["corrections"]["pose_graph_gated"]["scores"][TRUTH]
     again = results("evaluate", made[0] / "r.tum", reference, "--alignment", gated["alignment"])
-    ours, theirs = (one["ate"]["translation_m"]["rmse"] for one in (gated, again))
-    assert theirs == pytest.approx(ours, rel=1e-4)
+    in_loop, in_evaluate = (score["ate"]["translation_m"]["rmse"] for score in (gated, again))
+    assert in_evaluate == pytest.approx(in_loop, rel=1e-4)
     assert again["association"]["poses"] == gated["association"]["poses"]
 
 
 def test_loop_g2o_file_is_at_the_optimum(made, found, tmp_path) -> None:
-    """A graph whose closures are all accepted; with a rejected one it would move."""
+    """All closures of this graph are accepted; a rejected one would change the optimum."""
     graph = tmp_path / "g.g2o"
     written = results("loop", LOG, "--g2o", graph)["loop"]["corrections"]["pose_graph_gated"]
     again = results("loop", graph)["graph"]
@@ -203,7 +203,7 @@ def test_evaluate_writes_only_the_named_files(
 
 
 def test_loop_reference_gives_ate_of_each_path(desk) -> None:
-    """Itself, a flight with other stamps, and a path without overlap, which fails nothing."""
+    """References: the source itself, a flight with other timestamps, and one without overlap."""
 
     def scores(reference: str, way: str = "uncorrected") -> dict[str, Any]:
         found = results("loop", desk / "s.tum", "--reference", desk / reference)["loop"]
@@ -217,22 +217,22 @@ def test_loop_reference_gives_ate_of_each_path(desk) -> None:
     assert "no poses match in time" in json.dumps(scores("line.tum"))
 
 
-# ------------------------------------------------------------------ odd files that are right
+# ------------------------------------------------------------------ unusual frames
 
 
-def turned_up(rows: list[str]) -> list[str]:
-    """A trajectory of a camera as one of a body in a world with z up, as ROS writes it."""
-    turned = []
+def to_z_up(rows: list[str]) -> list[str]:
+    """Convert a trajectory of a camera to a body frame with z up, as in ROS."""
+    converted = []
     for row in rows:
         time, x, y, z, qx, qy, qz, qw = row.split()
         minus = [str(-float(text)) for text in (x, y, qx, qy)]
-        turned.append(" ".join([time, z, *minus[:2], qz, *minus[2:], qw]))
-    return turned
+        converted.append(" ".join([time, z, *minus[:2], qz, *minus[2:], qw]))
+    return converted
 
 
 def test_loop_z_up_track_has_same_ate_as_evaluate(tmp_path) -> None:
     for name in ("a.tum", "truth.tum"):
-        write(tmp_path / name, turned_up(ROWS))
+        write(tmp_path / name, to_z_up(ROWS))
     found = results("loop", tmp_path / "a.tum", "--reference", tmp_path / "truth.tum")["loop"]
     score = found["corrections"]["uncorrected"]["scores"]["truth.tum"]
     assert score["ate"]["rotation_deg"]["max"] < 0.01

@@ -1,4 +1,4 @@
-"""``px4fuse whatif``: side by side as table and results; refusals; real logs."""
+"""``px4fuse whatif``: results, table, refused input, and flights from SITL."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ pytestmark = pytest.mark.usefixtures("analysed_once")
 
 
 @pytest.fixture(scope="module")
-def asked(sample_log: Path) -> WhatIfAnalysis:
-    """What the data ask for, of the sample flight."""
+def estimated(sample_log: Path) -> WhatIfAnalysis:
+    """Replay the sample flight with the maximum-likelihood noise and delay."""
     return run_what_if(WhatIfRequest(log=str(sample_log)))
 
 
 @pytest.fixture(scope="module")
 def swept(sample_log: Path) -> WhatIfAnalysis:
-    """A changed gate, and the noise over three values."""
+    """Replay with a changed gate and three values of the noise."""
     sweep = Sweep("EKF2_EVP_NOISE", 0.05, 0.2, 3)
     request = WhatIfRequest(log=str(sample_log), changes={"EKF2_EVP_GATE": 3.0}, sweep=sweep)
     return run_what_if(request)
 
 
 def test_whatif_results_have_logged_replayed_and_changed(sample_log: Path) -> None:
-    asked = "--set", "EKF2_EVP_NOISE=0.3", "--json", "-"
-    text = done("whatif", sample_log, *asked).stdout
+    options = "--set", "EKF2_EVP_NOISE=0.3", "--json", "-"
+    text = done("whatif", sample_log, *options).stdout
     said = json.loads(text)
     jsonschema.validate(said, schema())
     assert isinstance(read_results(text.encode()), WhatIfResults)
@@ -51,14 +51,14 @@ def test_whatif_results_have_logged_replayed_and_changed(sample_log: Path) -> No
 
 
 def test_whatif_without_gnss_from_time_drifts_afterwards(sample_log: Path) -> None:
-    asked = "--without", "ev_pos", "--from", "100", "--json", "-"
-    said = json.loads(done("whatif", sample_log, *asked).stdout)
+    options = "--without", "ev_pos", "--from", "100", "--json", "-"
+    said = json.loads(done("whatif", sample_log, *options).stdout)
     jsonschema.validate(said, schema())
     assert said["whatif"]["without"] == {"ev_pos": 100.0}
     assert said["judged_s"][0][0] == 100.0
     assert said["provenance"]["command"].endswith("aisle_uwb.ulg --without ev_pos --from 100")
     assert said["replayed"]["without"] == {}
-    # half a minute of inertial navigation at 0.35 m/s² of noise, as far off as it says that it is
+    # consistent after 30 s of dead reckoning with a noise of 0.35 m/s²
     for axis in ("north", "east"):
         assert said["replayed"][axis]["position_rmse_to_truth_m"] < 0.1
         assert 0.02 < said["whatif"][axis]["nis_mean"] < 4.0
@@ -68,8 +68,8 @@ def test_whatif_without_gnss_from_time_drifts_afterwards(sample_log: Path) -> No
     assert "EKF2 itself gives its position up" in note
 
 
-def test_whatif_unknown_aid_or_time_is_refused(asked: WhatIfAnalysis) -> None:
-    model = open_model(asked.flight)
+def test_whatif_unknown_aid_or_time_is_refused(estimated: WhatIfAnalysis) -> None:
+    model = open_model(estimated.flight)
     for without, said in (
         ({"baro_hgt": 60.0}, "baro_hgt: of this log the model fuses ev_pos."),
         ({"ev_pos": 500.0}, "500 s: less than 5 s of the flight"),
@@ -78,17 +78,17 @@ def test_whatif_unknown_aid_or_time_is_refused(asked: WhatIfAnalysis) -> None:
             what_if(model, [], without)
 
 
-def test_whatif_without_set_uses_ml_estimates(asked: WhatIfAnalysis) -> None:
-    """The UWB's noise is 0.10 m, and its stamps are right."""
-    assert asked.asked
-    assert set(asked.changes) == {"EKF2_EVP_NOISE"}
-    assert asked.changes["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
-    assert "what the data ask for" in column_heads(asked)[-1]
-    table, found = {label.strip(): cells for label, *cells in rows(asked)}, asked.whatif
+def test_whatif_without_set_uses_ml_estimates(estimated: WhatIfAnalysis) -> None:
+    """The UWB noise is 0.10 m, and its timestamps are right."""
+    assert estimated.asked
+    assert set(estimated.changes) == {"EKF2_EVP_NOISE"}
+    assert estimated.changes["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
+    assert "what the data ask for" in column_heads(estimated)[-1]
+    table, found = {label.strip(): cells for label, *cells in rows(estimated)}, estimated.whatif
     every = (found.logged, found.replayed, found.whatif[0])
     assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
     assert table["samples"] == [str(s.samples) for s in every]
-    assert all(len(cells) == len(column_heads(asked)) == 3 for cells in table.values())
+    assert all(len(cells) == len(column_heads(estimated)) == 3 for cells in table.values())
 
 
 def test_whatif_sweep_keeps_set_parameters(swept: WhatIfAnalysis) -> None:
@@ -164,7 +164,7 @@ class TestFlownFlights:
 
 
 def error(summary: Summary) -> float:
-    """Horizontal error to the truth (m)."""
+    """Return the horizontal position RMSE against ground truth (m)."""
     parts = [axis.position_rmse_to_truth_m for axis in summary.axes.values()]
     assert all(isinstance(part, float) for part in parts)
     assert summary.position_rmse_to_truth_m == pytest.approx(np.hypot(*parts))
