@@ -36,7 +36,7 @@ MARKUP = '<img src=x onerror="window.alive=1"></script><script>window.alive=2</s
 TABLE = """Object.fromEntries([...document.querySelectorAll('#table tbody tr')].map((row) =>
   [row.cells[0].textContent, [row.cells[1].textContent, row.cells[2].textContent]]))"""
 
-VALUES = "[...document.querySelectorAll('.knob input[type=number]')].map((node) => node.value)"
+VALUES = "[...document.querySelectorAll('.setting input[type=number]')].map((node) => node.value)"
 
 
 def bare(flight: Flight) -> Analysis:
@@ -90,11 +90,11 @@ def test_page_is_small_and_contains_no_paths(
 # ------------------------------------------------------------------ numbers
 
 
-def drag(page: Browser, knob: str, share: float) -> None:
+def drag(page: Browser, slider: str, share: float) -> None:
     """Drag a slider with the mouse to a share of its range."""
-    x, y, width, height = box(page, knob)
+    x, y, width, height = box(page, slider)
     now = page.ask(
-        f"(({{value, max}}) => value / max)(document.getElementById({json.dumps(knob)}))"
+        f"(({{value, max}}) => value / max)(document.getElementById({json.dumps(slider)}))"
     )
     # the centre of the thumb does not reach the ends of the slider
     places = [x + 8 + (width - 16) * at for at in np.linspace(now, share, 6)]
@@ -141,8 +141,13 @@ def test_dragged_sliders_match_command_on_page(
     page: Browser, explored: tuple[Path, Analysis], sample_log: Path
 ) -> None:
     before = page.ask(TABLE)
-    for knob, share in (("sigma-a", 0.72), ("sigma-z", 0.38), ("dt", 0.3), ("clock-offset", 0.55)):
-        drag(page, knob, share)
+    for slider, share in (
+        ("sigma-a", 0.72),
+        ("sigma-z", 0.38),
+        ("dt", 0.3),
+        ("clock-offset", 0.55),
+    ):
+        drag(page, slider, share)
     page.click("#axes input[value=north]")
     settle(page)
     request = of_command(page, sample_log)
@@ -341,8 +346,8 @@ def test_explore_without_log_uses_sample_flight(
     here = tmp_path / "sample_logs"
     here.mkdir()
     (here / sample_log.name).write_bytes(sample_log.read_bytes())
-    said = done("explore", "--start", "20", "--end", "40").stderr
-    assert "No log was given: this is the sample flight, aisle_uwb.ulg." in said
+    output = done("explore", "--start", "20", "--end", "40").stderr
+    assert "No log was given: this is the sample flight, aisle_uwb.ulg." in output
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
 
 

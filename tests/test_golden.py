@@ -158,7 +158,7 @@ def test_command_output_matches_golden_file(
     for path in sorted(tmp_path.rglob("*.json")):
         if path.stat().st_mtime_ns != before.get(path):
             lines += [path.name, *written(path)]
-    # the file is identical only on a computer with the same rounding as where it was made
+    # the file is identical only if the processor rounds as the one that made it
     again = r"the log gives (the same file again, byte for byte|all \d+ values again \(.*?\))"
     agrees(name, [re.sub(again, "the log gives it again", line) for line in lines])
 

@@ -84,7 +84,8 @@ def test_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
     for width in (WIDTH, 60):
         assert "…" not in summaries[width]
         assert "--sigma-z" in summaries[width]
-    assert summaries[WIDTH].split() == whole.split()
+    # cells of the table wrap too, which changes the order of the words
+    assert sorted(summaries[WIDTH].split()) == sorted(whole.split())
     long = [line for line in summaries[WIDTH].splitlines() if len(line) > WIDTH]
     assert all(map(commands, long))  # only commands are longer, so they can be copied
     assert "\x1b" not in whole

@@ -233,7 +233,7 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
             "truthV": consistency.truth.velocity_rmse_m_s,
         }
     if hidden := error_beyond_reported_sigma(consistency):
-        ekf2["summary"]["claimed"] = hidden.reported_sigma_m
+        ekf2["summary"]["reportedSigma"] = hidden.reported_sigma_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         ekf2["variance"] = _pack_frame(

@@ -35,7 +35,7 @@ const Explore = (async () => {
   if (Practice.hidden) {
     for (const axis of flight.axes) {
       axis.truth = "shown after your answer";
-      for (const name of ["truthP", "truthV", "claimed"]) delete axis.ekf2.summary?.[name];
+      for (const name of ["truthP", "truthV", "reportedSigma"]) delete axis.ekf2.summary?.[name];
     }
   }
 
@@ -352,7 +352,7 @@ const Explore = (async () => {
       const at = Engine.stateAt(run, times), { p, v } = axis.truth;
       kf.truthP = Engine.rmse(at.p, Engine.interp(times, p[0], p[1], NaN));
       kf.truthV = v === null ? null : Engine.rmse(at.v, Engine.interp(times, v[0], v[1], NaN));
-      kf.claimed = hidden(run, p, kf.nis);
+      kf.reportedSigma = hidden(run, p, kf.nis);
     }
     return kf;
   }
@@ -574,14 +574,14 @@ const Explore = (async () => {
   const quoted = (x) => String(round(x, 12));
   function command() {
     const { bare, held, input, found } = flight.command, lesson = ranges.lesson;
-    const words = [settings.offset !== flight.settings.offset ? held : bare];
+    const parts = [settings.offset !== flight.settings.offset ? held : bare];
     for (const setting of SETTINGS) {
       const standard = setting.key === "offset" ? 0 : lesson[setting.key];
       if (setting.key === "offset" && why) continue;
-      if (settings[setting.key] !== standard) words.push(`--${setting.id} ${quoted(settings[setting.key])}`);
+      if (settings[setting.key] !== standard) parts.push(`--${setting.id} ${quoted(settings[setting.key])}`);
     }
-    if (settings.input !== found || input !== null) words.push(`--input ${settings.input}`);
-    return words.join(" ");
+    if (settings.input !== found || input !== null) parts.push(`--input ${settings.input}`);
+    return parts.join(" ");
   }
   $("copy").addEventListener("click", async () => {
     $("copy-note").textContent = await copied($("command")) ? " copied" : " selected, press Ctrl+C";

@@ -24,8 +24,8 @@ const Story = (() => {
     return `is ${confidence}: σ is ${factor} times too ${size}`;
   }
   function describe(name, filter) {
-    if (filter.truthP && filter.claimed !== undefined) {
-      return `${name} has a position RMSE of ${formatMetres(filter.truthP)}, but reports σ ${formatMetres(filter.claimed)}.`;
+    if (filter.truthP && filter.reportedSigma !== undefined) {
+      return `${name} has a position RMSE of ${formatMetres(filter.truthP)}, but reports σ ${formatMetres(filter.reportedSigma)}.`;
     }
     const start = filter.truthP ? `has a position RMSE of ${formatMetres(filter.truthP)} and `
       : filter.ekf2P ? `differs from EKF2 by ${formatMetres(filter.ekf2P)} RMS and ` : "";

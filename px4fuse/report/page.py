@@ -57,8 +57,8 @@ class Page:
     ) -> None:
         """Write a paragraph; `above` and `indent` in points, `mark` before a list item."""
         if text or mark:
-            styled_text = words(text, size, colour, bold)
-            self.add("text", above=above, indent=indent, mark=mark, **styled_text)
+            block = words(text, size, colour, bold)
+            self.add("text", above=above, indent=indent, mark=mark, **block)
 
     def heading(self, text: str, size: float = 9.0, above: float = 6.0) -> None:
         """Write a heading within the page."""

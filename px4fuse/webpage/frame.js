@@ -34,7 +34,7 @@
 
   const entries = rows.map(([cells, tags, details, beside], index) => ({
     index, cells, tags: new Set(tags), details, beside, open: false,
-    words: fold(cells.map(([text = "", , below = ""]) => text + "\n" + below).join("\n")),
+    searchText: fold(cells.map(([text = "", , below = ""]) => text + "\n" + below).join("\n")),
     values: cells.map(([text = "", value = ""]) =>
       (value === "" ? null : value === true ? text : value)),
   }));
@@ -89,12 +89,12 @@
   let unsaved = false;
   const boxes = (owner, lines, kept) => {
     const made = make("div", "", "boxes");
-    for (const [name, most, points, words] of lines) {
+    for (const [name, maximum, points, comment] of lines) {
       const number = make("input");
       const text = make("textarea");
-      Object.assign(number, { type: "number", min: 0, max: most, step: "any", value: points ?? "" });
-      Object.assign(text, { rows: 2, value: words, dir: "auto" });
-      for (const [title, field] of [["Points of " + most + " for " + name, number],
+      Object.assign(number, { type: "number", min: 0, max: maximum, step: "any", value: points ?? "" });
+      Object.assign(text, { rows: 2, value: comment, dir: "auto" });
+      for (const [title, field] of [["Points of " + maximum + " for " + name, number],
         ["Comment", text]]) {
         const label = isolated("label", title);
         label.append(field);
@@ -114,12 +114,12 @@
     for (const { details } of entries) {
       for (const [kind, , owner, rows, kept] of details) {
         if (kind !== "boxes") continue;
-        for (const [name, , points, words] of rows) {
-          if (points === null && !words) continue;
-          lines.set(owner + "\u0000" + name, [owner, name, points ?? "", words]);
+        for (const [name, , points, comment] of rows) {
+          if (points === null && !comment) continue;
+          lines.set(owner + "\u0000" + name, [owner, name, points ?? "", comment]);
         }
-        for (const [name, points, words] of kept) {
-          lines.set(owner + "\u0000" + name, [owner, name, points ?? "", words]);
+        for (const [name, points, comment] of kept) {
+          lines.set(owner + "\u0000" + name, [owner, name, points ?? "", comment]);
         }
       }
     }
@@ -264,10 +264,10 @@
   };
 
   const filter = () => {
-    const words = fold(at("text").value).split(/\s+/).filter(Boolean);
+    const searched = fold(at("text").value).split(/\s+/).filter(Boolean);
     const tags = selects.map((select) => select.value).filter(Boolean);
     fitting = order.filter((entry) => tags.every((tag) => entry.tags.has(tag))
-      && words.every((word) => entry.words.includes(word)));
+      && searched.every((word) => entry.searchText.includes(word)));
     first = 0;
     document.querySelector(".count").textContent =
       "Showing " + fitting.length + " of " + entries.length;
