@@ -1,4 +1,4 @@
-"""Readers: one file per format, picked by content, not by suffix."""
+"""Flight log readers, one per format, selected by the content of the file."""
 
 from pathlib import Path
 
@@ -8,9 +8,9 @@ from px4fuse.reading import display_name, read_head, read_log_bytes
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# What is given for a log by mistake: how it begins, or the ends of its name; and what it is for
+# Files that users give by mistake: first bytes, suffixes, description, action
 _FOREIGN_FORMATS = (
-    # libraries/AP_Logger/LogStructure.h
+    # Header bytes of ArduPilot, libraries/AP_Logger/LogStructure.h
     (
         b"\xa3\x95",
         (),
@@ -22,14 +22,14 @@ _FOREIGN_FORMATS = (
         b"",
         (".csv", ".tsv"),
         "a table, not a flight log",
-        "If it holds positions, give it beside the log of the flight: px4fuse compare LOG "
+        "If it contains positions, give it in addition to the log: px4fuse compare LOG "
         "--position {name}.",
     ),
     (
         b"",
         (".tum", ".g2o"),
         "a trajectory or a pose graph, not a flight log",
-        "Score it with px4fuse evaluate, or correct its loop: px4fuse loop {name}.",
+        "Compute its errors with px4fuse evaluate, or correct its loop: px4fuse loop {name}.",
     ),
 )
 
@@ -40,8 +40,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     Parameters
     ----------
     path : str or Path
-        A PX4 ULog (``.ulg``) or a MAVLink recording (``.tlog`` or a raw stream); the format is
-        recognised by content.
+        A PX4 ULog (``.ulg``) or a MAVLink recording (``.tlog`` or a raw stream).
     system : int, optional
         MAVLink system id of the vehicle; by default the autopilot with the most messages.
 
@@ -49,17 +48,19 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     ------
     LogError
         The file is missing, empty, not a regular file, larger than
-        :data:`px4fuse.reading.max_log_bytes`, of an unknown format, or holds no usable data.
+        :data:`px4fuse.reading.max_log_bytes`, of an unknown format, or contains no usable data.
     SettingsError
-        ``system`` is not in the recording, or the log is a ULog, which has no systems.
+        ``system`` is not a system id in the recording, or the log is a ULog.
     """
     path = Path(path)
     name = display_name(path)
     head = read_head(path, _SNIFF_BYTES, LogError)
-    # each reader is imported when its format is met: pyulog and pymavlink cost time
+    # Imports are local, because importing pyulog or pymavlink takes a noticeable time
     if head.startswith(ULOG_MAGIC):
         if system is not None:
-            raise SettingsError(f"{name}: `system` is for MAVLink recordings; this is a ULog.")
+            raise SettingsError(
+                f"{name}: `system` is only for MAVLink recordings, and this file is a ULog."
+            )
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))

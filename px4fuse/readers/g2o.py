@@ -1,4 +1,4 @@
-"""Pose graphs in g2o's text format, in the plane and in space."""
+"""Reader and writer of pose graphs in the g2o text format (SE2 and SE3)."""
 
 import re
 from pathlib import Path
@@ -15,42 +15,42 @@ from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
-# Tag: vertices that it names, and numbers that follow them
+# Tag: (count of vertex ids, count of numbers after them)
 _TAGS = {
     "VERTEX_SE2": (1, 3),
     "VERTEX_SE3:QUAT": (1, 7),
     "EDGE_SE2": (2, 3 + 6),
     "EDGE_SE3:QUAT": (2, 7 + 21),
 }
-# Lines of g2o's own tools that add nothing to poses and edges between them
+# Beginnings of tags that are skipped: laser scans and parameters contain no poses or edges
 _IGNORED = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _REMEDY = (
-    "Give poses (VERTEX_SE2 or VERTEX_SE3:QUAT) and edges between them (EDGE_SE2 or "
-    "EDGE_SE3:QUAT), take other lines out, and convert TORO's files to g2o."
+    "Supported are poses (VERTEX_SE2 or VERTEX_SE3:QUAT) and edges between them (EDGE_SE2 or "
+    "EDGE_SE3:QUAT). Remove other lines; convert TORO files to g2o."
 )
 _VERTEX = re.compile("[+-]?[0-9]{1,18}")
-# Files are printed with few digits: a matrix this far from semidefinite is meant as one
+# Ratio; negative over largest eigenvalue that rounding of printed digits can cause
 _ROUNDING = 1e-9
-# Of a squared norm: what normalising again would not improve
+# Deviation from norm 1 that is left unchanged: it is the rounding error of float64
 _UNIT_NORM_TOLERANCE = 1e-15
-# In 1/m² or 1/rad². Far beyond any measurement, and far from where squares and inverses overflow
+# 1/m² or 1/rad²; outside the values of real measurements, inside those whose squares overflow
 _MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
     """Read a pose graph.
 
-    VERTEX_SE2, EDGE_SE2, VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX are read; blank lines, comments
-    (``#``), repeated blanks and Windows line ends are no matter. Vertices are put in the order of
-    their numbers. One FIX is accepted and changes nothing but the frame: the first pose is what is
-    held here. Where the file has no vertices, poses are made from the edges.
+    VERTEX_SE2, EDGE_SE2, VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX are read. Blank lines, comments
+    (``#``), repeated blanks and Windows line ends are accepted. Vertices are sorted by id. One FIX
+    is accepted and ignored: px4fuse always fixes the first pose, which only changes the frame. In
+    a file without vertices the edges initialise the poses.
 
     Raises
     ------
     TrajectoryError
-        One line with the file, the line and what to do, for what is not such a file, has a number
-        that is not finite, an edge to a vertex that is not there, a vertex twice, a matrix that is
-        no information matrix, or both kinds of pose.
+        The file is not a g2o file, or contains a number that is not finite, an edge to a missing
+        vertex, a repeated vertex, an invalid information matrix, or both SE2 and SE3 poses. The
+        message names the file and the line.
     """
     file = Path(path)
     text = decode_text(read_bytes_limited(file, TrajectoryError, MAX_FILE_BYTES))
@@ -60,12 +60,12 @@ def read_g2o(path: str | Path) -> PoseGraph:
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
-    """Read a pose graph from its text.
+    """Parse the text of a g2o file.
 
     Parameters
     ----------
     name : str
-        Of the file, for messages.
+        File name for error messages.
 
     Raises
     ------
@@ -77,11 +77,11 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     dimension, kind, width = (2, "SE2", 3) if in_plane else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(kind):
-            what = "poses in space (SE3) beside poses in the plane (SE2)"
-            raise rows.row_error(0, what, "Give one kind per file.")
+            what = "the file contains both SE2 and SE3 poses"
+            raise rows.row_error(0, what, "Use one kind per file.")
     vertices, edges = rows_by_tag[f"VERTEX_{kind}"], rows_by_tag[f"EDGE_{kind}"]
     if not edges.lines:
-        raise TrajectoryError(f"{name}: no edges", _REMEDY)
+        raise TrajectoryError(f"{name}: the file contains no edges", _REMEDY)
     end_ids, numbers = _parse(edges, f"EDGE_{kind}")
     ids = np.unique(end_ids)
     poses = np.zeros((len(ids), width))
@@ -92,13 +92,13 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         ids, poses = vertex_ids[order, 0], _normalise_quaternions(vertices, poses)[order]
         is_repeated = np.zeros(len(ids), dtype=np.bool_)
         is_repeated[order[1:]] = ids[1:] == ids[:-1]
-        vertices.raise_where(is_repeated, "a vertex for the second time", "Take one of them out.")
+        vertices.raise_where(is_repeated, "this vertex id is repeated", "Remove one of the lines.")
     index = np.minimum(np.searchsorted(ids, end_ids), len(ids) - 1)
-    what = "an edge to a vertex that the file does not have"
-    remedy = "Add its VERTEX line, or take all of them out."
+    what = "an edge to a vertex that is not in the file"
+    remedy = "Add the VERTEX line, or remove all VERTEX lines."
     edges.raise_where(ids[index] != end_ids, what, remedy)
     edges.raise_where(
-        end_ids[:, 0] == end_ids[:, 1], "an edge from a vertex to itself", "Take it out."
+        end_ids[:, 0] == end_ids[:, 1], "an edge from a vertex to itself", "Remove the line."
     )
     graph = PoseGraph(
         dimension=dimension,
@@ -117,12 +117,9 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
 
 
 def g2o_text(graph: PoseGraph) -> str:
-    """A pose graph in g2o's format, which :func:`read_g2o` turns into the same numbers.
+    """Return the pose graph as the text of a g2o file, from which :func:`read_g2o` reads it.
 
-    Returns
-    -------
-    str
-        Vertices, a FIX of the first one, edges; every number with all its digits.
+    The text contains the vertices, a FIX of the first vertex, and the edges, with all digits.
     """
     kind = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
@@ -137,7 +134,7 @@ def g2o_text(graph: PoseGraph) -> str:
 
 
 def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
-    """Lines of vertices and edges by their tag."""
+    """Return the vertex and edge lines, grouped by tag."""
     rows_by_tag = {tag: Rows(name) for tag in _TAGS}
     fixed: set[str] = set()
     for number, raw in enumerate(text.split("\n"), start=1):
@@ -150,56 +147,56 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
         elif tag == "FIX":
             fixed.update(" ".join(rest).split())
             if len(fixed) > 1:
-                remedy = "One pose is held here: take the line out, or join the two by an edge."
+                remedy = "Only one pose can be fixed: remove the line, or connect both by an edge."
                 raise TrajectoryError(
                     format_line_error(name, number, "FIX of a second vertex", remedy)
                 )
         elif not tag.startswith(_IGNORED):
             raise TrajectoryError(
-                format_line_error(name, number, f"{quote(tag)} is not read here", _REMEDY)
+                format_line_error(name, number, f"{quote(tag)} lines are not supported", _REMEDY)
             )
     return rows_by_tag
 
 
 def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Array]:
-    """Vertices that the rows of a tag name, and the numbers behind them."""
+    """Return the vertex ids (n, 1 or 2) and the numbers of all lines of one tag."""
     vertex_count, count = _TAGS[tag]
     words, numbers = rows.parse(1 + vertex_count, count)
     is_no_number = np.array([_VERTEX.fullmatch(word) is None for word in words[:, 1:].flat])
-    what = "the number of a vertex is no integer"
+    what = "the vertex number is not an integer"
     rows.raise_where(is_no_number.reshape(-1, vertex_count), what, "Give an integer.")
-    remedy = "Correct it, or take the line out."
-    rows.raise_where(~np.isfinite(numbers), "a number that is not finite", remedy)
-    # of positions in m; of SE2 also the angle
+    remedy = "Correct or remove the line."
+    rows.raise_where(~np.isfinite(numbers), "a number is not finite", remedy)
+    # The first three numbers are the position (m) or, in SE2, x, y (m) and the angle (rad)
     far = np.abs(numbers[:, :3]) >= MAX_VALUE
-    rows.raise_where(far, f"a value beyond {MAX_VALUE:.0e}", remedy)
+    rows.raise_where(far, f"a value is above {MAX_VALUE:.0e}", remedy)
     return words[:, 1:].astype(np.int64), numbers
 
 
 def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
-    """Poses with unit quaternions."""
+    """Return the poses with unit quaternions; SE2 poses unchanged."""
     if poses.shape[1] == 3:
         return poses
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(poses[:, 3:], axis=1)
-    what = "a quaternion whose length is far from 1 is not a rotation"
-    remedy = "Give qx qy qz qw, of length 1, behind the position."
+    what = "the quaternion does not have unit length"
+    remedy = "Give the unit quaternion qx qy qz qw after the position."
     rows.raise_where((norm < 1e-6) | ~(norm < 1e6), what, remedy)
-    # What is a unit quaternion already stays as it is, so that writing and reading changes nothing
+    # Unit quaternions stay unchanged, so that a written file is read back identically
     norm[np.abs(norm - 1.0) <= _UNIT_NORM_TOLERANCE] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
 
 
 def _information(rows: Rows, numbers: Array, size: int) -> Array:
-    """Symmetric matrices from their upper triangles, row by row."""
+    """Return the information matrices (n, size, size) from their upper triangles by rows."""
     row, column = np.triu_indices(size)
     matrices = np.empty((len(numbers), size, size))
     matrices[:, row, column] = matrices[:, column, row] = numbers
     entry = np.abs(numbers)
     tiny = (row == column) & (entry > 0.0) & (entry < _MIN_INFORMATION)
-    what = "the information matrix has an entry that cannot be computed with"
+    what = "the information matrix has an invalid entry"
     usual_range = f"{_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}"
-    remedy = f"Give 0 for what the edge does not tell, else {usual_range}."
+    remedy = f"Give 0 for directions without information, else {usual_range}."
     rows.raise_where(tiny | (entry > _MAX_INFORMATION), what, remedy)
     values = np.linalg.eigvalsh(matrices)
     what = "the information matrix has a negative eigenvalue"

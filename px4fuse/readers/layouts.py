@@ -1,4 +1,4 @@
-"""How a topic or message holds a quantity: the rows of the tables of both formats.
+"""Mapping of message fields to columns: row format of the PX4 topic and MAVLink message tables.
 
 The tables are ``px4_topics.toml`` and ``mavlink_messages.toml``.
 """
@@ -11,25 +11,25 @@ import msgspec
 
 from px4fuse.flight import Columns
 
-# No field reaches it, flags and UNIX times in µs (1.8e15) included
+# Values of this size are damage: the largest valid fields are UNIX times in µs (1.8e15)
 IMPOSSIBLE = 1e17
 GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """One way in which a quantity is written.
+    """Fields of one topic or message that contain a quantity.
 
     Attributes
     ----------
     topic : str
-        A PX4 topic or a MAVLink message; empty where the table names it elsewhere.
-    columns : mapping
-        Our column name to the field's name, ``name[i]`` for an element; all must be present.
-    optional : mapping
-        Further columns, read where the topic has them.
-    scale : mapping
-        Our unit per unit of the field, by our column name; 1 where there is none.
+        PX4 topic or MAVLink message; empty if another row of the table names it.
+    columns : mapping from column name to field name
+        Required fields; ``name[i]`` is an array element.
+    optional : mapping from column name to field name
+        Fields that are read if the topic contains them.
+    scale : mapping from column name to float
+        Column unit per field unit; 1 if absent.
     """
 
     topic: str = ""
@@ -39,7 +39,7 @@ class Layout:
 
 
 def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
-    """Rows as they are written, with every column named."""
+    """Convert the rows of a table to layouts, with abbreviated columns expanded."""
     return {
         name: replace(
             row,
@@ -52,14 +52,14 @@ def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
 
 
 def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns one by one, of which a row names several at once.
+    """Expand a row that names several columns at once to one entry per column.
 
     Parameters
     ----------
     fields : mapping
-        Names of columns with blanks between them, or of a list of :class:`Columns`; and their
-        fields with blanks between them, elements of one field (``name[]`` from the first on,
-        ``name[0 6 11]``), or a number for all of them.
+        Keys are column names separated by blanks, or the name of a list of :class:`Columns`.
+        Values are field names separated by blanks, elements of one field (``name[]`` from the
+        first on, ``name[0 6 11]``), or one number for all columns.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""MAVLink recordings (``.tlog`` and raw streams) to :class:`~px4fuse.flight.Flight`.
+"""Reader of MAVLink recordings (``.tlog`` and raw streams); returns a flight.
 
-Which message is what, its direction and its clock follow PX4's ``src/modules/mavlink`` (v1.13 to
-v1.16) and MAVLink's ``common.xml``; ``mavlink_messages`` holds them as tables.
+Meaning, direction and clock of each message follow PX4's ``src/modules/mavlink`` (v1.13 to v1.16)
+and MAVLink's ``common.xml``; ``mavlink_messages`` contains them as tables.
 """
 
 from collections.abc import Mapping
@@ -24,11 +24,11 @@ from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 from px4fuse.recording import LogInfo, Unused
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
-# MAV_PARAM_TYPE: below, an integer
+# MAV_PARAM_TYPE_REAL32; smaller values of MAV_PARAM_TYPE are integer types
 PARAMETER_REAL = 9
 
 
-# hostile values become NaN or infinite without a word, and are dropped where samples are made
+# No warnings for damaged values: they become NaN or infinite, and such samples are dropped
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
 def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight:
     """Read a MAVLink recording.
@@ -36,7 +36,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     Parameters
     ----------
     name : str
-        Of the file.
+        File name.
     content : bytes
         ``.tlog`` of QGroundControl or MAVProxy, or a raw stream of MAVLink 1 and 2.
     system : int, optional
@@ -45,14 +45,14 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     Returns
     -------
     Flight
-        Parts that the recording lacks are ``Unavailable``.
+        Missing parts are ``Unavailable``.
 
     Raises
     ------
     LogError
-        It holds no MAVLink.
+        The content is not MAVLink.
     SettingsError
-        No autopilot in it has that system id.
+        No autopilot in the recording has this system id.
     """
     frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system)
@@ -63,7 +63,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
     ekf2 = _read_ekf2(recording, parameters, autopilot)
-    # other autopilots do not tell by how much they take a fix to be older than its stamp
+    # Only PX4 has a parameter for the delay between a GNSS fix and its timestamp
     known = settings_in_force(parameters, GNSS_POS) if autopilot == "PX4" else {}
     delay_s = 1e-3 * known.get(GNSS_POS.delay, 0.0)
     positions, missing_positions = read_positions(recording, mapped, remedies["position"], delay_s)
@@ -73,7 +73,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     pressure = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
     modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
-        # after all that is read, since it tells what was dropped
+        # Must come after all reads, because it lists the dropped samples
         log=_describe(recording, parameters, faults, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
@@ -96,12 +96,12 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
 
 def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     found = [(layout, recording.rows(layout.topic)) for layout in messages.IMU]
-    # HIGHRES_IMU has units and µs; of the others the densest
+    # HIGHRES_IMU is preferred (SI units, µs timestamps); otherwise the message with most samples
     layout, rows = found[0] if len(found[0][1]) > 1 else max(found, key=lambda pair: len(pair[1]))
     if len(rows) < 2:
         raw = len(recording.rows("RAW_IMU"))
-        refused = f"; {raw} RAW_IMU were refused, since raw counts have no unit" if raw else ""
-        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{refused}", remedy)
+        ignored = f"; {raw} RAW_IMU messages were not used: raw counts have no unit" if raw else ""
+        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{ignored}", remedy)
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
@@ -131,10 +131,10 @@ def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavaila
 def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
-    """EKF2's output as the autopilot sent it, or why there is none."""
+    """Read EKF2's position, velocity and variances as sent by the autopilot."""
     remedies, replay = messages.remedies_of_autopilot(autopilot)
     counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATES}
-    # the one with variances as long as it is not much sparser than the one without
+    # ODOMETRY, which has variances, unless its rate is below half of LOCAL_POSITION_NED's
     dense = (
         layout_candidate
         for layout_candidate in messages.STATES
@@ -149,23 +149,29 @@ def _read_ekf2(
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
     if len(state) < 2:
-        return Unavailable("EKF2", f"{message} holds no finite state", "Wait for EKF2 to start.")
+        return Unavailable(
+            "EKF2",
+            f"{message} has no finite state",
+            "Wait until EKF2 has started before recording.",
+        )
     recording.record_stream("ekf2_state", message)
-    notes = [f"EKF2's state is {message} as the autopilot sent it"]
+    notes = [f"EKF2 state from {message}, as sent by the autopilot"]
     if autopilot != "PX4":
-        notes.append(f"this is {autopilot}: what is called EKF2 here is its own estimator")
+        notes.append(f"autopilot {autopilot}: 'EKF2' means the estimator of this autopilot")
     if "reset_counter" in samples and (
         count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):
         reset = f"EKF2 reset its state {count} times in the recording"
-        notes.append(f"{reset}; ODOMETRY does not say by how much, so nothing was undone")
+        notes.append(f"{reset}; ODOMETRY does not contain their size, so they were not removed")
     found = samples.reindex(columns=VARIANCE_COLUMNS)
     found = found[(found > 0.0).all(axis=1)]
     if found.empty:
         message, found = messages.LAYOUTS["accuracy"].topic, _variance_by_accuracy(recording)
         if len(found):
-            by = "from ESTIMATOR_STATUS: its horizontal accuracy squared, half to each axis"
-            notes.append(f"EKF2's position variances are {by}; velocity variances are not sent")
+            notes.append(
+                "EKF2 position variances from ESTIMATOR_STATUS: half of the squared horizontal "
+                "accuracy on each horizontal axis; velocity variances are not sent"
+            )
     variance: pd.DataFrame | Unavailable = found
     if found.empty:
         variance = Unavailable(
@@ -201,7 +207,7 @@ def _read_ekf2(
 
 
 def _variance_by_accuracy(recording: Recording) -> pd.DataFrame:
-    """Position variances from the accuracies of ESTIMATOR_STATUS, which are one σ.
+    """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
 
     PX4's horizontal accuracy is the root of the sum over both axes (``get_ekf_lpos_accuracy``).
     """
@@ -215,12 +221,12 @@ def _variance_by_accuracy(recording: Recording) -> pd.DataFrame:
 def _read_airborne(
     recording: Recording, remedy: str
 ) -> tuple[tuple[float, float], ...] | Unavailable:
-    """Stretches of flight by the land detector, each from take-off to touch-down."""
+    """Read the intervals (s) from take-off to touch-down, as the land detector reports them."""
     rows = recording.rows("EXTENDED_SYS_STATE")
     table = recording.frames.table("EXTENDED_SYS_STATE", rows)
     known = table["landed_state"] > 0
     if not np.any(known):
-        return Unavailable("land detector", "no usable EXTENDED_SYS_STATE", remedy)
+        return Unavailable("land detector", "EXTENDED_SYS_STATE is missing or not usable", remedy)
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == messages.LANDED, index=time_s)
@@ -243,7 +249,7 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
-    """Parameters as first sent; PX4 puts the bytes of an integer into the float."""
+    """Read the first value of each parameter; PX4 sends integers as bytes in the float field."""
     table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
     by_bytes = (autopilot == "PX4") & (table["param_type"] < PARAMETER_REAL)
     raw = np.ascontiguousarray(table["param_value"])
@@ -284,7 +290,7 @@ def _describe(
     beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
     first = next(iter(beats["type"].tolist()), -1)
     kind = messages.VEHICLE_TYPES.get(first, "vehicle")
-    why = "zero, go back, or lie outside the recording"
+    why = "zero, go back, or are outside the recording"
     dropped = [dropped_note(n, message, why) for message, n in sorted(recording.dropped.items())]
     return LogInfo(
         name=frames.name,
@@ -312,7 +318,7 @@ def _describe(
 
 
 def _start_unix_s(recording: Recording) -> float | None:
-    """UNIX time of time zero: the autopilot's own, or else the recording computer's."""
+    """Return the UNIX time (s) of time zero, by the autopilot or else the recording computer."""
     if recording.zero_s >= UNIX_FROM_S:
         return recording.zero_s
     unix = unix_of_boot(recording)

@@ -1,9 +1,8 @@
-"""MAVLink bytes to frames, and frames to columns: everything that knows the wire format.
+"""MAVLink wire format: bytes to frames, and frames to columns.
 
-A recording is scanned for frames instead of being parsed byte by byte: every position that could
-begin a frame of a known message is checked by its checksum, so that junk, cut frames and bad
-checksums cost themselves; they are counted. A message type is then decoded for all its frames at
-once with the field tables of pymavlink's dialect.
+Every byte position at which a frame of a known message could begin is verified by the checksum.
+Invalid bytes and incomplete frames are skipped and counted, without loss of valid frames. All
+frames of one message type are decoded at once with the field tables of pymavlink's dialect.
 
 Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated dialects.
 """
@@ -23,7 +22,7 @@ from px4fuse.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
 
 Integers = NDArray[np.int64]
-# MAVLink system and component
+# (MAVLink system id, MAVLink component id)
 Address = tuple[int, int]
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
@@ -32,28 +31,28 @@ CHECKSUM = 2
 SIGNATURE = 13
 SIGNED = 0x01
 LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
-# QGroundControl and MAVProxy put the time of receipt before each frame: µs, big-endian
+# Receive time that QGroundControl and MAVProxy write before each frame: µs, big-endian
 STAMP_BYTES = 8
-# Bytes that are scanned at a time, which bounds the memory that hostile bytes can claim
+# Bytes scanned at once; limits the memory for malicious files
 BLOCK_BYTES = 1 << 16
-# Frames that are gathered at a time
+# Frames decoded at once; limits the memory
 FRAMES_PER_PIECE = 1 << 12
-# Below this share of bytes in good frames a file is no MAVLink recording: chance makes one frame
-# in about eight million random bytes.
+# Fraction of bytes in valid frames, below which a file is not a MAVLink recording. Random bytes
+# contain one valid frame in about eight million.
 MIN_GOOD_SHARE = 0.01
-# A stamp further than this from the median one is damaged (pymavlink's own limit)
+# µs; a receive time further than this from the median is damaged (limit of pymavlink)
 MAX_STAMP_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {one.msgname: at for at, one in dialect.mavlink_map.items()}
-# Last byte of the checksum's input by message id; -1 where the dialect does not know the message
+# CRC_EXTRA byte by message id, the last input of the checksum; -1 for unknown messages
 _SEEDS = np.full(max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16)
 _SEEDS[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
-# Checksum of each single byte, for the last step over the seed
+# Checksum of each single byte, for the last step of the checksum with CRC_EXTRA
 _LAST = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The good frames of one recording, in file order.
+    """Frames of one recording with valid checksums, in file order.
 
     Attributes
     ----------
@@ -68,14 +67,15 @@ class Frames:
     payload_start : ndarray of int64, shape (n,)
     payload_length : ndarray of uint8, shape (n,)
     received_us : ndarray of int64, shape (n,), or None
-        Time of receipt, µs UNIX, of a recording with stamps (damaged ones interpolated).
+        Receive time (UNIX, µs), with damaged ones interpolated; None for a raw stream.
     unknown_frame_count : int
-        Whole frames of messages that the dialect does not know.
+        Complete frames of messages that are not in the dialect.
     bad_bytes : int
-        Bytes that belong to no frame.
+        Bytes that are not part of a frame.
     in_frame : bool
-        Whether the file ends in the middle of a frame.
+        True if the file ends within a frame.
     bad_stamps : int
+        Damaged receive times.
     """
 
     name: str
@@ -98,11 +98,11 @@ class Frames:
         return len(self.start)
 
     def rows(self, message: str) -> IntArray:
-        """Indices of the frames of one message, by its MAVLink name."""
+        """Return the indices of the frames of one message, given its MAVLink name."""
         return np.flatnonzero(self.message_id == MESSAGE_IDS[message])
 
     def sent_by(self, address: Address, rows: IntArray | slice = slice(None)) -> BoolArray:
-        """Whether frames, by default all, are from one system and component."""
+        """Return a mask of the frames (all by default) from one system and component."""
         system, component = address
         return np.asarray((self.system[rows] == system) & (self.component[rows] == component))
 
@@ -114,13 +114,13 @@ class Frames:
         message : str
             MAVLink name, for example "ATTITUDE".
         rows : ndarray, shape (n,)
-            Of :meth:`rows`.
+            Frame indices from :meth:`rows`.
 
         Returns
         -------
         structured ndarray, shape (n,)
-            One field per MAVLink field, in MAVLink's units; trailing zeros that MAVLink 2 cuts
-            off the payload are put back.
+            One field per MAVLink field, in MAVLink units. The trailing zeros that MAVLink 2 omits
+            from the payload are restored.
         """
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
@@ -131,7 +131,7 @@ class Frames:
             if size:
                 rows_of_length = np.flatnonzero(lengths == length)
                 windows = np.lib.stride_tricks.sliding_window_view(source, size)
-                # a piece at a time: what is gathered is a copy
+                # Indexing copies the payloads, so the number of frames per step is limited
                 for at in range(0, len(rows_of_length), FRAMES_PER_PIECE):
                     piece_rows = rows_of_length[at : at + FRAMES_PER_PIECE]
                     payload[piece_rows, :size] = windows[starts[piece_rows]]
@@ -139,15 +139,15 @@ class Frames:
 
 
 def message_name(number: int) -> str:
-    """MAVLink's name of a message id."""
+    """Return the MAVLink name of a message id."""
     return str(dialect.mavlink_map[number].msgname)
 
 
 @cache
 def wire_layout(number: int) -> np.dtype[Any]:
-    """Payload of a message as a packed structured dtype, from pymavlink's field tables."""
+    """Return the payload layout of a message id as a packed structured dtype."""
     message = dialect.mavlink_map[number]
-    kinds = message.native_format.decode().removeprefix("<")  # struct's, which numpy knows too
+    kinds = message.native_format.decode().removeprefix("<")  # struct codes, same as in numpy
     fields: list[Any] = []
     for name, kind, length in zip(
         message.ordered_fieldnames, kinds, message.array_lengths, strict=True
@@ -160,34 +160,32 @@ def wire_layout(number: int) -> np.dtype[Any]:
 
 
 def read_frames(name: str, content: bytes) -> Frames:
-    """Find all good frames of a recording.
+    """Find all frames with valid checksums in a recording.
 
     Parameters
     ----------
     name : str
-        Of the file, for messages.
+        File name for error messages.
     content : bytes
-        A ``.tlog`` with time stamps, or a raw stream of MAVLink 1 and 2.
+        A ``.tlog`` with receive times, or a raw stream of MAVLink 1 and 2.
 
     Raises
     ------
     LogError
-        It holds no MAVLink.
+        The content is not MAVLink.
     """
     start, end, number = _remove_overlapping(_scan(content)).T
     stamp = STAMP_BYTES if len(start) and _has_receive_stamps(start, end) else 0
     good_bytes = int(np.sum(end - start))
     if good_bytes < MIN_GOOD_SHARE * len(content) or not len(start):
         raise LogError(
-            (
-                f"{name} is neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
-                f"with a valid checksum in {len(content)} bytes)."
-            ),
+            f"{name} is neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
+            f"with a valid checksum in {len(content)} bytes).",
             "Give the .ulg from the vehicle, or a .tlog or raw MAVLink stream.",
         )
     source = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = source[start] == MAGIC_2
-    # sequence, system and component follow one another
+    # Header order: sequence, system, component
     at = start + np.where(is_version_2, 4, 2)
     unknown_frame_count, bad_bytes, in_frame = _count_other_bytes(
         content, start - stamp, end, stamp
@@ -213,7 +211,7 @@ def read_frames(name: str, content: bytes) -> Frames:
 
 
 def _scan(content: bytes) -> Integers:
-    """Start, end and message id of all frames with a good checksum, shape (n, 3); may overlap."""
+    """Return start, end and message id, shape (n, 3), of all valid frames; they may overlap."""
     source, view = np.frombuffer(content, dtype=np.uint8), memoryview(content)
     found = [np.zeros((0, 3), dtype=np.int64)]
     for low in range(0, len(source), BLOCK_BYTES):
@@ -227,10 +225,10 @@ def _scan(content: bytes) -> Integers:
 
 
 def _remove_overlapping(frames: Integers) -> Integers:
-    """Frames in file order, without those that begin inside the one before.
+    """Remove frames that begin inside the previous frame.
 
-    One frame may lie in another one's payload (a tunnel). By chance a stamp looks like the
-    beginning of a frame, which must not hide the true one that follows the one before.
+    The payload of one frame may contain another frame (TUNNEL). A receive time can look like the
+    beginning of a frame; it must not hide the frame after it.
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
@@ -245,10 +243,7 @@ def _remove_overlapping(frames: Integers) -> Integers:
 
 
 def _candidates(source: NDArray[np.uint8], low: int) -> tuple[Integers, Integers]:
-    """Where a frame of a known message could begin in one block, as :func:`_scan` has frames.
-
-    And where its checksum stands.
-    """
+    """Return possible frames in one block (as in :func:`_scan`) and their checksum offsets."""
     block = source[low : low + BLOCK_BYTES]
     start = np.flatnonzero((block == MAGIC_1) | (block == MAGIC_2)).astype(np.int64) + low
     header = np.where(source[start] == MAGIC_2, HEADER_2, HEADER_1)
@@ -268,7 +263,7 @@ def _candidates(source: NDArray[np.uint8], low: int) -> tuple[Integers, Integers
 
 
 def _has_receive_stamps(start: Integers, end: Integers) -> bool:
-    """Whether a stamp stands before each frame: eight bytes between neighbours instead of none."""
+    """Return True if most frames are separated by the eight bytes of a receive time."""
     gap_bytes = start[1:] - end[:-1]
     stamped_count, bare_count = (
         np.count_nonzero(gap_bytes == STAMP_BYTES),
@@ -284,16 +279,16 @@ def _has_receive_stamps(start: Integers, end: Integers) -> bool:
 def _count_other_bytes(
     content: bytes, start: Integers, end: Integers, stamp: int
 ) -> tuple[int, int, bool]:
-    """What lies between the good frames, of which ``start`` is with the stamp.
+    """Count the content between valid frames; ``start`` includes the receive time.
 
     Returns
     -------
     int
-        Whole frames of messages that the dialect does not know.
+        Complete frames of messages that are not in the dialect.
     int
-        Bytes that belong to no frame.
+        Bytes that are not part of a frame.
     bool
-        Whether the last of them begin one.
+        True if the last of these bytes are the beginning of a frame.
     """
     unknown_frame_count, bad, rest = 0, 0, b""
     lows, highs = np.append(0, end), np.append(start, len(content))
@@ -309,7 +304,7 @@ def _count_other_bytes(
 
 
 def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[int]:
-    """Sizes of unknown frames that follow one another, by their headers alone."""
+    """Yield the sizes (bytes) of consecutive frames of unknown messages, from their headers."""
     while at + stamp + HEADER_1 + CHECKSUM <= high:
         head = content[at + stamp : at + stamp + HEADER_2]
         number, size = head[5], stamp + head[1] + HEADER_1 + CHECKSUM
@@ -323,20 +318,20 @@ def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[
 
 
 def _stamps(source: NDArray[np.uint8], start: Integers, end: Integers) -> tuple[Integers, int]:
-    """Time of receipt (µs), and how many stamps were damaged."""
+    """Return the receive times (UNIX, µs) and the number of damaged ones."""
     usable = start >= STAMP_BYTES
     usable[1:] &= start[1:] - end[:-1] >= STAMP_BYTES
     windows = np.lib.stride_tricks.sliding_window_view(source, STAMP_BYTES)
-    # the first frame may stand at the very beginning
+    # The first frame may have no receive time before it
     stamp = np.ascontiguousarray(windows[np.maximum(start - STAMP_BYTES, 0)]).view(">u8")[:, 0]
-    received = stamp.astype(np.int64)  # beyond 1 << 63: negative
+    received = stamp.astype(np.int64)  # values above 1 << 63 become negative
     usable &= (received >= 0) & (received < 1 << 62)
     middle = int(np.median(received[usable])) if np.any(usable) else 0
     usable &= np.abs(received - middle) <= MAX_STAMP_DISTANCE_US
     received = np.where(usable, received, 0)
     if np.any(usable):
         rows = np.flatnonzero(usable)
-        # interpolated from the first one on, so that float64 keeps every microsecond
+        # Relative to the first receive time, so that float64 resolves microseconds
         steps = np.interp(np.arange(len(start)), rows, received[rows] - received[rows[0]])
         received = received[rows[0]] + np.rint(steps).astype(np.int64)
     return received, int(np.count_nonzero(~usable))

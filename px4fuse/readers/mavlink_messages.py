@@ -1,6 +1,6 @@
-"""The table of MAVLink messages: names, units, frames and directions as data.
+"""MAVLink messages that px4fuse reads: fields, units, frames, directions.
 
-A new message with a position is a row of ``mavlink_messages.toml``, and nothing else.
+To support another message with a position, add a row to ``mavlink_messages.toml``.
 """
 
 from collections.abc import Mapping
@@ -29,9 +29,9 @@ ARDUPILOT_REPLAY = Unavailable(
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
     "Use its logged state.",
 )
-# Messages whose time_usec is the autopilot's boot clock; GPS_RAW_INT's, say, is the receiver's
+# Messages whose time_usec is the boot clock; in other messages it may be another clock
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
-# What an autopilot sends of itself, and nobody else
+# Messages that only an autopilot sends; they identify it
 OWN_MESSAGES = (
     "HIGHRES_IMU",
     "SCALED_IMU",
@@ -48,12 +48,11 @@ OWN_MESSAGES = (
 
 @dataclass(frozen=True)
 class PositionInput:
-    """An external position on its way to the autopilot.
+    """Message with which an external position is sent to the autopilot.
 
-    ``name`` is the track's name for ``--position-source``, ``row`` how its message holds it,
-    ``stamp`` the field with the sender's time in µs, ``estimator`` the MAV_ESTIMATOR_TYPE of which
-    it is, where the message has that. PX4 drops the covariance of a naive estimator
-    (``mavlink_receiver.cpp``).
+    ``name`` is the track name for ``--position-source``, ``row`` the key in LAYOUTS, ``stamp`` the
+    field with the sender's time (µs), ``estimator`` the required MAV_ESTIMATOR_TYPE, if any. PX4
+    ignores the covariance of a naive estimator (``mavlink_receiver.cpp``).
     """
 
     row: str
@@ -66,23 +65,23 @@ class PositionInput:
 
     @property
     def layout(self) -> Layout:
-        """How its message holds it."""
+        """Fields of the message."""
         return LAYOUTS[self.row]
 
     @property
     def origin(self) -> Origin:
-        """Where it comes from, with all that follows from it."""
+        """Origin of the position."""
         return find_origin(self.kind, "as it arrived")
 
     @property
     def message(self) -> str:
-        """Its MAVLink name."""
+        """MAVLink name of the message."""
         return self.layout.topic
 
 
 @dataclass(frozen=True)
 class FrameOfReference:
-    """A MAV_FRAME: which component is north (or forward), east (right) and down, and its sign."""
+    """MAV_FRAME: order and signs of its components as north, east, down or forward, right, down."""
 
     name: str
     order: tuple[int, int, int] = (0, 1, 2)
@@ -102,9 +101,9 @@ UNUSED: Mapping[str, str] = _ROWS["unused"]
 POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())
 _SCALED_IMU = (replace(LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3"))
 IMU = (LAYOUTS["highres_imu"], *_SCALED_IMU)
-# Equally dense ones are taken in this order
+# In order of preference for equal message counts
 ATTITUDE = (LAYOUTS["quaternion"], LAYOUTS["angles"], LAYOUTS["attitude_of_odometry"])
-# EKF2's state, that with variances first
+# EKF2's state; the message with variances first
 STATES = (LAYOUTS["odometry"], LAYOUTS["local_position"])
 # Simulation truth
 TRUTH = (LAYOUTS["truth"], LAYOUTS["sim_state"])
@@ -112,7 +111,10 @@ GNSS_INPUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """What would have recorded each part, and why EKF2 is not replayed; PX4's but for ArduPilot."""
+    """Return how to record each missing part, and the reason for no EKF2 replay.
+
+    Autopilots other than ArduPilot get the texts for PX4.
+    """
     if autopilot == "ArduPilot":
         return _ROWS["remedies"][autopilot], ARDUPILOT_REPLAY
     return _ROWS["remedies"]["PX4"], RECORD_NOT_LOGGED

@@ -1,4 +1,4 @@
-"""External positions that were sent to the autopilot over MAVLink, and the truth."""
+"""External positions sent to the autopilot over MAVLink, GNSS positions, and ground truth."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.parts import join_nearest, read_attitude, read_orientation
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
-# A boot clock's stamp is no further from its receipt
+# s; larger median distance between timestamp and receipt: the timestamp is not boot time
 OWN_CLOCK_S = 5.0
-# Of a global and a local position that tell the origin together, 5 cm at 1 m/s
+# s; time difference of global and local position for the origin: 5 cm error at 1 m/s
 SAME_STATE_S = 0.05
 
 
 def read_positions(
     recording: Recording, clocks: dict[Address, ClockMapping], remedy: str, delay_s: float
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Every external position that was sent to the autopilot, the best first.
+    """Read all external positions sent to the autopilot, in order of preference.
 
     Parameters
     ----------
-    clocks : mapping from address to Mapped
+    clocks : mapping from address to ClockMapping
         Clock of every sender.
     remedy : str
-        What would have recorded one that is missing.
+        How to record missing positions.
     delay_s : float
-        By which the autopilot takes a fix to be older than its stamp.
+        Delay between a GNSS fix and its timestamp that the autopilot assumes.
     """
     found: list[PositionTrack | Unavailable] = []
     for message in dict.fromkeys(source.message for source in messages.POSITION_INPUTS):
@@ -67,7 +67,7 @@ def _read_track(
     remedy: str,
     senders: list[Address],
 ) -> PositionTrack | Unavailable | None:
-    """What one sender sent of one kind; None where it did not."""
+    """Read one kind of position from one sender; None if the sender did not send it."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
@@ -83,7 +83,7 @@ def _read_track(
     samples = recording.read(source.layout, rows, boot_s, name)
     frame = "NED"
     if "frame_id" in samples and len(samples):
-        # one frame per track: that of the last sample, as PX4 would have used it
+        # One frame per track: that of the last sample, which PX4 would have used
         reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if reference is None else reference.name
     if source.drops_covariance:
@@ -113,10 +113,10 @@ def _read_track(
 def _read_gnss(
     recording: Recording, layout: Layout, delay_s: float
 ) -> PositionTrack | Unavailable | None:
-    """Fixes of a receiver, about the autopilot's own origin; None where there are none.
+    """Read the fixes of a GNSS receiver as NED about the autopilot's origin; None if none.
 
-    PX4 and ArduPilot stamp a fix with their boot clock, and send it again until the next comes.
-    It is what the autopilot's estimator follows where that knows where on the globe it is.
+    PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat it until the next
+    fix. The track is chosen automatically if the autopilot sends a global position.
     """
     rows = recording.rows(layout.topic)
     stamp_us = recording.frames.table(layout.topic, rows)["time_usec"]
@@ -124,7 +124,7 @@ def _read_gnss(
     boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
     receipt_s = recording.receipt_boot_s(rows)
     if len(rows) and np.median(np.abs(receipt_s - boot_s)) > OWN_CLOCK_S:
-        boot_s = receipt_s  # UNIX time, or the recording has no boot clock
+        boot_s = receipt_s  # timestamps are UNIX time, or the recording has no boot clock
     fixes = recording.read(layout, rows, boot_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
@@ -138,7 +138,7 @@ def _read_gnss(
         structs.replace(GNSS, is_automatic=is_automatic),
         description="GNSS position",
         frame="NED",
-        clock=f"{BOOT_CLOCK}, less {1e3 * delay_s:g} ms",
+        clock=f"{BOOT_CLOCK} minus {1e3 * delay_s:g} ms",
         topics=(layout.topic,),
         log=recording.frames.name,
         age_s=delay_s,
@@ -146,15 +146,15 @@ def _read_gnss(
 
 
 def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
-    """Altitude (m) of a pressure in the standard atmosphere, troposphere (ISO 2533:1975)."""
+    """Convert pressure (hPa) to altitude (m) in the standard troposphere (ISO 2533:1975)."""
     exponent = constants.R * 0.0065 / (constants.g * 0.0289644)
     return 288.15 / 0.0065 * (1.0 - (pressure_hpa / 1013.25) ** exponent)
 
 
 def local_origin(recording: Recording) -> GeodeticPosition | None:
-    """The autopilot's origin on the globe (degrees, degrees, m), None where it does not tell.
+    """Return latitude, longitude (degrees) and altitude (m) of the autopilot's local origin.
 
-    As it is sent, or else by its global and its local position.
+    The origin is as sent, or else computed from global and local positions; None if unknown.
     """
     sent_origin = recording.read(messages.LAYOUTS["origin"]).dropna()
     if len(sent_origin):
@@ -174,11 +174,11 @@ def local_origin(recording: Recording) -> GeodeticPosition | None:
 def read_truth(
     recording: Recording, positions: tuple[PositionTrack, ...], remedies: Mapping[str, str]
 ) -> Truth | Unavailable:
-    """Simulation truth, or motion capture where another track feeds EKF2.
+    """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
-    Simulation truth carries no usable clock (``HIL_STATE_QUATERNION.time_usec`` is 0 in PX4), so
-    the time of receipt is taken, and no local position, so it is projected about its own first
-    sample, where the simulated vehicle was put, or about the autopilot's origin where GNSS is.
+    Simulation ground truth has no usable timestamps (``HIL_STATE_QUATERNION.time_usec`` is 0 in
+    PX4), so receive times are used. Its geodetic positions are projected about the autopilot's
+    origin for a GNSS source, otherwise about its first sample, the start of the simulated vehicle.
     """
     for layout in messages.TRUTH:
         rows = recording.rows(layout.topic)
@@ -190,7 +190,7 @@ def read_truth(
             continue
         samples = samples.reindex(columns=[*GLOBAL_COLUMNS, *Columns.VELOCITY, *Columns.QUATERNION])
         if not samples[Columns.VELOCITY].to_numpy().any():
-            # not sent: a vehicle that never moves has no use for truth
+            # Velocities that are all zero were not sent
             samples[Columns.VELOCITY] = np.nan
         recording.record_stream("truth", layout.topic, clock=RECEIPT_CLOCK)
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
@@ -203,5 +203,5 @@ def read_truth(
     return mocap_truth or Unavailable(
         "ground truth",
         "the recording has neither simulation ground truth nor motion capture",
-        f"{remedies['truth']}",
+        remedies["truth"],
     )

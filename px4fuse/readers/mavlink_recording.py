@@ -1,4 +1,4 @@
-"""One MAVLink recording with its vehicle chosen and its clocks settled."""
+"""MAVLink recording of one vehicle, with all message times on its boot clock."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,48 +19,48 @@ from px4fuse.readers.ulog_topics import longest_increasing_run
 from px4fuse.recording import Stream
 
 BOOT_CLOCK = "autopilot boot clock"
-RECEIPT_CLOCK = "time of receipt, less the link's least delay"
-# The boot clock going back by more than this is a restart, not a late packet
+RECEIPT_CLOCK = "receive time minus minimum link delay"
+# s; a larger backward step of the boot clock is a restart, not a late packet
 RESTART_S = 5.0
-# Messages so far before and after a restart must say so too
+# Number of messages before and after a restart that are compared to confirm it
 RESTART_MESSAGES = 20
-# Stamps apart from the rest by OUTSIDE_S and fewer than this share of it are impossible
+# Fraction of the largest group of timestamps, below which a separate group is invalid
 STRAY_SHARE = 0.01
-# Samples further than this before or after the session have an impossible stamp
+# s; timestamps further than this from all others, or outside the session, are invalid
 OUTSIDE_S = 60.0
-# More bytes than this outside of frames are damage; a stream may begin in mid-frame
+# Fraction of bytes outside of frames, above which the file is damaged
 DAMAGED_SHARE = 0.002
-# From this number on, stamps of the autopilot that stand still are no clock
+# Fewest boot timestamps of which constant values are recognised as "not a clock"
 MIN_STAMPS = 10
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording with its clocks settled.
+    """MAVLink recording with the clock map of its autopilot.
 
     Attributes
     ----------
     frames : Frames
     address : Address
-        Of the autopilot whose flight this is.
+        Address of the autopilot of this flight.
     session : slice
-        The frames between two restarts of the autopilot.
+        Frames between two restarts of the autopilot.
     received_s : ndarray, shape (n,)
-        Time of receipt (s) of every frame, from the first one; in a stream without stamps the
-        boot time of the autopilot's last stamped message before it.
+        Receive time (s) of every frame since the first; in a stream without receive times, the
+        boot time of the last earlier autopilot message.
     boot_of_receipt : Line
-        From time of receipt to the boot clock, both s.
+        Map from receive time (s) to boot clock (s).
     zero_s, duration_s : float
-        Boot time of the flight's time zero, and the span of the session.
+        Boot time of time zero, and duration of the session.
     damage : tuple of str
-        What could not be read: sentences.
+        Sentences on unreadable parts.
     notes : list of str
     restarts, receipt_went_back : int or None
-        As :class:`~px4fuse.recording.LogInfo` has them.
+        As in :class:`~px4fuse.recording.LogInfo`.
     dropped : dict
-        Samples dropped for an impossible time stamp, by message; :meth:`frame` fills it.
+        Samples dropped because of an invalid timestamp, by message; filled by :meth:`read`.
     streams : dict
-        Where each part of the flight came from; :meth:`record_stream` fills it.
+        Source of each part of the flight; filled by :meth:`record_stream`.
     """
 
     frames: Frames
@@ -78,12 +78,15 @@ class Recording:
     streams: dict[str, Stream] = field(default_factory=dict)
 
     def rows_of_all_senders(self, message: str) -> IntArray:
-        """Frames of one message within the session, whoever sent it."""
+        """Return the frame indices of one message within the session, from all senders."""
         rows = self.frames.rows(message)
         return np.asarray(rows[(rows >= self.session.start) & (rows < self.session.stop)])
 
     def rows(self, message: str, address: Address | None = None) -> IntArray:
-        """Frames of one message within the session, from the autopilot unless said otherwise."""
+        """Return the frame indices of one message within the session from one sender.
+
+        The default sender is the autopilot.
+        """
         rows = self.rows_of_all_senders(message)
         return np.asarray(rows[self.frames.sent_by(address or self.address, rows)])
 
@@ -94,18 +97,18 @@ class Recording:
         boot_s: Array | None = None,
         name: str = "",
     ) -> pd.DataFrame:
-        """Samples of one message by seconds of the flight, strictly increasing.
+        """Read one message as a frame with strictly increasing times (s since time zero).
 
         Parameters
         ----------
         layout : Layout
-            Angles become quaternions, and what is in a frame of its own comes in NED (or FRD).
+            Euler angles become quaternions; MAV_FRAMEs are converted to NED (or FRD).
         rows : ndarray, shape (n,), optional
-            Of :meth:`rows`; by default all of the autopilot.
+            Frame indices from :meth:`rows`; by default all from the autopilot.
         boot_s : ndarray, shape (n,), optional
-            Boot clock; NaN drops the sample. By default the message's own stamp.
+            Boot times; NaN drops the sample. By default the timestamps of the messages.
         name : str, optional
-            Under which dropped samples are counted, by default the message's.
+            Key in :attr:`dropped`; by default the message name.
         """
         rows = self.rows(layout.topic) if rows is None else rows
         table = self.frames.table(layout.topic, rows)
@@ -113,7 +116,7 @@ class Recording:
         selected_rows = self._select_rows(name or layout.topic, boot_s)
         if len(selected_rows) < len(table):
             table = table[selected_rows]
-        # an hour of the IMU is hundreds of megabytes, so that nothing is kept twice
+        # One hour of IMU data has hundreds of megabytes, so copies are avoided
         values = np.empty((len(selected_rows), len(layout.columns)))
         for at, (column, field_name) in enumerate(layout.columns.items()):
             base, _, index = field_name.removesuffix("]").partition("[")
@@ -124,18 +127,18 @@ class Recording:
         times = pd.Index(boot_s[selected_rows] - self.zero_s, name="time_s")
         samples = pd.DataFrame(values, times, list(layout.columns), copy=False)
         if "roll" in samples:
-            is_body = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
-            samples[Columns.QUATERNION] = is_body.as_quat(scalar_first=True)
+            attitude = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
+            samples[Columns.QUATERNION] = attitude.as_quat(scalar_first=True)
         return _to_ned(samples) if "frame_id" in samples else samples
 
     def _select_rows(self, name: str, boot_s: Array) -> IntArray:
-        """Samples with a possible time stamp, strictly increasing; the others are counted."""
-        # false for NaN too
+        """Return the indices of valid, strictly increasing boot times; count the others."""
+        # Comparisons with NaN are False, so NaN is dropped
         time_s = boot_s - self.zero_s
         inside = (time_s >= -OUTSIDE_S) & (time_s <= self.duration_s + OUTSIDE_S)
         rows = np.flatnonzero(inside & (boot_s > 0.0))
         time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
-        # one message that came over two links is one sample
+        # The same message received over two links is one sample
         first = np.sort(np.unique(time_us, return_index=True)[1])
         selected_rows: IntArray = rows[first[longest_increasing_run(time_us[first])]]
         dropped = len(boot_s) - len(rows) + len(first) - len(selected_rows)
@@ -144,12 +147,12 @@ class Recording:
         return selected_rows
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
-        """Boot clock (s) at which frames were received, less the link's least delay."""
+        """Return the boot time (s) of receipt of frames, minus the minimum link delay."""
         return self.boot_of_receipt.at(self.received_s[rows])
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
-        """Boot clock (s) of the autopilot's own messages; by receipt where they are not on it."""
-        if not self.boot_of_receipt.pairs:  # no message carries it
+        """Return the boot time (s) of autopilot messages, from timestamps or else receipt."""
+        if not self.boot_of_receipt.pairs:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3, dtype=np.float64)
@@ -158,16 +161,16 @@ class Recording:
         return np.asarray(np.where(on_boot, stamp, self.receipt_boot_s(rows)), dtype=np.float64)
 
     def record_stream(self, part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
-        """Note where a part of the flight came from."""
+        """Record the source of a part of the flight."""
         self.streams[part] = Stream(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
-    """ODOMETRY in NED (or FRD); NaN where a frame is not one of those that PX4 knows.
+    """Convert ODOMETRY samples to NED (or FRD); values in unsupported frames become NaN.
 
-    The velocity is in the child frame, which PX4 sets to the body up to v1.13 and to NED later
-    (``streams/ODOMETRY.hpp``). Orientations are given up where the frame is not NED or FRD: what
-    such a sender calls its body is not known.
+    The velocity is in the child frame, which is the body frame in PX4 up to v1.13 and NED later
+    (``streams/ODOMETRY.hpp``). Orientations in frames other than NED or FRD are dropped, because
+    the sender's body axes are unknown.
     """
     has_quaternion = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1) > MIN_NORM
     orientation = Columns.QUATERNION + Columns.ROTATION_VARIANCE
@@ -194,7 +197,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
             quaternion = child_samples[Columns.QUATERNION].to_numpy(copy=True)
             rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
             velocity = np.einsum("nij,nj->ni", rotation, velocity)
-            # diagonal of R diag(s) Rᵀ
+            # Variances: diagonal of R diag(σ²) Rᵀ
             velocity_variance = np.einsum("nij,nj->ni", rotation**2, velocity_variance)
         ned_samples.loc[child_samples.index, Columns.VELOCITY] = velocity
         ned_samples.loc[child_samples.index, Columns.VELOCITY_VARIANCE] = velocity_variance
@@ -202,7 +205,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
-    """Frames of the autopilot that carry its boot clock, in file order, and that clock (s)."""
+    """Return the autopilot frames that contain its boot clock, and that time (s)."""
     frame_samples = frames.sent_by(address)
     all_rows, all_stamps = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
     for number in np.unique(frames.message_id[frame_samples]).tolist():
@@ -228,12 +231,12 @@ def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
 
 
 def read_recording(frames: Frames, address: Address) -> Recording:
-    """Choose the session and map the time of receipt to the boot clock."""
+    """Choose the longest session and map the receive time to the boot clock."""
     notes: list[str] = []
     rows, stamps = _boot_stamps(frames, address)
     session = slice(0, len(frames))
     restarts = np.flatnonzero(np.diff(stamps) < -RESTART_S) + 1
-    # one late or early packet is no restart: its neighbours must say so too
+    # A single late or early packet is not a restart, so its neighbours are compared too
     stamps_before = stamps[np.maximum(restarts - 1 - RESTART_MESSAGES, 0)]
     stamps_after = stamps[np.minimum(restarts + RESTART_MESSAGES, len(stamps) - 1)]
     restarts = restarts[stamps_after < np.minimum(stamps_before, stamps[restarts - 1]) - RESTART_S]
@@ -250,13 +253,13 @@ def read_recording(frames: Frames, address: Address) -> Recording:
             else int(rows[rows_of_session[-1]]) + 1
         )
         session = slice(low, high)
-        notes.append(
-            f"the autopilot's boot clock went back {len(restarts)} "
-            f"{'times' if len(restarts) > 1 else 'time'} (restart): only part {longest_index + 1} of "
-            f"{len(session_rows)} was read, from {stamps[rows_of_session[0]]:.1f} s to {stamps[rows_of_session[-1]]:.1f} s of "
-            f"its boot clock, {len(rows_of_session) / len(rows):.0%} of the data"
-        )
+        used_fraction = len(rows_of_session) / len(rows)
         rows, stamps = rows[rows_of_session], stamps[rows_of_session]
+        notes.append(
+            f"the boot clock restarted {_times(len(restarts))}: only part {longest_index + 1} of "
+            f"{len(session_rows)} is used, {stamps[0]:.1f} s to {stamps[-1]:.1f} s after boot "
+            f"({used_fraction:.0%} of the data)"
+        )
     increasing_rows = _remove_stray_stamps(
         stamps, longest_increasing_run(np.rint(stamps * 1e6).astype(np.int64))
     )
@@ -268,30 +271,28 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         if len(rows):
             line = fit_least_delay(stamps, received[rows]).inverse()
     elif len(rows):
-        # no time of receipt: the boot clock of the last stamped message stands in for it
+        # A raw stream has no receive time; the last boot time before each frame replaces it
         at = np.clip(np.searchsorted(rows, np.arange(len(frames)), side="right") - 1, 0, None)
         received = stamps[at]
     else:
-        notes.append("no message in the stream carries a time: nothing in it can be placed in time")
+        notes.append("no message in the stream contains a time, so the data have no time")
     receipt_reversals = int(np.count_nonzero(np.diff(received) < 0.0))
-    counted_notes = {
-        "whole frames of messages that px4fuse does not know were passed over: "
-        f"{frames.unknown_frame_count}": frames.unknown_frame_count,
-        f"{frames.bad_stamps} times of receipt are damaged and were interpolated": (
-            frames.bad_stamps
-        ),
-        f"the time of receipt went back {receipt_reversals} {'times' if receipt_reversals > 1 else 'time'}": receipt_reversals,
-    }
-    notes += [note for note, count in counted_notes.items() if count]
+    unknown, damaged_times = frames.unknown_frame_count, frames.bad_stamps
+    if unknown:
+        notes.append(f"frames of unknown message types, ignored: {unknown}")
+    if damaged_times:
+        notes.append(f"damaged receive times, interpolated: {damaged_times}")
+    if receipt_reversals:
+        notes.append(f"the receive time went back {_times(receipt_reversals)}")
     share = frames.bad_bytes / len(frames.content)
-    lost = f"{frames.bad_bytes:,} bytes ({share:.2%}) belong to no whole MAVLink frame"
-    # a first and a last frame that are cut are no damage
+    lost = f"{frames.bad_bytes:,} bytes ({share:.2%}) are not part of a complete MAVLink frame"
+    # An incomplete first and last frame are not damage
     bytes_inside = frames.bad_bytes - 2 * LONGEST_FRAME
     is_damaged = bytes_inside > DAMAGED_SHARE * len(frames.content)
     damage = (f"the file is damaged: {lost}",) if is_damaged else ()
     if frames.bad_bytes and not is_damaged:
         notes.append(lost)
-    # without a boot clock the receipt must do
+    # Without a boot clock, time is receive time
     span = stamps if len(stamps) else np.array([0.0, received.max()])
     zero_s, end_s = float(span[0]), float(span[-1])
     return Recording(
@@ -309,8 +310,12 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     )
 
 
+def _times(count: int) -> str:
+    return f"{count} time" if count == 1 else f"{count} times"
+
+
 def _remove_stray_stamps(stamps: Array, rows: IntArray) -> IntArray:
-    """IntArray of increasing stamps without a few at either end that are far from all others."""
+    """Remove small groups at either end whose timestamps are far from all others."""
     groups = np.split(rows, np.flatnonzero(np.diff(stamps[rows]) > OUTSIDE_S) + 1)
     min_count = STRAY_SHARE * max(len(group) for group in groups)
     large_groups = [number for number, group in enumerate(groups) if len(group) >= min_count]
@@ -318,7 +323,7 @@ def _remove_stray_stamps(stamps: Array, rows: IntArray) -> IntArray:
 
 
 def unix_of_boot(recording: Recording) -> Line | None:
-    """Boot clock to UNIX time by the autopilot's SYSTEM_TIME, where a receiver has set it."""
+    """Map the boot clock to UNIX time by SYSTEM_TIME; None if its UNIX time is not set."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
     boot, unix = table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6
     known = unix > UNIX_FROM_S

@@ -1,4 +1,4 @@
-"""Senders of a MAVLink recording: which one is the autopilot, and whose clock is which."""
+"""Senders of a MAVLink recording: the autopilot, position senders, and their clocks."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -20,18 +20,18 @@ from px4fuse.readers.mavlink_frames import Address, Frames
 from px4fuse.readers.mavlink_recording import RESTART_S, Recording, unix_of_boot
 from px4fuse.recording import ClockMap, Sender
 
-# Senders beyond the busiest ones are not described, and their positions are not read
+# Only the senders with most messages are read and described
 MAX_SENDERS = 32
-# A sender that seems to lose more than this does not count its messages
+# Lost fraction above which the sequence numbers are not counted by the sender and are ignored
 MAX_LOST_SHARE = 0.9
-# A message that comes after so many later ones of its sender came over a slower link
+# Sequence numbers; a message this much late was received over a slower link, not lost
 MAX_LATE_MESSAGES = 16
-# Stamps of one sender further apart than this are of two clocks
+# s; timestamps of one sender that differ by more are from two clocks
 OTHER_CLOCK_S = 1e5
 
 
 def _vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
-    """Type and autopilot that each sender gave in its first heartbeat."""
+    """Return MAV_TYPE and MAV_AUTOPILOT from each sender's first heartbeat."""
     rows = frames.rows("HEARTBEAT")
     beats = frames.table("HEARTBEAT", rows)
     types = zip(beats["type"].tolist(), beats["autopilot"].tolist(), strict=True)
@@ -40,14 +40,14 @@ def _vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
 
 
 def _addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
-    """Sender of each frame."""
+    """Return the sender address of each frame."""
     return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
 
 
 def _count_frames(
     frames: Frames, rows: IntArray | slice = slice(None)
 ) -> list[tuple[Address, int]]:
-    """Senders of frames and how many each sent, most first."""
+    """Count frames by sender, most frames first."""
     counts = Counter(_addresses(frames, rows))
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
@@ -57,23 +57,23 @@ def _is_vehicle(kind: int, autopilot: int) -> bool:
 
 
 def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
-    """Address and name of the autopilot whose flight this is.
+    """Return address and name of the autopilot with most messages, or of a given system id.
 
     Raises
     ------
     SettingsError
-        No autopilot has the system id that was asked for.
+        No autopilot has the given system id.
     """
     counts = dict(_count_frames(frames))
     vehicles = _vehicle_types(frames)
     flying = [s for s in counts if s in vehicles and _is_vehicle(*vehicles[s])]
     rows = np.concatenate([frames.rows(name) for name in messages.OWN_MESSAGES])
     own = dict(_count_frames(frames, rows))
-    # a companion may call itself an autopilot; one without a heartbeat is known by what it sends,
-    # or else by its component
+    # Companion computers may have autopilot heartbeats, so messages that only autopilots send
+    # count first. Without a heartbeat, these messages or the component id identify the autopilot
     candidates = [s for s in flying if s in own] or [s for s in own if s not in vehicles] or flying
     candidates = candidates or [s for s in counts if s[1] == messages.AUTOPILOT_COMPONENT]
-    # nor need it have been heard itself
+    # The recording may contain no message from the autopilot itself
     candidates = candidates or [(s[0], messages.AUTOPILOT_COMPONENT) for s in counts]
     if system is not None:
         candidates = [address for address in {*flying, *candidates} if address[0] == system]
@@ -89,7 +89,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
-    """Senders of one message that may speak to this vehicle: not it, nor another vehicle's."""
+    """Return the senders of one message other than this vehicle's autopilot and other vehicles."""
     frames, own = recording.frames, recording.address
     others = {
         s[0] for s, vehicle_type in _vehicle_types(frames).items() if _is_vehicle(*vehicle_type)
@@ -99,7 +99,7 @@ def senders_of(recording: Recording, message: str) -> list[Address]:
 
 
 def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
-    """Clock of every sender of an external position."""
+    """Map the clock of every sender of an external position to the boot clock."""
     message_names = {source.message for source in messages.POSITION_INPUTS}
     senders = {s for message in message_names for s in senders_of(recording, message)}
     unix = unix_of_boot(recording)
@@ -118,11 +118,11 @@ def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Clo
     rows = recording.rows("TIMESYNC", sender)
     sync = frames.table("TIMESYNC", rows)
     replied_s, sync_asked_s = sync["tc1"] * 1e-9, sync["ts1"] * 1e-9
-    # the reply to somebody else's question carries another clock
+    # Replies to another sender's request contain another clock
     replies = (replied_s != 0.0) & (
         np.abs(sync_asked_s - recording.receipt_boot_s(rows)) <= RESTART_S
     )
-    # a question is stamped as it is sent: hardly delayed
+    # A TIMESYNC request gets its timestamp when it is sent, so it is hardly delayed
     questions = (
         clock_runs & (replied_s == 0.0) & (np.abs(sync_asked_s - median_stamp_s) < OTHER_CLOCK_S)
     )
@@ -145,7 +145,7 @@ def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> Clo
 
 
 def _other_sync_questions(recording: Recording, sender: Address) -> NDArray[np.int64]:
-    """``ts1`` of the TIMESYNC questions of everybody but one sender."""
+    """Return ``ts1`` of the TIMESYNC requests of all other senders."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
     sync = frames.table("TIMESYNC", rows[~frames.sent_by(sender, rows)])
@@ -155,14 +155,14 @@ def _other_sync_questions(recording: Recording, sender: Address) -> NDArray[np.i
 def clock_maps(
     recording: Recording, clock_mappings: dict[Address, ClockMapping]
 ) -> tuple[ClockMap, ...]:
-    """How the senders' clocks and the time of receipt were mapped to the boot clock."""
+    """Return the maps from sender clocks and receive time to the boot clock."""
     clocks = [sender.statement for sender in clock_mappings.values()]
     received_us, line = recording.frames.received_us, recording.boot_of_receipt
     if received_us is not None and line.pairs:
-        name = "time of receipt (the recording computer's UNIX time)"
-        note = "the recording did not run at the flight's own speed (a replay?)"
+        name = "receive time (UNIX time of the recording computer)"
+        note = "the recording speed differs from real time (replayed link?)"
         if abs(line.slope - 1.0) < MAX_SPEED_DIFFERENCE:
-            note = "by the least delayed messages; used only to order messages and to map clocks"
+            note = "from the messages with least delay; used only to order messages and map clocks"
         offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
         numbers = line.pairs, offset_s, (line.slope - 1.0) * 1e6, line.jitter
         clocks.append(ClockMap(name, "receive time", *numbers, note))
@@ -170,7 +170,7 @@ def clock_maps(
 
 
 def describe_senders(recording: Recording) -> tuple[Sender, ...]:
-    """Senders that the recording heard, most messages first."""
+    """Describe the senders in the recording, most messages first."""
     frames, vehicles = recording.frames, _vehicle_types(recording.frames)
     sender_rows = []
     for address, count in _count_frames(frames)[:MAX_SENDERS]:
@@ -186,10 +186,10 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
 
 
 def _lost_share_of(frames: Frames, address: Address) -> float | None:
-    """Share of a sender's messages that its sequence numbers say are not here.
+    """Return the fraction of a sender's messages that are missing, by its sequence numbers.
 
-    A message that came again, or a little late, is not lost. None where the sender does not count
-    its messages, or counts them apart on each of two links.
+    Repeated or slightly late messages are not lost. None if the sender does not count its
+    messages, or counts them separately on two links.
     """
     number = frames.sequence[frames.sent_by(address)].astype(np.int64)
     step = np.mod(np.diff(number) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES

@@ -1,4 +1,4 @@
-"""What readers of all formats make alike: usable rows, stretches of time, what is missing."""
+"""Functions for readers of all formats: valid rows, time intervals, missing parts."""
 
 from typing import Any
 
@@ -8,15 +8,15 @@ import pandas as pd
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.flight import Columns, Ekf2, FlightMode, Unavailable
 
-# No position, velocity, acceleration or angle of a flight in SI units comes near it
+# SI units; larger positions, velocities, accelerations and angles are damaged data
 DAMAGED = 1e9
-# m/s² and rad/s: more than any accelerometer (400 g) or gyro (4000 °/s) measures
+# m/s² and rad/s; above the range of accelerometers (400 g) and gyros (4000 °/s)
 BEYOND_IMU = 1e4
-MIN_NORM = 0.5  # a zero quaternion is no attitude
+MIN_NORM = 0.5  # quaternions with a smaller norm mean "no attitude"
 
 
 def collect_unavailable(*flight_parts: object) -> tuple[Unavailable, ...]:
-    """Those of some parts of a flight that its log lacks, with what it lacks of EKF2."""
+    """Return the unavailable ones of some parts of a flight, including the parts of EKF2."""
     for flight_part in flight_parts:
         if isinstance(flight_part, Ekf2):
             flight_parts += (
@@ -30,10 +30,7 @@ def collect_unavailable(*flight_parts: object) -> tuple[Unavailable, ...]:
 
 
 def constant_spans(steps: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
-    """Stretches in which a step function of time keeps its value: start and end (s), value.
-
-    None where it has no value.
-    """
+    """Return start (s), end (s) and value of each interval with a constant value."""
     changes = steps[steps.ne(steps.shift())]
     starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
     spans = zip(starts, [*starts[1:], end_s], changes, strict=False)
@@ -41,41 +38,37 @@ def constant_spans(steps: pd.Series, end_s: float) -> list[tuple[float, float, A
 
 
 def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
-    """Stretches (s) in which a step function of time says "not landed" (0 or False)."""
+    """Return the intervals (s) in which ``landed`` is 0 or False."""
     return tuple((start, end) for start, end, on in constant_spans(landed, duration_s) if not on)
 
 
 def ends_in_flight(
     airborne: tuple[tuple[float, float], ...] | Unavailable, duration_s: float
 ) -> bool:
-    """Whether the last stretch of flight has no end but that of the data."""
+    """Return True if the last flight interval lasts until the end of the data."""
     last_span = () if isinstance(airborne, Unavailable) else airborne[-1:]
     return any(end >= duration_s for _, end in last_span)
 
 
 def format_truncation(part: str, duration_s: float, in_flight: bool) -> str:
-    """What is said of a file that ends in the middle of a part of it."""
+    """Format the sentence on a file that ends within a frame or message (``part``)."""
     flying = ", in flight" if in_flight else ""
-    end = f"the file ends in mid-{part} after {duration_s:.1f} s{flying}"
-    return f"{end}: what came after is not in it"
+    return f"the file ends within a {part} after {duration_s:.1f} s{flying}; later data are missing"
 
 
 def mode_spans(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
-    """Stretches (s) of a step function of time whose values are names of flight modes."""
+    """Convert a time series of flight mode names to intervals (s)."""
     return tuple(FlightMode(*span) for span in constant_spans(names, end_s))
 
 
 def finite_rows(samples: pd.DataFrame, columns: list[str], limit: float = DAMAGED) -> pd.DataFrame:
-    """Rows of a frame in which all of some float columns are finite, and none is beyond physics.
-
-    A value of 1e30 is damage as much as NaN is, and its square would soon be infinite.
-    """
-    possible: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
-    return samples[possible]
+    """Return the rows whose absolute values in ``columns`` are all below ``limit`` (not NaN)."""
+    is_valid: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
+    return samples[is_valid]
 
 
 def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, within_s: float) -> pd.DataFrame:
-    """Rows of a frame, each with the row of another that is nearest in time; NaN beyond."""
+    """Join each row with the nearest row of ``others`` in time; NaN beyond ``within_s`` (s)."""
     return pd.merge_asof(
         samples,
         others,
@@ -87,19 +80,19 @@ def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, within_s: float) -
 
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
-    """Rows of a frame with a quaternion ``w, x, y, z``; one of norm 0 means "not given"."""
+    """Return the rows with a valid quaternion ``w, x, y, z``; norm 0 means "not sent"."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_NORM) & (norm < DAMAGED)]
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Orientations in a frame of samples; None where there are none, or all are the same.
+    """Extract the orientations of samples; None if there are none or all are equal.
 
     Parameters
     ----------
     samples : DataFrame
-        With the columns ``w, x, y, z`` where the sender gave quaternions, and perhaps
-        ``forward_rad2, right_rad2, down_rad2``, of which 0 means "not given" (``EKF2.cpp``).
+        Columns ``w, x, y, z`` and optionally the variances ``forward_rad2, right_rad2,
+        down_rad2``, in which 0 means "not sent" (``EKF2.cpp``).
     """
     found = with_attitude(samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE))
     quaternions = found[Columns.QUATERNION]
@@ -110,6 +103,6 @@ def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
 
 
 def read_attitude(samples: pd.DataFrame | None) -> pd.DataFrame | None:
-    """Quaternions of :func:`read_orientation` alone."""
+    """Return the quaternions of :func:`read_orientation` without variances."""
     found = None if samples is None else read_orientation(samples)
     return None if found is None else found[Columns.QUATERNION]

@@ -1,9 +1,8 @@
-"""An external UWB positioning log (CSV) to samples on its own clock and in its own frame.
+"""Reader of CSV files from positioning systems (UWB); keeps the clock and frame of the file.
 
-The documented format is a header and ``time, x, y, z`` in seconds and metres, with ``sigma`` or
-``sigma_x, sigma_y, sigma_z`` where the system gives them. Vendors write others, so separator, names
-and units are detected. Every decision is stated, and every decision that a person might have to
-correct has an option.
+The documented format is a header and ``time, x, y, z`` in seconds and metres, optionally with
+``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other separators, column names and units are detected.
+The detected format is reported, and options override columns and units.
 """
 
 import csv
@@ -29,16 +28,16 @@ from px4fuse.reading import display_name, read_bytes_limited
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-MAX_FILE_BYTES = 500_000_000  # days of any UWB system
+MAX_FILE_BYTES = 500_000_000  # several days of UWB positions
 MIN_ROWS = 3
-# UWB systems run between 0.2 Hz and 200 Hz; their intervals vary by a tenth
+# s; UWB systems have rates of 0.2 Hz to 200 Hz, with 10 % variation of the interval
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
-# A boot clock in µs after half an hour has the magnitude of UNIX time in s; its intervals have not
+# s; tells UNIX time in s from a boot clock in µs, which has the same magnitude after half an hour
 MAX_UNIX_INTERVAL_S = 60.0
-# What an indoor flight spans
+# m; largest extent of an indoor flight
 MAX_SPREAD_M = 200.0
-MAX_COORDINATE = 1e9  # in any unit; beyond it stands a time stamp, or damage
-# The header is looked for in so much of the file
+MAX_COORDINATE = 1e9  # any length unit; larger values are timestamps or damage
+# The header is searched in this part of the file
 HEAD_LINES, HEAD_CHARS = 1000, 200_000
 MAX_COLUMNS = 200
 _COLUMNS = "`columns` TIME,X,Y,Z"
@@ -47,30 +46,29 @@ _SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
 
 @dataclass(frozen=True)
 class PositionRecording:
-    """An external position log as its own system wrote it: its own clock, its own frame.
+    """Position file of a positioning system, in the clock and frame of the file.
 
     Attributes
     ----------
     name : str
-        File name without its folder.
+        File name without folder.
     sha256 : str
-        Of the file's bytes.
+        Hash of the file content.
     size_bytes : int
     samples : DataFrame, shape (n, 6)
-        ``x_m, y_m, z_m, sigma_x_m, sigma_y_m, sigma_z_m`` (m), NaN where the file has none. The
-        index ``time_s`` is in seconds on the file's own clock and strictly increasing. In frame
-        "ned" x is north, y east, z down; in "enu" x is east, y north, z up; whatever the order of
-        the columns was.
+        ``x_m, y_m, z_m, sigma_x_m, sigma_y_m, sigma_z_m`` (m); NaN if not in the file. The index
+        ``time_s`` (s, clock of the file) is strictly increasing. In frame "ned" x is north, y
+        east, z down; in "enu" x is east, y north, z up, independent of the order of columns.
     clock : "UNIX" or "local"
-        "UNIX" where the stamps are between 2000 and 2100.
+        "UNIX" if the timestamps are between 2000 and 2100.
     frame : str or None
-        "ned" or "enu" where the columns' names say so.
+        "ned" or "enu" if the column names contain it.
     detected : tuple of str
-        One sentence per decision.
+        One sentence per detected property of the format.
     notes : tuple of str
-        What was dropped and why, and what looks doubtful.
+        Dropped rows with the reason, and warnings.
     dropped : int
-        Rows without a time that can be.
+        Rows with an invalid timestamp.
     """
 
     name: str
@@ -86,16 +84,16 @@ class PositionRecording:
 
 @dataclass(frozen=True)
 class _Table:
-    """Where the table is in a file."""
+    """Table in a text file: column names and rows."""
 
     file: str
     separator: str
     names: list[str]  # of the columns
-    body: str  # whole lines after the header
+    body: str  # complete lines after the header
     header_line: int
 
     def label(self, *columns: int | None) -> str:
-        """Names of some columns for a person, each once."""
+        """Format the names of some columns for messages, without repetition."""
         used_labels = dict.fromkeys(
             quote(self.names[at]) if self.names[at] else f"column {at + 1}"
             for at in columns
@@ -104,7 +102,7 @@ class _Table:
         return ", ".join([*used_labels][:12]) + (", ..." if len(used_labels) > 12 else "")
 
     def texts(self, columns: Iterable[int]) -> pd.DataFrame:
-        """Texts of some columns, without rows that have none."""
+        """Return the cells of some columns as text, without empty rows."""
         used = sorted({*columns})
         try:
             texts = pd.read_csv(
@@ -125,7 +123,7 @@ class _Table:
         return texts.dropna(how="all")
 
 
-# Columns of position or sigma, by index
+# Column indices of position or sigma along x, y, z; None if missing
 _Columns = tuple[int | None, ...]
 
 
@@ -136,27 +134,27 @@ def read_position_csv(
     time_unit: str | None = None,
     length_unit: str | None = None,
 ) -> PositionRecording:
-    """Read an external position log.
+    """Read the position file of a positioning system.
 
     Parameters
     ----------
     path : str or Path
-        A text table; see the module's description.
+        Text table in the format of the module description.
     columns : tuple of str, optional
-        TIME, X, Y, Z and optionally SIGMA, each a column's name or its number from 1. Z may be
-        left out together with SIGMA.
+        TIME, X, Y, Z and optionally SIGMA, each a column name or number (from 1). Without SIGMA, Z
+        may be omitted too.
     time_unit : {"s", "ms", "us", "ns"}, optional
-        Unit of the time column, whatever its name and its values say.
+        Unit of the time column; overrides detection.
     length_unit : {"m", "cm", "mm"}, optional
-        Unit of positions and sigmas, whatever their names say.
+        Unit of positions and sigmas; overrides detection.
 
     Raises
     ------
     LogError
-        The file cannot be read, is no text table, has no columns for time and position or more
-        columns than its header names, or fewer than three usable rows.
+        The file cannot be read, is not a text table, has no columns of time and position, more
+        columns than header names, or fewer than three usable rows.
     SettingsError
-        An option's value is not among those above, or names a column that the file has not.
+        An option has an invalid value or names a column that is not in the file.
     """
     _check_options(columns, time_unit, length_unit)
     path = Path(path)
@@ -170,41 +168,43 @@ def read_position_csv(
         table, meanings, chosen_columns, numbers
     )
     axes = [at for at in position if at is not None]
-    # 1e999 reads as infinity
+    # Texts such as 1e999 become infinite
     is_usable = np.isfinite(numbers[time])
     is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
-        notes.insert(
-            0, f"{_count_words(unusable_count)} dropped: without a usable time or position"
-        )
+        notes.insert(0, f"{_count_words(unusable_count)} dropped: no valid time or position")
     for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
-            notes.append(f"several tags ({', '.join(map(quote, tags[:2]))}): keep those of one")
+            some_tags = ", ".join(map(quote, tags[:2]))
+            notes.append(
+                f"the file contains positions of {len(tags)} tags (such as {some_tags}): keep the "
+                "rows of one tag only"
+            )
     numbers = numbers[is_usable]
     ticks = numbers[time].to_numpy()
     name_unit = meanings[time].unit
     unit, unit_words = _time_unit(ticks, name_unit if name_unit in TIME_UNITS else "", time_unit)
     seconds = ticks / round(1.0 / TIME_UNITS[unit])
     usable = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
-    # by rank: they may be before zero
+    # Ranks instead of times, because times may be negative
     ranks = np.unique(seconds[usable], return_inverse=True)[1].astype(np.int64)
     keep = usable[longest_increasing_run(ranks + 1)]
     if dropped := len(seconds) - len(keep):
         notes.append(
-            f"{_count_words(dropped)} dropped: their time stamps repeat, go back or are absurd"
+            f"{_count_words(dropped)} dropped: timestamps repeat, go back or are out of range"
         )
     if len(keep) < MIN_ROWS:
         raise LogError(
-            f"{table.file}: usable rows: {len(keep)}, at least {MIN_ROWS} are needed"
+            f"{table.file} contains {len(keep)} usable rows; at least {MIN_ROWS} are needed"
             f"{''.join('; ' + note for note in notes)}",
-            f"Export it with decimal points, or say where time and position are with {_COLUMNS}.",
+            f"Export it with decimal points, or name the columns with {_COLUMNS}.",
         )
     numbers = numbers.iloc[keep].set_index(pd.Index(seconds[keep], name="time_s"))
     step = float(np.median(np.diff(numbers.index)))
     if not MIN_INTERVAL_S <= step <= MAX_INTERVAL_S:
-        rate = f"one sample in {step:.3g} s (median)"
-        notes.append(f"{rate} is not a rate of a UWB: check --position-time-unit")
+        rate = f"one sample per {step:.3g} s (median)"
+        notes.append(f"{rate} is not a plausible UWB rate: check --position-time-unit")
     scales, length_words = _length_units(numbers, axes, meanings, length_unit)
     column_of_name = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
     lengths = {
@@ -214,7 +214,7 @@ def read_position_csv(
     samples = samples.where(np.isfinite(samples))
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     if rows := int(is_not_positive.any(axis=1).sum()):
-        notes.append(f"sigma is not above zero in {rows} rows and was left out there")
+        notes.append(f"sigma is zero or negative in {rows} rows and was ignored there")
         samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
@@ -242,7 +242,7 @@ def read_position_csv(
 def _check_options(
     columns: tuple[str, ...] | None, time_unit: str | None, length_unit: str | None
 ) -> None:
-    """Refuse option values that are wrong for any file."""
+    """Raise SettingsError for option values that are invalid for every file."""
     for name, value, units in (
         ("time_unit", time_unit, TIME_UNITS),
         ("length_unit", length_unit, LENGTH_UNITS),
@@ -253,7 +253,7 @@ def _check_options(
     if "" in titles or not 3 <= len({*titles}) == len(titles) <= 5:
         raise SettingsError(
             f"{_COLUMNS}[,SIGMA]: {','.join(titles)!r} must name four or five different "
-            "columns (three if there is no height)."
+            "columns (three without height)."
         )
 
 
@@ -262,8 +262,8 @@ def _count_words(rows: int) -> str:
 
 
 def _split_line(line: str, separator: str) -> list[str]:
-    """Fields of one line."""
-    if separator == " ":  # "x [mm]" is one name
+    """Split one line into its fields."""
+    if separator == " ":  # a name with unit, such as "x [mm]", is one field
         return re.sub(r" +(?=[\[(])", "", line.strip()).split()
     return [field.strip() for field in line.split(separator)]
 
@@ -271,21 +271,19 @@ def _split_line(line: str, separator: str) -> list[str]:
 def _find_table(
     file: str, content: bytes, columns: tuple[str, ...] | None
 ) -> tuple[_Table, list[str]]:
-    """Find separator, header and first row, and say whether a last line was left out."""
+    """Find separator, header and first row; return also a note if the last line was dropped."""
     text = decode_text(content)
     if text is None:
         raise LogError(
-            (
-                f"{file} is a binary file, not a text table. Give the CSV file of the "
-                "positioning system."
-            ),
-            "A flight log is given as LOG, without --position.",
+            f"{file} is a binary file, not a text table",
+            "Give the CSV file of the positioning system. A flight log is given as LOG, without "
+            "--position.",
         )
     notes = []
     whole_lines, _, last = text.replace('"', "").rpartition("\n")
     text = f"{whole_lines}\n"
     if last.strip():
-        notes.append("the last line was dropped: it may be cut, as it has no end")
+        notes.append("the last line was dropped: it has no line end and may be incomplete")
     lines = text[: text.rfind("\n", 0, HEAD_CHARS) + 1].split("\n")[:HEAD_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     headers = (
@@ -299,10 +297,8 @@ def _find_table(
     if not names:
         titles = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(
-            (
-                f"{file}: the first {len(lines)} lines contain no header with the columns "
-                f"{titles}. The first line is {quote(lines[0])}."
-            ),
+            f"{file}: the first {len(lines)} lines contain no header with the columns "
+            f"{titles}. The first line is {quote(lines[0])}.",
             f"Give a CSV file with a header, or name its columns with {_COLUMNS}.",
         )
     body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", line)[line])
@@ -317,7 +313,7 @@ def _find_table(
 
 
 def _is_header(fields: list[str], wanted: set[str]) -> bool:
-    """Whether these are names of columns: those that were asked for, or of time and position."""
+    """Return True if the fields contain the wanted names, or else names of time and position."""
     if wanted:
         return wanted <= {name.casefold() for name in fields}
     meanings = [read_column_name(name) for name in fields]
@@ -326,7 +322,7 @@ def _is_header(fields: list[str], wanted: set[str]) -> bool:
 
 
 def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
-    """Columns that the option names, by index."""
+    """Return the indices of the columns that the option names."""
     names = [name.casefold() for name in table.names]
     numbers = [str(at + 1) for at in range(len(names))]
     found = []
@@ -334,9 +330,9 @@ def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
         wanted = column.strip().casefold()
         if wanted not in names + numbers:
             raise SettingsError(
-                f"{table.file}: no column {quote(column)} found (the columns are "
+                f"{table.file} has no column {quote(column)} (its columns are "
                 f"{table.label(*range(len(names)))})",
-                f"Name them with {_COLUMNS}.",
+                f"Name the columns with {_COLUMNS}.",
             )
         found.append((names if wanted in names else numbers).index(wanted))
     if len({*found}) < len(found):
@@ -350,14 +346,14 @@ def _choose_columns(
     chosen_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Columns of time, position and sigma, the frame, and the words on the time.
+    """Choose the columns of time, position and sigma; return also frame and time description.
 
-    They are those that the option tells, else by name. Of several times that of measurement goes
-    before that of recording, if it is filled.
+    The option names them; otherwise their names select them. A filled column with the time of
+    measurement is preferred to the time of recording.
     """
     if chosen_columns:
         time, words = chosen_columns[0], table.label(chosen_columns[0])
-        # the names may tell the frame, and with it the order of the axes
+        # The column names may contain the frame and so the order of the axes
         chosen_meanings = [
             m if at in chosen_columns[1:4] else ColumnMeaning() for at, m in enumerate(meanings)
         ]
@@ -384,9 +380,9 @@ def _choose_columns(
 
 
 def _time_unit(ticks: Array, name_unit: str, option: str | None) -> tuple[str, str]:
-    """Unit of the time column, and the words on it."""
+    """Return the unit of the time column and its description."""
     if option is not None:
-        return option, f"{option} as --position-time-unit says"
+        return option, f"{option} from --position-time-unit"
     middle = float(np.median(ticks)) if len(ticks) else 0.0
     if name_unit and abs(middle) * TIME_UNITS[name_unit] < UNIX_END_S:
         return name_unit, f"{name_unit} from its name"
@@ -401,33 +397,35 @@ def _time_unit(ticks: Array, name_unit: str, option: str | None) -> tuple[str, s
         if MIN_INTERVAL_S <= step * scale <= MAX_INTERVAL_S:
             fits.append(unit)
     if not fits:
-        return "s", "s assumed, as no unit gives the rate of a UWB: else give --position-time-unit"
+        return "s", (
+            "s assumed: no unit gives a plausible UWB rate (--position-time-unit overrides)"
+        )
     words = f"{fits[0]} from its interval of {step * TIME_UNITS[fits[0]]:.3g} s"
     if fits[1:]:
-        words += f" ({fits[1]} would do as well: then give --position-time-unit)"
+        words += f" ({fits[1]} is also possible: then give --position-time-unit)"
     return fits[0], words
 
 
 def _length_units(
     numbers: pd.DataFrame, axes: list[int], meanings: Sequence[ColumnMeaning], option: str | None
 ) -> tuple[dict[int, float], str]:
-    """Metres per unit of each column of numbers, and the words on those of position."""
+    """Return metres per unit of each column, and the description of the position's unit."""
     name_units = {at: m.unit for at, m in enumerate(meanings) if m.unit in LENGTH_UNITS}
-    # outliers must not decide
+    # Percentiles, because outliers must not determine the unit
     spreads = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
     spread = float(spreads.max())
-    unit, reason = "m", "no unit in the names"
+    unit, reason = "m", "no unit in the column names"
     if option is not None:
-        unit, name_units, reason = option, {}, "as --position-unit says"
+        unit, name_units, reason = option, {}, "from --position-unit"
     elif used_labels := [name_units[at] for at in axes if at in name_units]:
-        unit, reason = used_labels[0], "from the names"
+        unit, reason = used_labels[0], "from the column names"
     elif MAX_SPREAD_M < spread <= MAX_SPREAD_M / LENGTH_UNITS["mm"]:
         unit = "mm"
-        reason = f"as {spread:.0f} m is not an indoor flight; if cm, give --position-unit"
+        reason = f"{spread:.0f} m is too large for an indoor flight; if cm, give --position-unit"
     elif spread > MAX_SPREAD_M:
-        reason = "assumed, as no unit gives an indoor flight: else give --position-unit"
+        reason = "assumed: no unit gives the size of an indoor flight; else give --position-unit"
     units = {at: name_units.get(at, unit) for at in map(int, numbers.columns)}
     scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
     span = max(float(spreads[at]) * scales[at] for at in axes)
     used = ", ".join(dict.fromkeys(units[at] for at in axes))
-    return scales, f"{used} ({reason}), nine tenths of it within {span:.3g} m"
+    return scales, f"{used} ({reason}); 90 % of the positions within {span:.3g} m"

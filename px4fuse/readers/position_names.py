@@ -1,4 +1,4 @@
-"""What the names of columns mean in position logs: "x_m", "position.x", "East [mm]", "bag_time"."""
+"""Meaning of column names in position files: "x_m", "position.x", "East [mm]", "bag_time"."""
 
 import re
 import unicodedata
@@ -15,19 +15,15 @@ Position = tuple[int, int, int | None]
 
 _WORDS = table(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
-    {
-        word: read_column_name
-        for read_column_name, words in _WORDS[group].items()
-        for word in words.split()
-    }
+    {word: meaning for meaning, words in _WORDS[group].items() for word in words.split()}
     for group in ("units", "axes")
 )
 _ROLES = {role: {*words.split()} for role, words in _WORDS["roles"].items()}
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
-# Whose time it is, in order of preference
+# Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 _GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
-# Frame, and the names of its axes in order; the first whose horizontal names are there is taken
+# (Frame, names of its axes in order); the first with both horizontal axes in the file is used
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),
@@ -39,16 +35,16 @@ _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """What one column's name says; all "" where it says nothing."""
+    """Meaning of one column name; all "" if it is not known."""
 
     kind: str = ""  # "time", "position", "sigma" or "tag"
-    key: str = ""  # name of the axis, or which time of `TIME_KINDS`
+    key: str = ""  # axis, or element of `TIME_KINDS`
     unit: str = ""
-    group: str = ""  # what else a position's name holds, which its x, y and z share
+    group: str = ""  # other parts of a position's name, common to its x, y and z
 
 
 def read_column_name(name: str) -> ColumnMeaning:
-    """Read a column's name."""
+    """Return the kind, axis, unit and group that a column name contains."""
     plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
     words = re.findall(r"[^\W_]+", plain_name)
@@ -86,7 +82,7 @@ def read_column_name(name: str) -> ColumnMeaning:
 
 
 def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Position] | None:
-    """Frame and columns of the first track that has two horizontal axes, best all three."""
+    """Return frame and columns of the first position with three axes, or else without height."""
     groups: dict[str, dict[str, int]] = {}
     for index, column in enumerate(meanings):
         if column.kind == "position":
@@ -100,8 +96,8 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
 
 
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
-    """Columns of sigma of the frame's axes; one without an axis is for all of them."""
-    # of several with one meaning the first is kept, as of positions
+    """Return the sigma columns of the frame's axes; a sigma without axis is valid for all."""
+    # Reversed, so that the first of several columns with the same meaning is used
     sigmas = {m.key: at for at, m in [*enumerate(meanings)][::-1] if m.kind == "sigma"}
     axes = next(axes for name, axes in _FRAMES if name == frame)
     both = zip(axes, "xyz", strict=True)

@@ -1,4 +1,4 @@
-"""What a ULog has of every aid that EKF2 can fuse: innovations, their variance, what was fused.
+"""Innovations, variances and fusion results of all EKF2 aids in a ULog.
 
 Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main; the
 fields are in ``ekf2_parameters.toml``.
@@ -19,24 +19,23 @@ from px4fuse.readers.layouts import Layout
 from px4fuse.readers.parts import join_nearest
 from px4fuse.readers.ulog_topics import Topics
 
-# innovations and variances are logged by separate rate limiters, up to one interval of the default
-# profile (0.5 s) apart; S changes little in that time
+# s; innovations and variances are logged up to one interval of the default profile (0.5 s) apart,
+# and S changes little in that time
 JOIN_TOLERANCE_S = 0.6
 
 
 def read_aids(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> dict[str, AidLog]:
-    """Every aid of which the log has innovations, by PX4's name.
+    """Read all aids with innovations in the log, by PX4 name.
 
-    ``enabled`` is what :func:`read_enabled_aids` says.
-
-    Of several topics the aid's own is taken: it has each attempt to fuse, with its time, and what
-    came of it. The others repeat a value until the next one, which counts once.
+    ``enabled`` is the result of :func:`read_enabled_aids`. The topic ``estimator_aid_src`` of the
+    aid is preferred: it contains each fusion attempt with time and result. The other topics repeat
+    a value until the next one; repeats are removed.
     """
     found = {}
     for name, aid in AIDS.items():
         aid_enabled = enabled.get(name)
         log = _read_own_topic(topics, aid, aid_enabled)
-        # an aid that was never meant to be fused stands at its last value, or is another's
+        # The values of an aid that was never enabled are outdated or belong to another aid
         if log is None and (name.startswith("ev_") if aid_enabled is None else aid_enabled.any()):
             log = _read_last_values(topics, aid, aid_enabled)
         if log is not None:
@@ -45,9 +44,9 @@ def read_aids(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> dict[s
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
-    """By aid, a step function: 1 while EKF2 means to fuse it, 0 while it does not.
+    """Read one step function per aid: 1 while its fusion is enabled, otherwise 0.
 
-    By its flags, or else by the bits of the older topic.
+    From ``estimator_status_flags``, or the control bits of ``estimator_status`` in older logs.
     """
     enabled, tables = {}, topics.of(px4.STATUS_FLAGS)
     every = (*AIDS.values(), *DISTURBANCES.values())
@@ -71,7 +70,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
 
 
 def _read_own_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
-    """An aid by its ``estimator_aid_src`` topic."""
+    """Read an aid from its ``estimator_aid_src`` topic."""
     count = len(aid.axes)
     at = [""] if count == 1 else [f"[{number}]" for number in range(count)]
     columns = {
@@ -87,7 +86,7 @@ def _read_own_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
     }
     columns |= {"fused": "fused", "rejected": "innovation_rejected"}
     layout = Layout(f"estimator_aid_src_{aid.name}", columns)
-    if topics.find(layout) is None:  # most aids of most logs: an empty table takes its time
+    if topics.find(layout) is None:  # return early; reading an empty table takes time
         return None
     frame = topics.primary_samples(layout).dropna()
     if enabled is not None and aid.name in px4.FLAG_ALWAYS_SET:
@@ -96,7 +95,7 @@ def _read_own_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
 
 
 def _read_last_values(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
-    """An aid by the topics that hold the last value of every aid."""
+    """Read an aid from the topics that contain the last value of all aids."""
     gauss = aid.name == "mag_heading" and any(
         "cs_mag" in one for one in topics.of(px4.STATUS_FLAGS)
     )
@@ -118,7 +117,7 @@ def _read_last_values(topics: Topics, aid: Aid, enabled: pd.Series[float] | None
     for values, variances in layouts:
         frame = topics.primary_samples(values, select=_drop_repeats)
         if variances is not values:
-            # each topic is thinned by itself; S changes slowly
+            # The logger decimates each topic separately; S changes slowly
             known = topics.primary_samples(variances).dropna()
             frame = join_nearest(frame, known, JOIN_TOLERANCE_S)
         excluded_count = len(frame) - len(frame := frame.dropna())
@@ -131,7 +130,7 @@ def _read_last_values(topics: Topics, aid: Aid, enabled: pd.Series[float] | None
 
 
 def _drop_repeats(frame: pd.DataFrame) -> pd.DataFrame:
-    """Without repeats and without zeros, the value before any fusion."""
+    """Remove repeated rows, and zeros, which mean "not fused yet"."""
     known = frame.dropna()
     first = known.iloc[:, 0]
     return known[first.ne(first.shift()) & (first != 0.0)]
@@ -148,7 +147,7 @@ def _aid_log(
     enabled: pd.Series[float] | None,
     excluded_count: int = 0,
 ) -> AidLog | None:
-    """The record of what has a variance, with the sign that everyone else gives an innovation."""
+    """Build the record from rows with positive variance; reverse PX4's sign of innovations."""
     frame = frame[(frame[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     negated = {one: -frame[one] for one in _columns("innovation", aid, aid.axes)}
     aid_log = AidLog(

@@ -1,4 +1,4 @@
-"""EKF2's part of a ULog: state, variances, innovations, resets, and the inside of its filter.
+"""EKF2 data of a ULog: state, variances, innovations, resets, and state at the fusion horizon.
 
 Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates), ``EKF/common.h`` (order of the states),
 ``msg/EstimatorStatusFlags.msg`` and ``msg/EstimatorStatus.msg`` (horizontal aiding).
@@ -24,22 +24,19 @@ from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION = "vehicle_visual_odometry"
-STATES = 22  # attitude, velocity, position, biases, magnetic fields; the rest is wind and terrain
+STATES = 22  # attitude, velocity, position, biases, magnetic fields; wind and terrain follow
 MAG_3D_BIT = 5  # filter_control_status_u, common.h
-ALL_FIELD_HZ = 10.0  # EKF2 has 14 samples a second
-# So near to a half, IMU samples per step may be rounded either way
+ALL_FIELD_HZ = 10.0  # Hz; a faster topic is complete (EKF2 uses 14 samples per second)
+# IMU samples; distance to n + 0.5 within which EKF2 may round up or down
 HALF = 0.05
-# Between two rows of optical flow
+# s; longest interval between two rows of optical flow
 MAX_FLOW_S = 0.5
 # Horizontal aiding besides vision position
 OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
-    (
-        "estimator_states (estimator_status before v1.12) is not logged or not "
-        "usable. Record with SDLOG_PROFILE bit 0 (default)"
-    ),
-    "The topic is also missing if EKF2 had not started.",
+    "estimator_states (estimator_status before v1.12) is not logged or not usable",
+    "Record with SDLOG_PROFILE bit 0 (default). The topic is also missing if EKF2 had not started.",
 )
 _RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
@@ -50,7 +47,7 @@ _RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]]
 
 
 def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
-    """EKF2's output, or why there is none."""
+    """Read EKF2's published state, variances, innovations and fusion flags."""
     parameters = topics.log.parameters
     if parameters.get("EKF2_EN") == 0.0:
         return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
@@ -62,7 +59,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         )
     local = topics.read(px4.LOCAL_POSITION)
     if topics.find(px4.LOCAL_POSITION) is None:
-        return Unavailable("EKF2", "no topic vehicle_local_position", px4.DEFAULT_PROFILE)
+        return Unavailable("EKF2", "vehicle_local_position is not logged", px4.DEFAULT_PROFILE)
     state = local[Columns.STATE].dropna()
     if state.empty:
         return Unavailable(
@@ -79,14 +76,14 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
-        f"{topic} has no time of measurement in this release: EKF2's innovations carry the time of "
-        "their publication, up to 0.2 s later"
+        f"{topic} has no measurement time in this release: the times of EKF2 innovations are "
+        "publication times, up to 0.2 s later"
         for topic in innovation_topics[:1]
         if not any("timestamp_sample" in table for table in topics.of(topic))
     ]
     notes += [
-        f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) have no "
-        f"{log.topics[-1]} within {JOIN_TOLERANCE_S:g} s and were left out"
+        f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped: "
+        f"no {log.topics[-1]} within {JOIN_TOLERANCE_S:g} s"
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
         if log.excluded_count
     ]
@@ -114,9 +111,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
 
 
 def _state_vector(topics: Topics) -> tuple[str, int]:
-    """The topic with EKF2's state vector, and how many variances attitude has in it.
+    """Return the topic with EKF2's state vector and its number of attitude variances.
 
-    "" where there is none; 0 where the lengths of its arrays are of no known layout.
+    The topic is "" if it is not logged; the number is 0 if the array lengths are unknown.
     """
     for topic in px4.ESTIMATOR_STATES:
         for table in topics.of(topic)[:1]:
@@ -128,9 +125,9 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
 
 
 def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
-    """EKF2's state and variances at its fusion horizon, in one layout and unit for all releases.
+    """Read EKF2's state and variances at the fusion horizon, converted to one layout and unit.
 
-    ``step_s`` is the time between two predictions, for releases that keep biases per prediction.
+    ``step_s`` is the prediction interval, for releases that store bias increments per prediction.
     """
     topic, attitude = _state_vector(topics)
     if not topic:
@@ -157,7 +154,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
 
 
 def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
-    """Variances of position and velocity."""
+    """Return the variances of position and velocity (m², m²/s²) that are all positive."""
     if isinstance(delayed, Unavailable):
         return delayed
     variance = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
@@ -166,12 +163,12 @@ def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable
 
 
 def target_step_s(topics: Topics) -> float:
-    """EKF2_PREDICT_US, in s."""
+    """Return EKF2_PREDICT_US in s."""
     return topics.log.parameters.get("EKF2_PREDICT_US", flight.EKF2_STEP_S * 1e6) * 1e-6
 
 
 def _step_s(topics: Topics) -> float:
-    """Time between two predictions: EKF2 gathers whole IMU samples (ImuDownSampler.cpp)."""
+    """Return the prediction interval (s): a whole number of IMU samples (ImuDownSampler.cpp)."""
     target = target_step_s(topics)
     imu = topics.read(px4.IMU)
     if len(imu) < 2:
@@ -186,16 +183,16 @@ def _step_s(topics: Topics) -> float:
 
 
 def rows_of_stamps(times_s: Array, known_s: ArrayLike) -> IntArray:
-    """Rows of the times that are among the known ones, to a microsecond."""
+    """Return the rows of ``times_s`` whose time is in ``known_s``, rounded to 1 µs."""
     wanted = np.rint(np.asarray(known_s, dtype=float) * 1e6)
     return np.flatnonzero(np.isin(np.rint(times_s * 1e6), wanted))
 
 
 def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -> int:
-    """IMU samples that EKF2 gathers for a prediction: the nearest whole number.
+    """Return the number of IMU samples per EKF2 prediction: the nearest whole number.
 
-    EKF2 rounds a mean of the measured intervals, so that a half goes either way: up, unless ends
-    of steps that the log shows (as numbers of IMU samples) tell otherwise.
+    EKF2 rounds a mean of the measured intervals, so n + 0.5 may be rounded up or down. It is
+    rounded up here, unless the logged step ends (in IMU samples) fit the smaller number only.
 
     >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
     (3, 3)
@@ -203,7 +200,7 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
     2
     """
     exact = target_s / interval_s + 0.5
-    # stamps in µs: an interval of 4 ms must not fall to either side by rounding
+    # Margin for timestamps in µs, so that rounding does not change the result
     samples = max(int(exact + 1e-6), 1)
     gaps = np.diff(np.asarray(ends, dtype=float))
     if samples > 1 and abs(exact - samples) < HALF and len(gaps):
@@ -215,7 +212,7 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
 def _accelerometer_bias(
     topics: Topics, delayed: pd.DataFrame | Unavailable
 ) -> pd.DataFrame | Unavailable:
-    """Accelerometer bias from its own topic, or else from the state vector."""
+    """Read the accelerometer bias (m/s²) from estimator_sensor_bias or the state vector."""
     if len(bias_topic := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
         return bias_topic
     if isinstance(delayed, Unavailable) or delayed.empty:
@@ -224,10 +221,10 @@ def _accelerometer_bias(
 
 
 def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
-    """How long after the time that it is of the delayed state is published (median).
+    """Return the median delay (s) from fusion horizon to publication.
 
-    Releases before v1.13 stamp it with the newest IMU sample instead, so that what is left is less
-    than a prediction step.
+    Before v1.13 the timestamp is that of the newest IMU sample, so the delay is below one
+    prediction interval and the horizon is unavailable.
     """
     age_s = _publication_age_s(topics, _state_vector(topics)[0])
     if len(age_s) and (lag := float(age_s.median())) > step_s:
@@ -236,7 +233,7 @@ def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
 
 
 def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
-    """How long after its measurement each message of a topic was published, by that stamp (s)."""
+    """Return the delay (s) from measurement to publication, indexed by measurement time (s)."""
     for table in topics.of(topic)[:1]:
         if "timestamp_sample" in table:
             stamp_us = measurement_time_us(table)
@@ -249,7 +246,7 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
 def _read_fusing(
     topics: Topics, enabled: Mapping[str, pd.Series[float]]
 ) -> pd.DataFrame | Unavailable:
-    """What EKF2 means to fuse of external vision."""
+    """Read the fusion flags of external vision: horizontal, vertical, yaw."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= enabled.keys():
         return Unavailable(
@@ -260,13 +257,13 @@ def _read_fusing(
     frame = pd.DataFrame({group: enabled[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
     if frame.empty:
-        return Unavailable("EKF2 fusion flags", f"{topic} holds no usable sample", "Record again.")
+        return Unavailable("EKF2 fusion flags", f"{topic} has no usable sample", "Record again.")
     topics.record_stream("ekf2_fusing", topic)
     return frame
 
 
 def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
-    """Resets of the published state, from the counters (uint8, they wrap) and their deltas."""
+    """Read the resets of the published state from its counters (uint8, wrapping) and deltas."""
     resets = []
     for quantity, counter, deltas in _RESETS:
         if counter not in local:
@@ -287,7 +284,7 @@ def _read_record(
     enabled: Mapping[str, pd.Series[float]],
     step_s: float,
 ) -> FusionRecord | Unavailable:
-    """What the log tells of the inside of EKF2's filter; ``local`` is the published position."""
+    """Read the data for a replay of EKF2; ``local`` is the published local position."""
     topic, attitude = _state_vector(topics)
     if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed, Unavailable):
         return flight.RECORD_NOT_LOGGED
@@ -296,9 +293,10 @@ def _read_record(
     if usable_state.empty:
         return flight.RECORD_NOT_LOGGED
     horizontal, altitude_m = Columns.POSITION[:2], 0.0
-    if not usable_state[horizontal].to_numpy().any():  # from v1.16 kept as latitude and longitude
+    # Since v1.16 EKF2 stores latitude and longitude, logged as zero, and altitude above sea level
+    # once it has an origin (ekf_helper.cpp)
+    if not usable_state[horizontal].to_numpy().any():
         usable_state[horizontal] = np.nan
-        # and its height, where there is an origin, as altitude above the sea (ekf_helper.cpp)
         altitude_m = _last(local, "ref_alt", 0.0)
         usable_state["down_m"] += altitude_m
     age_s = _publication_age_s(topics, VISION).sort_index()
@@ -326,15 +324,15 @@ def _read_record(
 
 
 def _last(frame: pd.DataFrame, column: str, default: float) -> float:
-    """The last finite value of a column, where there is one."""
+    """Return the last finite value of a column, or ``default``."""
     known = frame[column].dropna().to_numpy() if column in frame else np.zeros(0)
     return float(known[-1]) if len(known) else default
 
 
 def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """What the magnetometer measured, of the two topics that have it.
+    """Read the magnetic field from the better one of the two topics that contain it.
 
-    The one with all samples, else the one that tells of those between its rows, else with more.
+    A topic with all samples is preferred, then one with EKF2's low-pass filtered innovation.
     """
     fields_found = []
     for topic, name in px4.MAGNETOMETER:
@@ -358,7 +356,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
-    """What optical flow measured: of the samples between two rows the mean, by the low pass."""
+    """Read optical flow velocities: means between two rows, from EKF2's low-pass filter states."""
     speed, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{part}"]).dropna()
         for part in ("velocity", "interval", "noise")
@@ -367,7 +365,7 @@ def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.Da
     if not interval_s > 0.0 or noise.empty:
         return pd.DataFrame()
     times = speed.index.to_numpy()
-    # of more samples the low pass has forgotten too many
+    # Over longer intervals the low pass has lost the earlier samples
     row = np.flatnonzero((np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_S)) + 1
     if FLOW.name in enabled:
         row = row[step_values_at(enabled[FLOW.name], times[row]) > 0.0]
@@ -395,9 +393,9 @@ def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.Da
 
 
 def _attitude_variance(quaternion: Array, variance: Array) -> Array:
-    """Variances of the attitude error about NED's axes, from those of the quaternion.
+    """Convert quaternion variances to variances (rad²) of the attitude error about NED axes.
 
-    δθ = 2 Im(δq ⊗ q*); the log holds no correlations.
+    δθ = 2 Im(δq ⊗ q*); correlations are not logged and assumed to be zero.
     """
     w, x, y, z = quaternion.T
     turns = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])

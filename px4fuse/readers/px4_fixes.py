@@ -1,4 +1,4 @@
-"""Fixes of GNSS that EKF2 took and the logger left out, from what EKF2 logs of them."""
+"""Reconstruction of GNSS fixes that EKF2 used but that are not logged."""
 
 import numpy as np
 import pandas as pd
@@ -9,38 +9,39 @@ from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# Fixes are 0.05 s apart and more
+# s; times this close are the same fix (fixes are at least 0.05 s apart)
 SAME_FIX_S = 0.01
-# Within 100 km
+# degrees; about 100 km
 NEAR_DEG = 1.0
-# Receivers give 4 to 20 fixes a second
+# s; candidate intervals of receivers, which send 4 to 20 fixes per second
 PERIODS_S = np.arange(0.05, 0.26, 0.0005)
-# How far stamps may be from a multiple of the receiver's interval: EKF2's step, and its clock's
+# s; tolerance of fix times on the receiver's time grid: EKF2's step and clock jitter
 ON_GRID_S = 0.006
+# Logged fixes needed to check the reconstruction
 MIN_KNOWN = 10
-# Intervals of one and of the next multiple, before the receiver's own is known
+# Number of intervals with n and with n + 1 periods that the estimate of the period needs
 MIN_REPEATED_INTERVALS = 3
-# RMS of what is rebuilt, by fixes that are logged too
+# m; RMS limit of the reconstruction error, measured at fixes that are also logged
 EXACT_M = 0.1
 
 
 def read_unlogged_fixes(
     topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable
 ) -> pd.DataFrame:
-    """Fixes that EKF2 took and the log lacks, from the rows of its innovations (from v1.16).
+    """Read unlogged fixes from EKF2's GNSS innovation topics (PX4 v1.16 and newer).
 
-    The logger keeps every fix only where it comes slower than its limit of 10 a second.
+    ``gps`` contains the logged fixes. The logger drops fixes above its limit of 10 per second.
     """
     layouts = px4.LAYOUTS["fused_position"], px4.LAYOUTS["fused_velocity"]
     if isinstance(ekf2, Unavailable) or not all(map(topics.find, layouts)):
         return pd.DataFrame()
     position, velocity = map(topics.primary_samples, layouts)
-    # what a receiver sends without a fix has a row too
+    # Messages without a fix also have a row
     is_fix = position[["fused", "rejected"]].any(axis=1)
     position = position.loc[is_fix].drop(columns=["fused", "rejected"])
-    # rows are of half a prediction step before (estimator_interface.cpp)
+    # EKF2 shifts GNSS times back by half a prediction step (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
-    # of the reference; else it has EKF2's bias in it
+    # Only if GNSS is the height reference: otherwise the observation includes EKF2's bias
     height, reference = px4.LAYOUTS["fused_height"], topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0)
     if topics.find(height) and reference == 1.0:
         fixes = fixes.join(topics.primary_samples(height))
@@ -52,7 +53,7 @@ def read_unlogged_fixes(
         fixes[distance_s <= SAME_FIX_S],
         fixes[(distance_s > SAME_FIX_S) & is_between_fixes],
     )
-    # before v1.16 their position is local, in m
+    # Before v1.16 the observation is a local position in m
     is_in_degrees = (
         known["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median() < NEAR_DEG
     )
@@ -62,26 +63,25 @@ def read_unlogged_fixes(
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Fixes between the logged ones as EKF2's position plus its innovation, where those are exact.
+    """Reconstruct fixes between the logged ones as EKF2 position plus innovation.
 
-    An innovation is logged at times of its own (2 Hz up to v1.15) and is of the last fix before,
-    which came a whole number of the receiver's intervals after a logged fix. Where that is none
-    after it, the fix is known: by those the method is judged.
+    An innovation belongs to the last fix before its log time (2 Hz up to v1.15). That fix is a
+    whole number n of receiver intervals after a logged fix. For n = 0 the fix is also logged; these
+    give the reconstruction error, and nothing is returned if it exceeds EXACT_M.
 
     Parameters
     ----------
     fixes : DataFrame
-        Positions (m, NED) and variances by the time that EKF2 takes them to be of.
+        Positions (m, NED) and variances, indexed by the measurement time that EKF2 assumes.
     ekf2 : Ekf2 or Unavailable
     delay_s : float
-        By which EKF2 takes a fix to be older than its stamp; one that is older than the horizon is
+        Delay between fix and timestamp that EKF2 assumes. A fix older than the fusion horizon is
         fused at the horizon (``RingBuffer.h``).
 
     Returns
     -------
     (DataFrame, tuple of str)
-        Those that are not among ``fixes``, without height where EKF2 has none of GNSS, and what
-        was done.
+        Fixes that are not in ``fixes``, with interpolated heights, and a note.
     """
     no_fixes = pd.DataFrame(columns=fixes.columns)
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
@@ -97,7 +97,7 @@ def reconstruct_fixes(
     is_between_fixes = (before >= 0) & (before < len(times) - 1)
     rows, before = rows[is_between_fixes], before[is_between_fixes]
     intervals_passed = (rows - delay_beyond_horizon_s - times[before]) / interval_s
-    # of a row in the step of the fusion it is open which fix it is of
+    # Skip innovations logged within one EKF2 step of a fix: their fix is ambiguous
     is_unambiguous = intervals_passed % 1.0 > ekf2.step_s / interval_s
     rows, before, intervals_passed = (
         rows[is_unambiguous],
@@ -130,17 +130,16 @@ def reconstruct_fixes(
         if column in fixes:
             fixes_found[column] = np.interp(fixes_found.index, times, fixes[column])
     return fixes_found, (
-        f"{len(fixes_found)} positions of GNSS that the logger left out are EKF2's position plus its "
-        f"innovation, to within {exact_m:.2f} m (RMS along each axis, by {len(error)} that are "
-        "logged too); their heights are interpolated",
+        f"{len(fixes_found)} GNSS fixes that were not logged are reconstructed as EKF2 position "
+        f"plus innovation, with interpolated heights (RMS error {exact_m:.2f} m per axis at "
+        f"{len(error)} logged fixes)",
     )
 
 
 def _interval_s(times: Array) -> float | None:
-    """The receiver's interval: the longest of which all logged ones are multiples.
+    """Estimate the receiver's interval (s): the longest whose multiples are the logged intervals.
 
-    A logger that keeps two a second keeps every fifth, say, and now and then every fourth or
-    sixth. None where all are alike, which leaves it open into how many parts they fall.
+    None if all logged intervals are the same multiple, because that multiple is then unknown.
     """
     gaps = np.diff(times)[:, None]
     grid_error_s = np.abs(gaps / PERIODS_S - np.round(gaps / PERIODS_S)) * PERIODS_S
@@ -149,7 +148,7 @@ def _interval_s(times: Array) -> float | None:
     if not len(fits):
         return None
     longest_period_s = PERIODS_S[fits[-1]]
-    # the best of those next to it
+    # Refine to the best fit near the longest period
     near_periods = np.flatnonzero(np.abs(PERIODS_S - longest_period_s) < 0.1 * longest_period_s)
     best_period_s = PERIODS_S[near_periods[np.argmin(worst_error_s[near_periods])]]
     interval_multiples = np.round(gaps[:, 0] / best_period_s)

@@ -1,4 +1,4 @@
-"""EKF2's innovations of a position source, per axis, from what a log has of its aids."""
+"""EKF2 innovations of a position source, per axis, from the logged EKF2 aids."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
 @dataclass(frozen=True)
 class FusedSource:
-    """A position source as EKF2 knows it: its name, its aids, and what has EKF2 fuse them.
+    """Position source of EKF2: name, aids, and actions to enable and log them.
 
-    ``height`` is the name of what its height is from, where that is something else.
+    ``height`` is the name of a separate height sensor, or "".
     """
 
     name: str
@@ -35,7 +35,7 @@ VISION, GNSS, GNSS_AND_BAROMETER = (
 
 
 def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
-    """Whether EKF2 fused an aid, or meant to fuse it, at any time."""
+    """Return True if EKF2 fused the aid at any time, or enabled it if fusion is not logged."""
     log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(aid)
     if log is None:
         return False
@@ -43,14 +43,14 @@ def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
 
 
 def with_gnss_innovations(ekf2: Ekf2, source: FusedSource = GNSS) -> Ekf2:
-    """EKF2 with its innovations of GNSS in place of those of external vision."""
+    """Replace the innovations of external vision by those of GNSS."""
     enabled = {
         group: log.enabled
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if (log := ekf2.aids.get(name)) is not None and log.enabled is not None
     }
     fusing: pd.DataFrame | Unavailable = Unavailable(
-        "EKF2 fusion flags", "the log does not contain when EKF2 fused GNSS", f"{GNSS.to_log}"
+        "EKF2 fusion flags", "the log does not contain when EKF2 fused GNSS", GNSS.to_log
     )
     if enabled:
         columns = ["horizontal", "vertical", "yaw"]
@@ -68,16 +68,16 @@ def innovations_of(
     gate: float,
     source: FusedSource = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
-    """Innovations per axis, and their topics.
+    """Return the innovations per axis and their topics.
 
     Parameters
     ----------
-    aids : mapping from PX4's name to AidLog
+    aids : mapping from PX4 name to AidLog
     fusing : DataFrame or Unavailable
-        As :class:`~px4fuse.flight.Ekf2` has it.
+        Fusion flags, as in :class:`~px4fuse.flight.Ekf2`.
     gate : float
-        Of the source's position, for rejections that are not logged.
-    source : Fused
+        Innovation gate (in √S), used if rejections are not logged.
+    source : FusedSource
     """
     found: Innovations = {}
     used_topics: dict[str, None] = {}
@@ -106,7 +106,7 @@ def innovations_of(
 
 
 def along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
-    """One axis of what was fused or rejected; a rejection is of all axes of the aid."""
+    """Return the innovations of one axis; a rejection applies to all axes of the aid."""
     samples = log.samples
     nis = {one: samples[f"innovation_{one}"] ** 2 / samples[f"variance_{one}"] for one in log.axes}
     is_beyond_gate = pd.DataFrame(nis).max(axis=1) > gate**2

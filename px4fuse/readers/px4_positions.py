@@ -1,4 +1,4 @@
-"""External position tracks of a ULog: in order of preference."""
+"""External position tracks and ground truth of a ULog."""
 
 from __future__ import annotations
 
@@ -33,24 +33,25 @@ from px4fuse.recording import ClockMap
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-# Samples that are published within this of their measurement have no measured time of their own
+# µs; a sample published this soon after its measurement time has the arrival time instead
 SAME_TIME_US = 100
+# Fraction of such samples above which a topic has arrival times
 ARRIVAL_SHARE = 0.9
-# Heights this far from a position may be joined to it: 2.5 cm at a climb of 0.5 m/s
+# s; largest time difference of height and position: 2.5 cm error at a climb rate of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
-# Logged no faster than this, a receiver's positions were thinned: they give 5 to 20 a second
+# Hz; a lower GNSS rate means that the logger decimated the fixes (receivers send 5 to 20 Hz)
 MAX_THINNED_HZ = 4.0
-AUTOPILOT_CLOCK = "autopilot boot clock (as PX4 mapped the sender's stamp)"
-# Latitude and longitude in degrees, and perhaps altitude in m
+AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
+# Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
 
 
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Every external position track, the best first, and what was looked for and not found."""
+    """Read all external positions in order of preference, and the reasons for missing ones."""
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
-    # of what EKF2 kept, a source that EKF2 took a heading from counts as an odometry
+    # EKF2's observations have no orientation; a source with fused yaw counts as odometry
     turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
     found = [
         *(_read_logged(topics, name) for name in px4.LOGGED),
@@ -63,7 +64,7 @@ def read_positions(
 
 
 def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
-    """Why there is no position source of this name; of a ULog's, what would have logged it."""
+    """Describe a missing position source; the default action is that of the ULog track."""
     remedy = remedy or px4.TRACKS[name].remedy
     return Unavailable(f"position source {name}", reason, remedy, source=name)
 
@@ -77,22 +78,23 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """A track of the samples that have a position; unavailable where they are too few.
+    """Make a track of the samples with valid position; unavailable if they are too few.
 
     Parameters
     ----------
     samples : DataFrame
-        With the columns of a track's, as far as there are such. A variance of 0 becomes NaN: PX4
-        reads it as not given (``EKF2.cpp``).
+        Columns of a track; missing ones become NaN. A variance of 0 becomes NaN, because PX4
+        treats it as "not sent" (``EKF2.cpp``).
     needed_columns : list of str
-        What a sample must have.
+        Columns in which a valid sample must be finite.
     track_fields
-        Of :class:`~px4fuse.flight.PositionTrack`.
+        Other fields of :class:`~px4fuse.flight.PositionTrack`.
     """
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     samples = finite_rows(samples, needed_columns)
     if len(samples) < MIN_TRACK_SAMPLES:
-        return unavailable(name, f"{len(samples)} finite samples are too few", remedy)
+        reason = f"only {len(samples)} finite samples (at least {MIN_TRACK_SAMPLES} are needed)"
+        return unavailable(name, reason, remedy)
     variance = samples[Columns.POSITION_VARIANCE]
     samples = samples.assign(**variance.where(variance > 0))
     return PositionTrack(name=name, samples=samples, origin=origin, **track_fields)
@@ -107,7 +109,7 @@ def _track(
     turns: bool = False,
     **more: Any,
 ) -> PositionTrack | Unavailable:
-    """A track of a ULog; ``turns`` says whether it has an orientation that turns."""
+    """Make a ULog track; ``turns`` is True if it has an orientation that changes."""
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, turns=turns)
     places = ("", "", "") if origin.aid is None else origin.aid.place
@@ -125,15 +127,15 @@ def _track(
 def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
     layout = topics.find(*px4.layouts_of_track(name))
     if layout is None:
-        return unavailable(name, f"no topic {name} in the log")
-    is_ekf2 = layout.topic.startswith("estimator_")  # only EKF2's own topics have its instances
+        return unavailable(name, f"{name} is not logged")
+    is_ekf2 = layout.topic.startswith("estimator_")  # only these topics have EKF2 instances
     samples = topics.primary_samples(layout) if is_ekf2 else topics.frame(layout)
     frame = "unknown"
     for field, names in px4.FRAMES.items():
         if field in samples and len(samples):
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
-        frame = "NED"  # rotated by EKF2 itself, whatever the field still says
+        frame = "NED"  # rotated by EKF2, although the field still contains the original frame
     orientation = read_orientation(samples)
     return _track(
         topics,
@@ -148,9 +150,9 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
 
 
 def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
-    """Whether a topic's times of measurement are in truth the times of arrival.
+    """Describe the clock of a topic whose measurement times are arrival times; otherwise None.
 
-    PX4 takes the time of arrival until 500 answers to TIMESYNC have come (``Timesync.cpp``).
+    PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``).
     """
     table = topics.of(topic)[0]
     if "timestamp_sample" not in table:
@@ -159,28 +161,28 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     if len(age_us) < MIN_TRACK_SAMPLES or np.mean(np.abs(age_us) <= SAME_TIME_US) < ARRIVAL_SHARE:
         return None
     return ClockMap(
-        "the sender's stamps",
+        "sender timestamps",
         "arrival time",
         len(age_us),
         0.0,
         0.0,
         0.0,
-        "PX4 replaced them by the time of arrival, since the clocks were not synchronised",
+        "PX4 replaced them by the arrival time: the clocks were not synchronised",
     )
 
 
 def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.LAYOUTS["kept_horizontal"])
     if layout is None:
-        return unavailable(px4.KEPT_OBSERVATION, f"no topic {px4.KEPT_OBSERVATION} in the log")
+        return unavailable(px4.KEPT_OBSERVATION, f"{px4.KEPT_OBSERVATION} is not logged")
     samples, used = topics.primary_samples(layout), [layout.topic]
     notes: tuple[str, ...] = ()
     vertical = topics.find(px4.LAYOUTS["kept_vertical"])
     if vertical is not None:
         samples, notes = _with_height(samples, topics.primary_samples(vertical))
         used.append(vertical.topic)
-    # EKF2 stamps its buffer entries earlier than the sender did: by its delay and by half its
-    # update period (estimator_interface.cpp)
+    # EKF2 subtracts its delay and half its prediction interval from the sender's timestamp
+    # (estimator_interface.cpp)
     samples = _shift_times(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
     return _track(
         topics,
@@ -200,32 +202,32 @@ def _shift_times(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
 def _with_height(
     samples: pd.DataFrame, height: pd.DataFrame
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Add the nearest height to each horizontal position, and say where there was none.
+    """Add the nearest height to each horizontal position; note how many have none.
 
-    EKF2 stamps both with one external vision sample, but the logger thins each topic by itself.
+    Both have the timestamp of one external vision sample, but the logger decimates each topic
+    separately.
     """
     joined = join_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
     without_height = int(joined.pop("_found").isna().sum())
     within = f"within {1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
-    note = f"{without_height} of {len(joined)} positions of external vision have no height {within}"
+    note = f"{without_height} of {len(joined)} external vision positions have no height {within}"
     return joined, (note,) if without_height else ()
 
 
 def _delay_s(topics: Topics) -> float:
-    """The delay by which EKF2 takes a sample to be older than its stamp."""
+    """Return EKF2_EV_DELAY in s, the delay from measurement to timestamp that EKF2 assumes."""
     return topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
 
 
 def _reconstruct(
     topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool
 ) -> PositionTrack | Unavailable:
-    """Position = EKF2's state + innovation (measurement - state), at the innovation's time.
+    """Reconstruct the position as EKF2 state plus innovation, at the time of the innovation.
 
-    The innovation may be as old as one interval of the source, so the times are late by up to
-    that; without the source's own stamps nothing better is known.
+    The times are late by up to one interval of the source, whose timestamps are not logged.
     """
     if isinstance(ekf2, Unavailable):
-        return unavailable(px4.RECONSTRUCTION, "no EKF2 output")
+        return unavailable(px4.RECONSTRUCTION, "the log contains no EKF2 state")
     tracks = {}
     for column, innovations in zip(Columns.POSITION, ekf2.innovations.values(), strict=True):
         if isinstance(innovations, pd.DataFrame):
@@ -246,14 +248,14 @@ def _reconstruct(
         turns=turns,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
-        clock=f"EKF2's time plus {EV_POS.delay}; late by up to one interval of the source",
+        clock=f"EKF2 time plus {EV_POS.delay}; late by up to one interval of the source",
     )
 
 
 def project(
     latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition
 ) -> tuple[Array, Array]:
-    """North and east (m) of an origin by the azimuthal equidistant projection that PX4 uses.
+    """Convert latitude and longitude to north and east (m): azimuthal equidistant projection.
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
     """
@@ -270,14 +272,14 @@ def project(
 
 
 def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[Array, Array]:
-    """Latitude and longitude (degrees) of what :func:`project` gives.
+    """Convert north and east (m) to latitude and longitude (degrees), the inverse of project.
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
     """
     x, y = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
     latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
     c = np.hypot(x, y)
-    # sin(c)/c, which is 1 at the origin
+    # sin(c)/c, with the limit 1 at the origin
     share = np.sinc(c / np.pi)
     sine, cosine = np.sin(latitude_0), np.cos(latitude_0)
     latitude = np.arcsin(np.cos(c) * sine + x * share * cosine)
@@ -286,7 +288,7 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
 
 def _local_origin(topics: Topics) -> GeodeticPosition | None:
-    """EKF2's geographic origin (degrees, degrees, m), where it had one."""
+    """Return EKF2's origin: latitude, longitude (degrees), altitude (m); None if it has none."""
     local = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
     if not {*columns} <= {*local}:
@@ -299,9 +301,9 @@ def _local_origin(topics: Topics) -> GeodeticPosition | None:
 
 
 def project_to_ned(geo: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
-    """Latitude, longitude and altitude as north, east, down (m).
+    """Convert latitude, longitude and altitude to north, east, down (m) from the origin.
 
-    About an origin, or where there is none about their own first sample.
+    The default origin is the first sample.
     """
     latitude, longitude, altitude = geo[GLOBAL_COLUMNS].to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
@@ -311,14 +313,14 @@ def project_to_ned(geo: pd.DataFrame, origin: GeodeticPosition | None) -> pd.Dat
 
 
 def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
-    """GNSS at the times that EKF2 takes its fixes to have been measured at.
+    """Read GNSS positions, with the measurement times that EKF2 assumes.
 
-    Those are the stamps less EKF2_GPS_DELAY, and since main of 2026 the driver's own times of
-    measurement where those differ (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
+    These are the timestamps minus EKF2_GPS_DELAY; since PX4 main of 2026 the measurement times of
+    the driver if they differ (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
     layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
-        return unavailable(px4.GPS_POSITION, f"no topic {px4.GPS_POSITION} in the log")
+        return unavailable(px4.GPS_POSITION, f"{px4.GPS_POSITION} is not logged")
     gps = topics.frame(layout)
     if "fix_type" in gps:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
@@ -330,22 +332,22 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         np.any(published_s - gps.index > SAME_TIME_US * 1e-6)
     )
     delay_ms = 0.0 if has_driver_times else settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
-    clock = "autopilot boot clock, the receiver driver's times of measurement"
+    clock = "autopilot boot clock, measurement times of the receiver driver"
     if not has_driver_times:
         gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
-        clock = f"autopilot boot clock, less {delay_ms:g} ms ({GNSS_POS.delay})"
+        clock = f"autopilot boot clock minus {delay_ms:g} ms ({GNSS_POS.delay})"
     unlogged_fixes = read_unlogged_fixes(topics, gps, ekf2)
     if len(unlogged_fixes):
         gps = pd.concat([gps, unlogged_fixes]).sort_index()
         interpolated = int(gps["altitude_m"].isna().sum())
-        # what their rows do not have is as in the fix before
+        # Fields that these rows do not contain are copied from the previous fix
         gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
     samples = project_to_ned(gps, _local_origin(topics))
     if {"eph_m", "epv_m"} <= set(gps.columns):
-        # EKF2 takes the horizontal accuracy for each axis (gps_control.cpp)
+        # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
-    # together, so that a damaged fix takes its velocity with it
+    # Joined before the check, so that a damaged fix is dropped with its velocity
     samples = samples.assign(**_velocity(gps).set_axis(samples.index))
     samples = finite_rows(samples, Columns.POSITION)
     rate_hz, notes = sample_rate(samples), tuple[str, ...]()
@@ -358,17 +360,17 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         )
     if rate_hz < MAX_THINNED_HZ:
         notes = (
-            f"the log holds {rate_hz:.1f} positions of GNSS a second, fewer than receivers "
-            "give: the logger left out the others (SDLOG_PROFILE bit 1 keeps them)",
+            f"GNSS fixes are logged at {rate_hz:.1f} Hz, below the rate of receivers: the logger "
+            "dropped fixes. Set SDLOG_PROFILE bit 1 to log all",
             *notes,
         )
     if len(unlogged_fixes):
         notes += (
-            f"{len(unlogged_fixes)} positions of GNSS that the logger left out are from "
-            f"estimator_aid_src_gnss_pos, {interpolated} of their heights are interpolated",
+            f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
+            f"estimator_aid_src_gnss_pos ({interpolated} with interpolated height)",
         )
     more: dict[str, Any] = {}
-    if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # since v1.17 of each receiver
+    if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # logged per receiver since v1.17
         more["lever_arm_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     found = _track(
         topics,
@@ -387,7 +389,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
-    """Height by the pressure, ``down_m``, None where there is none."""
+    """Return the barometer height as ``down_m`` with times minus ``delay_s``; None if too few."""
     heights = altitude_m[np.isfinite(altitude_m)]
     if len(heights) < MIN_TRACK_SAMPLES:
         return None
@@ -395,7 +397,7 @@ def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFram
 
 
 def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
-    """Velocity of GNSS, and the square of its accuracy as the receiver states it, on each axis."""
+    """Return the GNSS velocity (m/s, NED) and the squared accuracy of the receiver per axis."""
     velocity = gps.reindex(columns=Columns.VELOCITY)
     accuracy = gps.get("speed_accuracy_m_s", np.nan)
     return velocity.assign(**dict.fromkeys(Columns.VELOCITY_VARIANCE, accuracy**2))
@@ -404,11 +406,10 @@ def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
 def read_truth(
     topics: Topics, positions: tuple[PositionTrack, ...], ekf2: Ekf2 | Unavailable
 ) -> Truth | Unavailable:
-    """Simulation ground truth, or motion capture where another track feeds EKF2.
+    """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
-    Some has only latitude and longitude (v1.13 and older); its own first sample is the simulation's
-    home. Where EKF2 fused GNSS, its origin is where its first fix put it, which the simulation's
-    is not: the truth is moved there.
+    Up to v1.13 it has only latitude and longitude. If EKF2 fused GNSS, EKF2's origin differs from
+    that of the simulation, so the ground truth is shifted to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
     logged = topics.read(px4.LAYOUTS["truth_local"])
@@ -426,10 +427,8 @@ def read_truth(
     if captured is None and len(logged):
         return Unavailable(
             "ground truth",
-            (
-                f"{px4.LAYOUTS['truth_local'].topic} has no sample with finite positions and "
-                "velocities below 1e9 m and m/s"
-            ),
+            f"{px4.LAYOUTS['truth_local'].topic} has no sample with finite positions and "
+            "velocities below 1e9 m and m/s",
             "Check the simulation that writes the ground truth.",
         )
     return captured or Unavailable(
@@ -440,7 +439,7 @@ def read_truth(
 
 
 def _move_to_origin(local: pd.DataFrame, global_samples: pd.DataFrame) -> pd.DataFrame:
-    """Local positions about the origin of others of the same path (median of what they differ)."""
+    """Shift local positions to the origin of ``global_samples`` by the median difference."""
     moved_samples = local.copy()
     for column in Columns.POSITION:
         at = np.interp(global_samples.index, local.index, local[column], left=np.nan, right=np.nan)
@@ -450,7 +449,7 @@ def _move_to_origin(local: pd.DataFrame, global_samples: pd.DataFrame) -> pd.Dat
 
 
 def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
-    """Motion capture by its topic as the truth, which it is where another track feeds EKF2."""
+    """Return motion capture as ground truth if external vision exists besides it; else None."""
     if any(track.origin.is_vision for track in positions):
         for track in positions:
             if track.topics[0] == topic:

@@ -1,6 +1,6 @@
-"""What the readers of text tables share: text of bytes, numbers, and errors that name the line.
+"""Functions for text tables: decoding, numbers, and errors that name the line.
 
-Position files, trajectories and pose graphs (g2o) are such tables.
+Used by the readers of position files, trajectories and pose graphs (g2o).
 """
 
 import re
@@ -12,11 +12,11 @@ import numpy as np
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 
-# A UNIX clock that is set lies between 2000 and 2100
+# s; valid UNIX times are between 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# A control character within these says that the file is binary; a NUL does anywhere
+# A file with a control character in this part is binary; NUL is searched in the whole file
 _SNIFFED_CHARS = 100_000
-_UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # a Windows shell's redirection
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks, written by Windows shells
 _CONTROL = re.compile("[\x00-\x08\x0e-\x1b]")
 _NUMBER = re.compile(
     r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
@@ -24,15 +24,15 @@ _NUMBER = re.compile(
 
 
 def decode_text(content: bytes) -> str | None:
-    """Text with line feeds between lines; None where the bytes are no text.
+    """Decode text and convert its line ends to line feeds; None if the content is binary.
 
-    UTF-8, UTF-16 with its mark, or else Latin-1, as in comments of old programs.
+    The encoding is UTF-8, UTF-16 with byte order mark, or otherwise Latin-1.
     """
     if content.startswith(_UTF_16):
         even_bytes = content[: len(content) // 2 * 2]
         text = even_bytes.decode("utf-16", errors="replace")
     else:
-        content = content.rstrip(b"\0\x1a")  # what a power cut, or DOS, leaves at the end
+        content = content.rstrip(b"\0\x1a")  # left at the end by a power loss or by DOS
         try:
             text = content.decode("utf-8-sig")
         except UnicodeDecodeError:
@@ -43,17 +43,17 @@ def decode_text(content: bytes) -> str | None:
 
 
 def is_number(text: str) -> bool:
-    """Whether this is a number with a decimal point, NaN or infinite."""
+    """Return True for a number with a decimal point, NaN or infinity."""
     return _NUMBER.fullmatch(text) is not None
 
 
 def quote(text: str) -> str:
-    """Quote a text of the file, shortened."""
+    """Quote a text from a file, shortened to 40 characters."""
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
 def format_line_error(name: str, number: int, description: str, remedy: str) -> str:
-    """Message on one line of a file.
+    """Format an error message on one line of a file.
 
     >>> format_line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove that line.")
     "uwb.csv, line 7: 'x' is not a number. Correct or remove that line."
@@ -63,32 +63,27 @@ def format_line_error(name: str, number: int, description: str, remedy: str) -> 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a table in a text file, of trajectories and pose graphs.
+    """Rows of a table in a text file.
 
     Attributes
     ----------
     file : str
-        Name of the file, for messages.
+        File name for messages.
     lines : list of (int, str)
-        Their numbers in the file, and what they say.
+        Line number in the file, and text of the line.
     """
 
     file: str
     lines: list[tuple[int, str]] = field(default_factory=list)
 
     def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
-        """Error that names the line of a row."""
+        """Return an error that names the line of a row."""
         return TrajectoryError(
             format_line_error(self.file, self.lines[row][0], description, remedy)
         )
 
     def raise_where(self, bad: BoolArray, description: str, remedy: str) -> None:
-        """Refuse the first row with something bad, shape (n,) or (n, k).
-
-        Raises
-        ------
-        TrajectoryError
-        """
+        """Raise TrajectoryError for the first row in which the mask (n,) or (n, k) is True."""
         bad_places = np.argwhere(bad)
         if len(bad_places):
             raise self.row_error(int(bad_places[0, 0]), description, remedy)
@@ -96,12 +91,12 @@ class Rows:
     def parse(
         self, words: int, values: int, separator: str | None = None
     ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
-        """Columns of words, and behind them columns of numbers; ``#`` begins a remark.
+        """Parse rows with columns of words, then columns of numbers; ``#`` begins a comment.
 
         Parameters
         ----------
         words, values : int
-            How many columns there are of either.
+            Number of columns of each.
         separator : str, optional
             White space by default.
 
@@ -113,7 +108,7 @@ class Rows:
         Raises
         ------
         TrajectoryError
-            Names the first row that has other columns.
+            A row has other columns; the message names the first one.
         """
         texts = [text for _, text in self.lines]
         columns = [("words", "U80", (words,)), ("values", "f8", (values,))]

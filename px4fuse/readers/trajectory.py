@@ -1,9 +1,9 @@
-"""Trajectory files: TUM, EuRoC ground truth and ORB-SLAM3's mixture of both.
+"""Reader of trajectory files: TUM, EuRoC ground truth and ORB-SLAM3.
 
-TUM is ``time tx ty tz qx qy qz qw`` in seconds between blanks (Sturm 2012); EuRoC's ground truth
-is ``time, x, y, z, qw, qx, qy, qz, ...`` in nanoseconds between commas (Burri 2016). ORB-SLAM3's
-``SaveTrajectoryEuRoC`` writes TUM's columns with nanoseconds, and leaves out the frames where it
-was lost. Which one it is shows in the content. Every decision is stated in the notes.
+TUM is ``time tx ty tz qx qy qz qw`` in seconds, separated by blanks (Sturm 2012). EuRoC ground
+truth is ``time, x, y, z, qw, qx, qy, qz, ...`` in nanoseconds, separated by commas (Burri 2016).
+ORB-SLAM3's ``SaveTrajectoryEuRoC`` writes TUM columns with nanoseconds and omits frames without
+tracking. The format is detected from the content and reported in the notes.
 """
 
 import hashlib
@@ -24,24 +24,25 @@ from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 MAX_FILE_BYTES = 500_000_000
 COLUMNS = 8
 MAX_USUAL_STEP_S = 10.0
-EUROC_COLUMNS = (8, 17)  # alone, or with velocity and the biases of gyro and accelerometer
-# A key frame may be a minute from the next, but no frames come at a kHz
+EUROC_COLUMNS = (8, 17)  # pose only, or also velocity and biases of gyro and accelerometer
+# s; key frames may be minutes apart, but frame rates are below 1 kHz
 MAX_INTERVAL_S, MIN_INTERVAL_S = 1000.0, 1e-3
 PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
 MAX_NORM_ERROR = 0.1
-MAX_VALUE = 1e9  # beyond it stands a time stamp, or damage
-UNIT_NORM = 1e-15  # left alone, so that what was written is read back to the last bit
-MAX_REPEATED = 0.01  # share of stamps that repeat; more means that digits are missing
+MAX_VALUE = 1e9  # larger values are timestamps or damage
+UNIT_NORM = 1e-15  # smaller norm errors stay, so that a written file is read back identically
+MAX_REPEATED = 0.01  # fraction of repeated timestamps; more means that digits are missing
 IDENTITY_M, IDENTITY_RAD = 1e-6, 1e-6
-# A level flight: it extends in two directions and hardly in the third, which is near y
+# Level motion: extent (RMS) in the third principal direction over the second, second over first,
+# and tilt of the third direction against y
 MAX_THICKNESS, MIN_WIDTH, MAX_TILT_RAD = 1 / 3, 0.1, math.radians(20.0)
-# Frames come at a rate where so many intervals are this near to the median one
+# A regular frame rate: fraction of intervals, and their relative deviation from the median
 REGULAR_SHARE, REGULAR_WITHIN = 0.9, 0.5
 GAP_INTERVALS, GAP_S = 2.5, 0.3
 
 _TUM = "TUM (time x y z qx qy qz qw)"
-_EUROC = "EuRoC (time, x, y, z, qw, qx, qy, qz between commas)"
-# "q_RS_w []" and "qw" alike
+_EUROC = "EuRoC (time, x, y, z, qw, qx, qy, qz with commas)"
+# Matches "q_RS_w []" and "qw"
 _NAME_OF_AXIS = re.compile(r"\bq(?:\w*_)?([wxyz])\b")
 _TRUTH = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])", re.IGNORECASE)
 _REMEDY = f"Export the trajectory as {_TUM}, in seconds."
@@ -53,21 +54,20 @@ def read_trajectory(path: str | Path) -> Trajectory:
     Parameters
     ----------
     path : str or Path
-        TUM, EuRoC ground truth, or what ORB-SLAM3 saves; recognised by content.
+        File in the format of TUM, EuRoC ground truth or ORB-SLAM3.
 
     Returns
     -------
     Trajectory
-        ``time_s`` in the file's own stamps as seconds. ``kind`` is "truth" where comments or name
-        say so (or the columns are those of EuRoC's ground truth), "slam" where the first pose is
-        the identity. ``frame`` is "camera" where the world is such a first pose and the motion is
-        level with y vertical.
+        ``time_s`` are the timestamps of the file in s. ``kind`` is "truth" if a comment, the file
+        name or the EuRoC columns indicate ground truth, and "slam" if the first pose is the
+        identity. ``frame`` is "camera" for "slam" with level motion and vertical y.
 
     Raises
     ------
     TrajectoryError
-        The file cannot be read or is no trajectory, has fewer than three poses, stamps that go
-        back, numbers that are not finite, or quaternions that are far from unit length.
+        The file cannot be read or is not a trajectory, has fewer than three poses, timestamps that
+        go back, numbers that are not finite, or quaternions without unit length.
     """
     path = Path(path)
     name = display_name(path)
@@ -80,14 +80,14 @@ def read_trajectory(path: str | Path) -> Trajectory:
     if columns not in ((COLUMNS,) if separator is None else EUROC_COLUMNS):
         raise rows.row_error(
             0,
-            f"{columns} columns; TUM has {COLUMNS} between blanks, EuRoC {EUROC_COLUMNS[0]} or "
-            f"{EUROC_COLUMNS[1]} between commas",
+            f"{columns} columns; TUM has {COLUMNS} separated by blanks, EuRoC {EUROC_COLUMNS[0]} "
+            f"or {EUROC_COLUMNS[1]} separated by commas",
             _REMEDY,
         )
     w_first, words = _quaternion_order(rows, separator, comments)
     stamps, values = rows.parse(1, columns - 1, separator)
     time, time_words = _stamps_in_seconds(rows, stamps[:, 0].tolist())
-    problem = f"a value that is not finite, or beyond {MAX_VALUE:.0e}"
+    problem = f"a value is not finite, or above {MAX_VALUE:.0e}"
     rows.raise_where(~(np.abs(values[:, :7]) < MAX_VALUE), problem, "Remove that line.")
     position, rotation = values[:, :3], _read_rotation(rows, values[:, 3:7], w_first)
     keep, dropped = _increasing_rows(rows, time)
@@ -95,7 +95,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     kind, kind_words = _detect_kind(path, columns, comments, position, rotation)
     frame, frame_words = _detect_frame(kind, position)
     is_unix = UNIX_START_S <= time[0] < UNIX_END_S
-    clock = "its stamps are UNIX time" if is_unix else "its clock is its own, not UNIX time"
+    clock = "its timestamps are UNIX time" if is_unix else "its timestamps are not UNIX time"
     reader_notes = (
         f"Recognised as {words}; {clock}.",
         time_words,
@@ -120,24 +120,21 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 
 def tum_text(trajectory: Trajectory) -> str:
-    """Text of a TUM file: ``time tx ty tz qx qy qz qw`` with every digit.
+    """Return the trajectory as the text of a TUM file, with all digits.
 
     Parameters
     ----------
     trajectory : Trajectory
-        With orientation. Stamps are written as UNIX time where ``unix_offset_s`` is known.
+        Trajectory with orientation. Timestamps are UNIX time if ``unix_offset_s`` is known.
 
     Raises
     ------
     TrajectoryError
-        It has no orientation, which the format demands.
+        The trajectory has no orientation, which the format requires.
     """
     if trajectory.rotation is None:
         raise TrajectoryError(
-            (
-                f"{trajectory.name}: a TUM file needs orientations, but this track has "
-                "positions only."
-            ),
+            f"{trajectory.name}: a TUM file needs orientations, but this track has positions only",
             "Choose a track with orientation.",
         )
     time = trajectory.time_s + (trajectory.unix_offset_s or 0.0)
@@ -147,39 +144,37 @@ def tum_text(trajectory: Trajectory) -> str:
 
 
 def _rows(name: str, content: bytes) -> tuple[Rows, str, str]:
-    """Rows of numbers, comments and header in one text, and the words on a row that is cut."""
+    """Return rows of numbers, comments with header, and a note on an incomplete last row."""
     text = decode_text(content)
     if text is None:
         is_ulog = content.startswith(b"ULog")
         what = "a PX4 log" if is_ulog else "a binary file"
-        remedy = f"Name a part of the log: {name}:vio or {name}:ekf2." if is_ulog else _REMEDY
+        remedy = f"Choose a track of the log: {name}:vio or {name}:ekf2." if is_ulog else _REMEDY
         raise TrajectoryError(f"{name}: {what}, not a trajectory file", remedy)
     lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     comments = [line for _, line in lines if line.lstrip().startswith("#")]
     data = [row for row in lines if not row[1].lstrip().startswith("#")]
     if len(data) > 1 and not _is_numeric_row(data[0][1]) and _is_numeric_row(data[1][1]):
-        comments.append(data.pop(0)[1])  # a header that is no comment
+        comments.append(data.pop(0)[1])  # header without #
     if data and not _is_numeric_row(data[0][1]):
         what = f"not a trajectory file: its first line is {quote(data[0][1])}"
         raise TrajectoryError(f"{name}: {what}", _REMEDY)
     truncation_note = ""
     is_short = len(data) > 1 and len(_fields(data[-1][1])) < len(_fields(data[0][1]))
     if is_short and not text.endswith("\n"):
-        truncation_note = f"Line {data[-1][0]}, the last one, was dropped: it is cut."
+        truncation_note = f"The last line ({data[-1][0]}) was dropped: it is incomplete."
         data.pop()
     if len(data) < MIN_POSES:
         raise TrajectoryError(
-            (
-                f"{name} contains {len(data)} poses; at least {MIN_POSES} are needed. Export "
-                "the trajectory again."
-            ),
-            "The file is almost empty if SLAM lost tracking at the start.",
+            f"{name} contains {len(data)} poses; at least {MIN_POSES} are needed",
+            "Export the trajectory again. The file is almost empty if SLAM lost tracking at the "
+            "start.",
         )
     return Rows(name, data), "\n".join(comments), truncation_note
 
 
 def _fields(line: str) -> list[str]:
-    """Fields of a row, between commas where there are any."""
+    """Split a row at commas, or at blanks if it has no comma."""
     line = line.partition("#")[0]
     return line.split("," if "," in line else None)
 
@@ -189,9 +184,9 @@ def _is_numeric_row(line: str) -> bool:
 
 
 def _quaternion_order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]:
-    """Whether the quaternion's w comes first, and what such a table is called.
+    """Return True if w is the first quaternion component, and the name of the format.
 
-    Without a header, blanks mean TUM, and commas with nanoseconds EuRoC.
+    Without a header, blanks mean TUM, and commas with UNIX time in nanoseconds mean EuRoC.
     """
     order = "".join(_NAME_OF_AXIS.findall(comments.casefold())[-4:])
     w_first = order == "wxyz"
@@ -202,56 +197,57 @@ def _quaternion_order(rows: Rows, separator: str | None, comments: str) -> tuple
         if not w_first:
             raise rows.row_error(
                 0,
-                "the place of the quaternion's w is not known, as no header names it",
+                "the position of the quaternion's w is unknown: the header does not name it",
                 "Add the line '#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z' with the columns in "
                 "their order.",
             )
     if w_first == (separator is not None):
         return w_first, _EUROC if w_first else _TUM
-    between = "blanks, quaternion w first" if w_first else "commas, quaternion w last"
-    return w_first, f"columns between {between}, by its header"
+    order = "blanks, quaternion w first" if w_first else "commas, quaternion w last"
+    return w_first, f"columns separated by {order}, according to the header"
 
 
 def _stamps_in_seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
-    """Stamps in seconds, and the words on their unit where it is not seconds."""
+    """Convert the timestamps to s; return also a note if their unit is not seconds."""
     bad = np.array([not is_number(one.strip()) or not np.isfinite(float(one)) for one in stamps])
     rows.raise_where(bad, "column 1 is not a time", "Correct or remove that line.")
     values = np.array(stamps, dtype=np.float64)
     step = float(np.median(np.abs(np.diff(values))))
     if step <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
-        interval_question = (
-            f"Poses are {step:.0f} s apart, read as seconds: are the stamps in milliseconds?"
+        interval_note = (
+            f"The timestamps are read as seconds, with an interval of {step:.0f} s. Check that "
+            "they are not milliseconds."
         )
-        return values, interval_question if step >= MAX_USUAL_STEP_S else ""
+        return values, interval_note if step >= MAX_USUAL_STEP_S else ""
     for unit, per_second in PER_SECOND.items():
         first, last = float(values[0]) / per_second, float(np.abs(values).max()) / per_second
-        # on a clock of its own only ORB-SLAM3's nanoseconds are known to occur
+        # Times that are not UNIX times are known in nanoseconds only (ORB-SLAM3)
         is_known = first >= UNIX_START_S or unit == "nanoseconds"
         if is_known and last < UNIX_END_S and MIN_INTERVAL_S <= step / per_second <= MAX_INTERVAL_S:
             ticks = np.array([int(Decimal(stamp)) for stamp in stamps], dtype=np.int64)
-            words = f"Its stamps are {unit} and were divided by {per_second:.0e}."
-            # in two parts, as float64 does not hold the digits of UNIX time in ns
+            words = f"Its timestamps are {unit} and were divided by {per_second:.0e}."
+            # Divided in two parts, because float64 cannot represent UNIX time in ns
             return ticks // per_second + ticks % per_second / per_second, words
     raise TrajectoryError(
-        (
-            f"{rows.file}: the timestamps have a median spacing of {step:.3g}, not a "
-            "valid interval in seconds or nanoseconds."
-        ),
+        f"{rows.file}: the median interval of the timestamps, {step:.3g}, is not valid in any unit "
+        "from seconds to nanoseconds",
         "Give timestamps in seconds.",
     )
 
 
 def _increasing_rows(rows: Rows, time: Array) -> tuple[BoolArray, str]:
-    """Rows whose stamps increase: of those that repeat the first, and the words on the others."""
+    """Return a mask without repeated timestamps, and a note on the dropped rows."""
     steps = np.diff(time, prepend=-np.inf)
     remedy = "Sort the lines by time, or separate the recordings."
-    rows.raise_where(steps < 0.0, "its time is before that of the line above", remedy)
+    rows.raise_where(steps < 0.0, "its timestamp is before that of the line above", remedy)
     repeated = int((steps == 0.0).sum())
     if repeated > MAX_REPEATED * len(steps):
-        what = f"its time is that of the line above, as in {repeated} of {len(steps)} lines"
-        remedy = "Export the stamps with all their digits (%.9f)."
+        what = (
+            f"its timestamp equals that of the line above, as in {repeated} of {len(steps)} lines"
+        )
+        remedy = "Export the timestamps with all digits (%.9f)."
         rows.raise_where(steps == 0.0, what, remedy)
-    note = f"Dropped poses with the stamp of the one before: {repeated}." if repeated else ""
+    note = f"Dropped poses with a repeated timestamp: {repeated}." if repeated else ""
     return steps > 0.0, note
 
 
@@ -268,22 +264,22 @@ def _read_rotation(rows: Rows, quaternion: Array, w_first: bool) -> Rotation:
 def _detect_kind(
     path: Path, columns: int, comments: str, position: Array, rotation: Rotation
 ) -> tuple[Kind, str]:
-    """What made it, and the words on that."""
+    """Return the kind of trajectory and the reason."""
     if columns == EUROC_COLUMNS[1]:
-        return "truth", "Ground truth, as its 17 columns are those of EuRoC's."
-    # EuRoC's file is called data.csv; its folder says what it is
+        return "truth", "Ground truth: it has the 17 columns of EuRoC ground truth."
+    # In EuRoC the file name is always data.csv, and the folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
-    text_by_source = {"comments say": comments, "name says": path.name, "folder says": folder}
-    for words, text in text_by_source.items():
+    text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
+    for source, text in text_by_source.items():
         if _TRUTH.search(text):
-            return "truth", f"Ground truth, as its {words}."
+            return "truth", f"Ground truth, according to {source}."
     if np.abs(position[0]).max() < IDENTITY_M and rotation[0].magnitude() < IDENTITY_RAD:
-        return "slam", "SLAM, as its first pose is the identity: its world is its first key frame."
+        return "slam", "SLAM: the first pose is the identity, so the world is the first key frame."
     return "unknown", ""
 
 
 def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
-    """Axes of the world, and the words on them."""
+    """Return the axes of the world frame and the reason."""
     if kind != "slam":
         return "unknown", ""
     centred = position - position.mean(axis=0)
@@ -295,21 +291,19 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
         return "unknown", ""
     return "camera", (
         "Camera frame (x right, y down, z forward): the motion is level, "
-        f"{thin:.2g} m against {width:.2g} and {length:.2g} m (RMS), and what is vertical is "
+        f"with an extent of {length:.2g}, {width:.2g} and {thin:.2g} m (RMS). Its vertical is "
         f"{math.degrees(tilt):.0f}° from y."
     )
 
 
 def _gap_words(time: Array, kind: Kind) -> str:
-    """Words on missing frames, or on poses that are key frames."""
+    """Return a note on missing frames or on an irregular rate (key frames); "" if none."""
     steps = np.diff(time)
     median = float(np.median(steps))
     near: BoolArray = np.abs(steps - median) <= REGULAR_WITHIN * median
     if near.mean() < REGULAR_SHARE:
-        format_interval = f"every {median:.3g} s in the median, {steps.max():.3g} s apart at most"
-        return (
-            f"Poses come at no rate ({format_interval}): key frames, or a recording that lost many."
-        )
+        interval = f"interval {median:.3g} s (median), {steps.max():.3g} s (maximum)"
+        return f"Poses have no regular rate ({interval}): key frames only, or many poses lost."
     gaps = np.flatnonzero(steps > max(GAP_INTERVALS * median, GAP_S))
     if not len(gaps):
         return ""
@@ -318,5 +312,5 @@ def _gap_words(time: Array, kind: Kind) -> str:
     longest = time[gaps[np.argmax(lost)]] - time[0]
     what = "Tracking lost" if kind == "slam" else "No poses"
     several = f"in {len(gaps)} gaps, the longest " if len(gaps) > 1 else ""
-    where = f"{several}at {longest:.1f} s after its start"
+    where = f"{several}at {longest:.1f} s after the start"
     return f"{what} for {lost.sum():.1f} s {where}, {missing} frames missing."

@@ -1,4 +1,4 @@
-"""PX4 ULog to :class:`~px4fuse.flight.Flight`, for PX4 v1.9 to today."""
+"""Reader of PX4 ULog files, PX4 v1.9 and newer; returns a flight."""
 
 import numpy as np
 import pandas as pd
@@ -15,25 +15,25 @@ from px4fuse.readers.ulog_topics import Topics, dropped_note, longest_increasing
 from px4fuse.recording import Unused
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# Longer steps between IMU samples count as missing (s)
+# s; longer intervals between IMU samples count as missing data
 IMU_GAP_S = 0.2
-# A receiver's UTC outside these is not valid: PX4's own GPS_EPOCH_SECS (gps_helper.h), and 2100
+# s; valid UTC of a receiver: PX4's GPS_EPOCH_SECS (gps_helper.h) to 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
 def read_ulog(name: str, content: bytes) -> Flight:
-    """Read a PX4 ULog of this name.
+    """Read the content of a PX4 ULog file.
 
     Raises
     ------
     LogError
-        It is no ULog, or holds no usable data.
+        The content is not a ULog, or contains no usable data.
     """
     topics = read_topics(name, content)
-    remedy = "Check that the logger ran while the sensors did."
+    remedy = "Check that the sensors were running during logging."
     imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU, remedy)
     logged = parts.with_attitude(topics.read(px4.LAYOUTS["attitude"]))
-    remedy = "Check that the estimator ran while the logger did."
+    remedy = "Check that the estimator was running during logging."
     attitude = _require_samples(topics, logged, "attitude", px4.LAYOUTS["attitude"], remedy)
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
@@ -75,23 +75,23 @@ def read_ulog(name: str, content: bytes) -> Flight:
 
 
 def _damage(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> tuple[str, ...]:
-    """Sentences about the missing parts of the file."""
+    """Return sentences about missing parts of the file."""
     end_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_cut:
         damage_sentences.append(parts.format_truncation("message", end_s, in_flight))
     if topics.is_damaged:
-        missing = "the IMU is missing"
+        missing = "all IMU data are missing"
         if not isinstance(imu, Unavailable):
             steps_s = np.diff(imu.index.to_numpy())
             missing_s = float(steps_s[steps_s > IMU_GAP_S].sum())
-            missing = f"{missing_s:.1f} s of the IMU are missing before the end at {end_s:.1f} s"
+            missing = f"{missing_s:.1f} s of {end_s:.1f} s of IMU data are missing"
         damage_sentences.append(f"the file is damaged: {missing}; invalid messages were skipped")
     return tuple(damage_sentences)
 
 
 def _start_unix(topics: Topics) -> float | None:
-    """UNIX time (s) of time zero by the GPS receiver, the median over its fixes."""
+    """Return the UNIX time (s) of time zero: the median over the fixes of the GPS receiver."""
     gps = topics.read(*px4.layouts_of_track(px4.GPS_POSITION))
     if "utc_us" not in gps:
         return None
@@ -105,12 +105,12 @@ def _start_unix(topics: Topics) -> float | None:
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, what: str, layout: Layout, remedy: str
 ) -> pd.DataFrame | Unavailable:
-    """The usable samples of a topic, or why there are none."""
+    """Return the samples and record their topic; unavailable if fewer than two."""
     topic = layout.topic
     if topics.find(layout) is None:
-        return Unavailable(what, f"no topic {topic}", px4.DEFAULT_PROFILE)
+        return Unavailable(what, f"{topic} is not logged", px4.DEFAULT_PROFILE)
     if len(samples) < 2:
-        return Unavailable(what, f"{topic} holds {len(samples)} usable samples", remedy)
+        return Unavailable(what, f"{topic} contains only {len(samples)} usable samples", remedy)
     topics.record_stream(what.lower(), topic)
     return samples
 
@@ -128,7 +128,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
-    """Stretches of flight by the land detector, each from take-off to touch-down."""
+    """Read the intervals (s) from take-off to touch-down, as the land detector reports them."""
     detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
     if detected.empty:
         return Unavailable(
@@ -141,7 +141,7 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
 
 
 def _read_tumbled(topics: Topics) -> tuple[tuple[float, float], ...]:
-    """Stretches in which PX4's failure detector finds roll or pitch beyond their limits."""
+    """Read the intervals (s) in which PX4's failure detector reports roll or pitch."""
     upright = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
     return parts.flight_spans(upright, topics.log.duration_s)
 

@@ -1,7 +1,7 @@
-"""ULog file to topic tables on one clean clock: everything that touches pyulog.
+"""Topic tables of a ULog file with valid timestamps; the only module that uses pyulog.
 
-pyulog does the parsing; this module decides what of it can be trusted. Time stamps that are zero,
-go back or jump hours away exist in real logs, and so do topics that were subscribed to twice.
+pyulog parses the file. This module removes invalid samples: real logs contain timestamps that are
+zero, go back or jump by hours, and topics with two subscriptions.
 """
 
 import contextlib
@@ -30,20 +30,20 @@ from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 from px4fuse.recording import Dropout, LogInfo, Stream
 
 _MICROSECOND = 1e-6
-# A measurement time stamp further than this from its publication is not on the boot clock
-# (GPS topics before v1.16 carry receiver time, ground truth of v1.13 carries 0).
+# s; a measurement time further than this from publication is not boot time (GPS topics before
+# v1.16 have receiver time, ground truth in v1.13 has 0)
 MAX_PUBLICATION_LAG_S = 10.0
-# Samples outside the data window by more than this are stale leftovers of an earlier boot phase.
+# s; samples this far outside the data span are left over from before
 WINDOW_MARGIN_S = 2.0
 RELEASE = 255
-# An info message in which a log says of itself what whoever reads it must know
+# Info message with a note of the log's author to its users
 NOTE_KEY = "px4fuse_note"
-# A gap longer than this in the IMU's stamps is no dropout: what lies beyond is another boot.
+# s; after a longer gap of the IMU timestamps the samples are from another boot
 MAX_DATA_GAP_S = 600.0
-# Fields of all subscriptions together, about 300 bytes of memory each; real logs have up to 3,300
+# Limit on the fields of all subscriptions, 300 bytes of memory each; real logs have up to 3,300
 MAX_FIELDS = 200_000
 HEADER_BYTES = 3
-# pyulog reads damaged bytes as messages; these are the exceptions that this can raise
+# Exceptions that pyulog may raise when it parses damaged bytes as messages
 _PARSE_ERRORS = (
     ULogException,
     struct.error,
@@ -61,24 +61,24 @@ _PARSE_ERRORS = (
 )
 
 
-# Primary EKF2 instance from each time on
+# (start time in s, primary EKF2 instance from then on)
 Instances = tuple[tuple[float, int], ...]
-# One EKF2 instance alone publishes no selector
+# Without the selector topic there is one EKF2 instance
 NO_SELECTOR: Instances = ((-np.inf, 0),)
 
 
 class _Content(io.BytesIO):
     """Content of a ULog; counts the bytes that pyulog skips.
 
-    pyulog reads a header of 3 bytes, then the message. It moves on by one byte, or to the next
-    synchronisation message, where the header is invalid.
+    pyulog reads a header of 3 bytes, then the message. After an invalid header it advances by one
+    byte, or to the next synchronisation message.
 
     Attributes
     ----------
     skipped_bytes : int
     start, end, position : int
-        Offsets of the last header, of the end of the last read, and of the next one. The last two
-        can be beyond the end of the file.
+        Offsets of the last header, of the end of the last read, and of the next read. The last two
+        may be after the end of the file.
     """
 
     skipped_bytes = start = end = position = 0
@@ -93,8 +93,8 @@ class _Content(io.BytesIO):
         return io.BytesIO.read(self, size)
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        # pyulog moves back by the length it asked for: without this it never ends where a damaged
-        # definition is longer than the rest of the file
+        # pyulog moves back by the requested length, which may exceed the rest of a damaged file.
+        # The virtual position prevents an endless loop
         if whence == io.SEEK_CUR:
             offset += self.position
         self.position = super().seek(offset)
@@ -102,9 +102,9 @@ class _Content(io.BytesIO):
 
 
 def _skip_if_short(read: Callable[..., Any]) -> Callable[..., Any]:
-    """Raise ValueError where a message is too short for its kind.
+    """Decorate a parser to raise ValueError instead of struct.error for short messages.
 
-    pyulog skips such a message. At struct.error it takes the end of the file as reached.
+    pyulog skips a message after ValueError, but stops reading the file after struct.error.
     """
 
     def checked(*arguments: Any, **named: Any) -> Any:
@@ -121,9 +121,9 @@ class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no ty
 
 
 class _Reader(ULog):  # type: ignore[misc]
-    """pyulog that loses less of a damaged file, with a limit on the fields of all subscriptions.
+    """pyulog reader with better recovery from damage and a limit on the number of fields.
 
-    A format of 20 bytes can declare 65,535 fields, and nested formats multiply.
+    A format of 20 bytes can declare 65,535 fields, and nested formats multiply the number.
     """
 
     fields = 0
@@ -135,7 +135,7 @@ class _Reader(ULog):  # type: ignore[misc]
     MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
 
     def _check_packet_corruption(self, header: Any) -> bool:
-        # pyulog skips up to 10,000 bytes as a message of a later PX4; its kind is a capital letter
+        # pyulog accepts any unknown message type up to 10,000 bytes; valid types are capital letters
         is_corrupt: bool = super()._check_packet_corruption(header)
         if not ord("A") <= header.msg_type <= ord("Z"):
             self._file_corrupt = is_corrupt = True
@@ -158,26 +158,26 @@ class _Reader(ULog):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class Topics:
-    """The decoded topics of one log.
+    """Decoded topics of one log.
 
     Attributes
     ----------
     log : LogInfo
-        Without notes on single topics; see :attr:`dropped`.
+        Log description, without notes on single topics (see :attr:`dropped`).
     tables : mapping from (topic, instance) to mapping from PX4 field name to array
     zero_us : int
         Boot time of time zero in µs.
     dropped : dict
-        Samples dropped for an impossible time stamp, by topic and instance; :meth:`frame` fills
-        it.
+        Samples dropped because of an invalid timestamp, by topic and instance; filled by
+        :meth:`frame`.
     ekf2_parameters : mapping
-        Every EKF2_ parameter, by PX4 name; ``log`` holds only those that enter the results.
+        All EKF2_ parameters by PX4 name; ``log`` contains only those used in results.
     is_cut : bool
-        The file ends inside a message.
+        True if the file ends within a message.
     is_damaged : bool
-        pyulog skipped invalid bytes or messages.
+        True if pyulog skipped invalid bytes or messages.
     streams : dict
-        Where each part of the flight came from; :meth:`record_stream` fills it.
+        Source of each part of the flight; filled by :meth:`record_stream`.
     """
 
     log: LogInfo
@@ -190,11 +190,11 @@ class Topics:
     streams: dict[str, Stream] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
-        """Instances of a topic that hold data, in order."""
+        """Return the sorted instance numbers of a topic with data."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
     def of(self, topic: str) -> list[dict[str, NDArray[Any]]]:
-        """Tables of a topic's instances, in order."""
+        """Return the tables of a topic's instances, in order."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
     @cached_property
@@ -209,7 +209,7 @@ class Topics:
         return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """First layout that this log holds, or None."""
+        """Return the first layout whose fields are in the log, or None."""
         for layout in layouts:
             if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
                 return layout
@@ -221,11 +221,11 @@ class Topics:
         Parameters
         ----------
         layout : Layout
-            Must be one that :meth:`find` returned.
+            A layout that :meth:`find` returned.
         instance : int
-            Topic instance; the lowest that exists is taken where this one does not.
+            Topic instance; if it does not exist, the lowest one is read.
         step : bool
-            Whether the topic is a step function, whose stale first sample still holds.
+            True for a step function, in which samples before time zero remain valid.
 
         Returns
         -------
@@ -253,13 +253,12 @@ class Topics:
                 },
                 index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
-        frame = frame.where(np.abs(frame) < IMPOSSIBLE)  # such a value is as unusable as NaN
-        # what lies outside the span of the data by more than the margin is dropped
+        frame = frame.where(np.abs(frame) < IMPOSSIBLE)  # damaged values become NaN
         end = self.log.duration_s + WINDOW_MARGIN_S
         return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """:meth:`frame` of the first layout that this log holds; empty where it holds none."""
+        """Read the first layout in the log as in :meth:`frame`; empty if none is."""
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.frame(layout, step=step)
 
@@ -270,16 +269,16 @@ class Topics:
         step: bool = False,
         select: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
     ) -> pd.DataFrame:
-        """Rows of each instance of a topic of EKF2 from when that instance was the primary one.
+        """Read an EKF2 topic from the instance that was primary at each time.
 
-        Empty where the log does not hold the layout.
+        The frame is empty if the layout is not in the log.
 
         Parameters
         ----------
         layout, step
-            As :meth:`frame` takes them.
+            As in :meth:`frame`.
         select : callable, optional
-            Which rows of an instance count; all by default.
+            Filter for the rows of each instance; by default all rows are used.
         """
         if self.find(layout) is None:
             return _empty_frame(layout)
@@ -296,8 +295,8 @@ class Topics:
         return joined_frames[~joined_frames.index.duplicated()]
 
     def record_stream(self, part: str, *topics: str) -> None:
-        """Note where a part of the flight came from, and which moment its times are."""
-        # of sensor_combined the stamp is the gyro's, to which the accelerometer's offset is added
+        """Record the source of a part of the flight, with measurement or publication time."""
+        # The timestamp of sensor_combined is the gyro's measurement time
         measured = part == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
             for table in self.of(topics[0])
@@ -307,15 +306,15 @@ class Topics:
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:
-    """What a log without a topic has of it."""
+    """Return an empty frame with the columns of a layout."""
     times = pd.Index([], dtype=np.float64, name="time_s")
     return pd.DataFrame(columns=list(layout.columns), index=times, dtype=np.float64)
 
 
 def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
-    """Time of measurement in µs: ``timestamp_sample`` where it is on the boot clock.
+    """Return the measurement time (µs): ``timestamp_sample`` if it is boot time.
 
-    Publication (``timestamp``) is up to 0.2 s later in EKF2's own topics.
+    Otherwise it is the publication time, ``timestamp``, which is up to 0.2 s later in EKF2 topics.
     """
     published = table["timestamp"].astype(np.int64)
     sampled = table.get("timestamp_sample")
@@ -323,7 +322,7 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
         return published
     sampled = sampled.astype(np.int64)
     lag_s = np.abs(published - sampled) * _MICROSECOND
-    # where only the first message predates its measurement stamp, keep publication for that one
+    # Single invalid measurement times, such as in the first message, are replaced by publication
     plausible = (sampled > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
     if np.count_nonzero(plausible) * 2 < len(plausible):
         return published
@@ -331,17 +330,17 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
 
 
 def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
-    """Indices of the longest strictly increasing run of positive time stamps.
+    """Return the indices of the longest strictly increasing subsequence of positive timestamps.
 
-    A stamp hours ahead must cost one sample, not all that follow it, so the longest increasing
-    subsequence is kept (patience sorting, Fredman 1975) instead of a running maximum.
+    A timestamp hours ahead then costs one sample, while a running maximum would drop all later
+    ones. Patience sorting, Fredman 1975.
     """
     indices = np.flatnonzero(time_us > 0)
     stamps = time_us[indices]
     if len(stamps) < 2 or np.all(np.diff(stamps) > 0):
         return indices
-    tails: list[int] = []  # smallest last stamp of an increasing run of each length
-    tail_at: list[int] = []  # where that stamp stands
+    tails: list[int] = []  # smallest last timestamp of an increasing subsequence of each length
+    tail_at: list[int] = []  # index of that timestamp
     previous = np.empty(len(stamps), dtype=np.intp)
     for at, stamp in enumerate(stamps.tolist()):
         length = bisect_left(tails, stamp)
@@ -357,31 +356,31 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
 
 
 def dropped_note(count: int, name: str, why: str) -> str:
-    """What a log's notes say of samples whose time stamps cannot be.
+    """Format the note on samples that were dropped because of invalid timestamps.
 
     >>> dropped_note(1, "ATTITUDE", "zero")
-    '1 sample of ATTITUDE was dropped: its time stamp is zero'
+    '1 sample of ATTITUDE was dropped: its timestamp is zero'
     """
     if count == 1:
-        why = why.replace("go back", "goes back").replace("lie ", "lies ")
-        return f"1 sample of {name} was dropped: its time stamp is {why}"
-    return f"{count} samples of {name} were dropped: their time stamps are {why}"
+        why = why.replace("go back", "goes back").replace("are outside", "is outside")
+        return f"1 sample of {name} was dropped: its timestamp is {why}"
+    return f"{count} samples of {name} were dropped: their timestamps are {why}"
 
 
 def read_topics(name: str, content: bytes) -> Topics:
-    """Decode the topics that px4fuse uses, of a log of this name.
+    """Decode the topics of a ULog that px4fuse uses.
 
     Raises
     ------
     LogError
-        It is no ULog, or holds no data with usable time stamps.
+        The content is not a ULog, or contains no data with valid timestamps.
     """
     source, size = _Content(content), len(content)
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints its warnings
             ulog = _Reader(source, message_name_filter_list=topics())
             tables = _tables(ulog)
-            # a log of other topics can still be placed in time, by all that it holds
+            # Without topics that px4fuse uses, all other topics give the duration of the log
             time_tables = tables or _tables(_Reader(_Content(content)))
     except _PARSE_ERRORS as error:
         raise LogError(
@@ -391,15 +390,12 @@ def read_topics(name: str, content: bytes) -> Topics:
     notes: tuple[str, ...] = ()
     if not time_tables:
         raise LogError(
-            (
-                f"{name}: this ULog contains no data (no IMU, no position, no EKF2). If it "
-                "was cut off, copy it again."
-            ),
-            "Otherwise record with SDLOG_PROFILE 129.",
+            f"{name}: this ULog contains no data (no IMU, no position, no EKF2)",
+            "If it was cut off, copy it again. Otherwise record with SDLOG_PROFILE 129.",
         )
     if not tables:
         names = sorted({topic for topic, _ in time_tables})
-        notes += (f"none of its topics is one that px4fuse uses (it holds {join_first(names, 5)})",)
+        notes += (f"px4fuse uses none of the topics in this log ({join_first(names, 5)})",)
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(time_tables, name)
@@ -438,7 +434,7 @@ def read_topics(name: str, content: bytes) -> Topics:
 
 
 def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
-    """Topic tables; a topic that was subscribed to twice is joined on its common fields."""
+    """Return the topic tables; two subscriptions to a topic are joined on their common fields."""
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
     for data in ulog.data_list:
         if "timestamp" not in data.data:
@@ -457,26 +453,23 @@ def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
 def _data_span(
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]], name: str
 ) -> tuple[int, int]:
-    """First and last time (µs) of the IMU, or else of the topic with most samples."""
+    """Return the first and last time (µs) of the IMU, or else of the topic with most samples."""
     for key in sorted(tables, key=lambda of: (of[0] != IMU.topic, -len(tables[of]["timestamp"]))):
         time_us = tables[key]["timestamp"].astype(np.int64)
         increasing_us = time_us[longest_increasing_run(time_us)]
         if len(increasing_us):
-            # a stamp hours away from the others is a leftover: the longest stretch counts
+            # Timestamps hours away from the others are leftovers, so the longest interval is used
             breaks = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND) + 1
             stretch = max(np.split(increasing_us, breaks), key=len)
             return int(stretch[0]), int(stretch[-1])
     raise LogError(
-        (
-            f"{name}: all timestamps are zero, so the data have no time. The logger "
-            "started before the clock."
-        ),
-        "Record again.",
+        f"{name}: all timestamps are zero, so the data have no time",
+        "The logger started before the clock. Record again.",
     )
 
 
 def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
-    """A text from the log, without a terminal's control characters."""
+    """Return a text from the log without control characters, which could affect a terminal."""
     text = str(info.get(key, otherwise))
     return "".join(c for c in text if c.isprintable()) or otherwise
 
