@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-MAX_TEXT = 60  # characters
+MAX_TEXT = 60  # characters; a longer text is cut
 
 
 def one_line_repr(result: Any) -> str:

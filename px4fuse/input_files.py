@@ -25,7 +25,7 @@ class _Register:
 
     read: set[_Identity] = field(default_factory=set)
     containing: dict[_Identity, Path] = field(default_factory=dict)
-    entered: set[Path] = field(default_factory=set)  # folders whose parents are in containing
+    entered: set[Path] = field(default_factory=set)  # folders whose parents are in `containing`
 
 
 _register: ContextVar[_Register | None] = ContextVar("register", default=None)

@@ -70,7 +70,7 @@ def capitalise_first(text: str) -> str:
 
 
 def join_first(names: Sequence[str], most: int, between: str = ", ") -> str:
-    """Join the first names and append the number of the others.
+    """Join the first ``most`` names, and append the number of the others.
 
     >>> join_first("abcd", 2), join_first("ab", 2)
     ('a, b and 2 more', 'a, b')

@@ -1,4 +1,4 @@
-"""Runs that aim outputs at inputs: by path, link, folder and letters, over all commands."""
+"""Commands whose output is one of their inputs: by path, link, folder or other spelling."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ulog_tools import make_log
 from px4fuse.answers import form_text
 from px4fuse.assignment.key import AnswerKey, key_text
 
-# Command, the files that it reads, its options for one file with the ending that they require, and
-# the names that it writes into the folder of -o: "" for the folder itself
+# Command, its inputs, its options for an output file (with the required ending), and the names that
+# it writes to the folder of -o ("" for the folder itself)
 RUNS = [
     ("compare l.ulg --mavlink m.tlog", "l.ulg m.tlog", "--json -o.pdf", None),
     ("compare l.ulg --position pos.csv", "l.ulg pos.csv", "--json -o.pdf", None),
@@ -56,7 +56,7 @@ PATHS = ("typed", "relative", "absolute", "link", "link to link", "hard link", "
 
 
 def made_desk(folder: Path) -> Path:
-    """Every kind of input; a folder per kind of table."""
+    """Write all types of inputs to a folder, each type of table to a subfolder."""
     log = make_log("v1.16", 20.0).encode()
     report = report_of("Ada", "1")
     for name, content in {

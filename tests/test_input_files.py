@@ -97,7 +97,7 @@ def test_compare_keeps_its_answer_form(tmp_path, monkeypatch) -> None:
     done("answers", "l.ulg", "-o", "form.toml")
     before = hashed(tmp_path)
     command = "compare l.ulg --answers form.toml --json form.toml"
-    assert refused(*command.split()).startswith("form.toml: is an input of this command")
+    assert refused(*command.split()).startswith("form.toml is an input of this command")
     assert hashed(tmp_path) == before
 
 

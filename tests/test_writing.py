@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -117,7 +118,7 @@ def test_write_dev_stdout_appends_to_redirected_file(desk) -> None:
         assert process.communicate()[1] == b""
     text = out.read_bytes()
     assert text.startswith(b"before\n{")
-    assert b"What px4fuse can do with it" in text  # the table follows
+    assert b"possible analysis" in text  # the table follows
 
 
 # --- each file complete or not at all ---
@@ -288,8 +289,8 @@ def test_compare_name_without_font_warns_before_report(
     run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())
     fonts.font_of.cache_clear()
     (before,) = warnings
-    assert (f"No font of this machine has the characters {name}" in before) == said
-    assert ("Install a font that has them" in before) == said
+    assert (f"No installed font has the characters {name}" in before) == said
+    assert ("Install a font with them" in before) == said
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -336,7 +337,8 @@ def test_clock_offset_auto_not_significant_adds_nothing(sample_log) -> None:
     found = run_comparison(request)
     assert found.settings.clock_offset_s == 0.0
     (said,) = (note for note in found.notes if note.startswith("--clock-offset auto: "))
-    assert "no offset was applied" in said
+    low, high = re.search(r"95 % (\S+)(?: s)? to (\S+)", said).groups()
+    assert float(low) < 0.0 < float(high)
 
 
 @pytest.mark.reallogs

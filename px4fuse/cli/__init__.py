@@ -96,7 +96,7 @@ class LazyGroup(click.Group):
             error.args = (_with_option_names(str(error), ctx.invoked_subcommand),)
             raise
         except BrokenPipeError as error:
-            # without errno EPIPE: on that, click ends with exit code 1
+            # a new error without errno: for EPIPE, click would end with exit code 1
             raise BrokenPipeError from error
         except KeyboardInterrupt as stopped:  # click would print an empty line
             raise Interrupted(stopped, written_so_far(ctx)) from None
@@ -144,7 +144,7 @@ def _check_memory() -> None:
     """
     try:
         import resource
-    except ImportError:  # Windows has no such limit
+    except ImportError:  # Windows has no memory limit for a process
         return
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < LEAST_BYTES:

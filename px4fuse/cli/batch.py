@@ -16,7 +16,7 @@ from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
 FAILED = "failed"
-# --scheduler prints NAME.txt of this folder: how to start such a cluster
+# For --scheduler NAME, batch prints NAME.txt of this folder: how to start such a cluster
 CLUSTERS = ("slurm", "kubernetes")
 
 

@@ -256,7 +256,7 @@ max_size_option = option(
     expose_value=False,
     callback=_set_max_size,
 )
-#: --json
+#: Option --json
 json_option = option(
     "--json FILE",
     "Write the results as JSON; - prints them to standard output. With --json and without -o, no "
@@ -356,7 +356,7 @@ def read_student(option_values: dict[str, Any]) -> Student:
     name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
     path, form, notes = option_values.pop("notes"), option_values.pop("answers"), ""
     if path is not None:
-        from px4fuse.report.notes import parse  # slow to import
+        from px4fuse.report.notes import parse  # imported here, as it is slow
 
         notes = read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
         parse(notes, f"--notes {path}")  # report errors before the analysis

@@ -321,6 +321,6 @@ def terminal() -> Console:
     columns = os.environ.get("COLUMNS", "")
     if not console.is_terminal and not (columns.isdecimal() and int(columns)):
         console.width = UNWRAPPED_WIDTH
-    elif console.width < 1:  # COLUMNS=0
+    elif console.width < 1:  # the environment variable COLUMNS is 0
         console.width = shutil.get_terminal_size().columns
     return console

@@ -69,7 +69,7 @@ def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
     from px4fuse.verification.verification import LIMIT
 
     values = asdict(verdict)
-    for name in ("redrawn", "remedy", "missing"):  # used by grade only
+    for name in ("redrawn", "remedy", "missing"):  # fields for px4fuse grade only
         del values[name]
     return {
         "schema": SCHEMA,

@@ -84,7 +84,8 @@ class _Run:
     first_of: dict[str, FoundLog] = field(default_factory=dict)
     # Rows of logs that failed, by address
     failed_rows: dict[str, Row] = field(default_factory=dict)
-    reused: set[str] = field(default_factory=set)  # SHA-256
+    # SHA-256 of logs with results of an earlier run
+    reused: set[str] = field(default_factory=set)
 
 
 def batch(
@@ -181,7 +182,9 @@ def run(
             "`mavlink` and `position` are files of one flight and not available for many logs."
         )
     sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
-    Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)  # raises if out of range
+    Settings(
+        request.sigma_a_m_s2, sigma_z_m, request.dt_s
+    )  # raises an error for values out of range
     state = _Run(output, metadata.version("px4fuse"), command_line(request))
     hashes_by_size = _cached_hashes(state, reports)
     log_by_address = {log.address: log for log in logs}

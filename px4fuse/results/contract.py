@@ -103,7 +103,7 @@ TUNED_FIELDS = {"sigma_a_m_s2": "filter_sigma_a_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
 Which = Literal["A", "B"]
-# 95 %; the upper end is None if nothing bounds it
+# 95 % interval; the upper end is None if there is no upper bound
 Interval = tuple[float, float | None]
 
 
