@@ -341,7 +341,7 @@ def test_explore_without_log_uses_sample_flight(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
-    assert "no log was given" in refused("explore")
+    assert "no log was given" in refused("explore").lower()
     assert list(tmp_path.iterdir()) == []
     here = tmp_path / "sample_logs"
     here.mkdir()

@@ -120,7 +120,7 @@ def flights(name: str, sample_log: Path) -> Comparison:
     return compare(aisle_flight(duration_s=30.0, imu=None, uwb=Uwb(gap_s=(12.0, 16.0))))
 
 
-@pytest.mark.parametrize("name", ["sample", "odometry", "IMU with a gap", "no IMU, source gap"])
+@pytest.mark.parametrize("name", ["sample", "odometry", "IMU with a gap", "no IMU, gap in source"])
 def test_engine_matches_python_replay(engine: Browser, sample_log: Path, name: str) -> None:
     comparison = flights(name, sample_log)
     rng = np.random.default_rng(len(name))

@@ -129,7 +129,7 @@ def test_sentences_follow_settings_and_name_re_run(
     sentence = text(page, "live")
     nis = nis_with(analysis, Settings(sigma_a_m_s2=0.002, sigma_z_m=0.05))
     assert f"overconfident: σ is {format_number(nis**0.5, 2)} times too small" in sentence
-    best = re.search(r"Best: SIGMA_A ([\d.]+) \(mean NIS ([\d,]+) → ([\d.]+)\)", sentence)
+    best = re.search(r"Best re-run: SIGMA_A ([\d.]+) \(mean NIS ([\d,]+) → ([\d.]+)\)", sentence)
     assert best[2] == format_number(nis, 2)
     after = nis_with(analysis, Settings(sigma_a_m_s2=float(best[1]), sigma_z_m=0.05))
     assert best[3] == format_number(after, 2)

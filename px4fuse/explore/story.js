@@ -46,11 +46,11 @@ const Story = (() => {
       .filter(([, result]) => result?.nis !== undefined);
     const format = ([label, result]) => `${label} (mean NIS ${formatNumber(kf.nis, 2)} → ${formatNumber(result.nis, 2)})`;
     const consistent = results.filter(([, result]) => isConsistent(result));
-    if (consistent.length) return ` Re-run with one change, consistent: ${consistent.map(format).join(" or ")}.`;
+    if (consistent.length) return ` One change makes KF consistent (re-run): ${consistent.map(format).join(" or ")}.`;
     const distance = (result) => Math.abs(Math.log(result.nis));
     const best = results.reduce((a, b) => a === null || distance(b[1]) < distance(a[1]) ? b : a, null);
     if (best === null || distance(best[1]) >= distance(kf)) return "";
-    return ` Re-runs with one change: none makes KF consistent. Best: ${format(best)}.`;
+    return ` No single change makes KF consistent. Best re-run: ${format(best)}.`;
   }
 
   return { formatNumber, formatMetres, verdict, sentence, remedy };
