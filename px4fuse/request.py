@@ -64,10 +64,12 @@ class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def without_paths(self) -> Self:
         """Return the request with file names instead of paths, as the results record it."""
         paths = {name: getattr(self, name, None) for name in _PATHS}
-        changes: dict[str, Any] = {n: _name(path) for n, path in paths.items() if path is not None}
+        changes: dict[str, Any] = {
+            n: _file_name(path) for n, path in paths.items() if path is not None
+        }
         position = getattr(self, "position", None)
         if position is not None:
-            changes["position"] = msgspec.structs.replace(position, path=_name(position.path))
+            changes["position"] = msgspec.structs.replace(position, path=_file_name(position.path))
         return msgspec.structs.replace(self, **changes)
 
 
@@ -386,6 +388,6 @@ def _option_text(value: Any) -> str:
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
-def _name(path: str) -> str:
+def _file_name(path: str) -> str:
     """Return the file name of a path; bytes that are not valid text are replaced."""
     return PurePath(path).name.encode(errors="replace").decode()

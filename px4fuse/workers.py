@@ -183,8 +183,8 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
             message = pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
         except MemoryError:
             # the next job would not have enough memory, so the process ends
-            why = JobFailure("the memory limit for one file was exceeded.")
-            message = pickle.dumps((False, why))
+            failure = JobFailure("the memory limit for one file was exceeded.")
+            message = pickle.dumps((False, failure))
         except Exception as error:  # noqa: BLE001 - the failure of a job is its result
             # imported here: the import takes 2 s and is needed for errors only
             from px4fuse.results.reading import one_line  # noqa: PLC0415

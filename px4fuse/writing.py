@@ -48,19 +48,19 @@ def write_all(
     """
     check_outputs(path for path in contents if path != STANDARD_OUTPUT)
     written: list[Path] = []
-    gone = None
+    pipe_error = None
     for path, content in contents.items():
         try:
             _write(path, content)
         except BrokenPipeError as error:  # the reader has ended (| head)
-            gone = error
+            pipe_error = error
             continue
         except OSError as error:
             raise _refusal(path, error, written) from error
         written.append(path)
         placed(path)
-    if gone is not None:
-        raise gone
+    if pipe_error is not None:
+        raise pipe_error
 
 
 def written_before(paths: Sequence[Path]) -> str:

@@ -97,7 +97,7 @@ def _logs_in(pattern: str) -> list[FoundLog]:
         address = path if _is_local(files) else files.unstrip_protocol(path)
         is_relative = _is_local(files) and not Path(pattern).is_absolute()
         log = os.path.relpath(path) if is_relative else address
-        found_logs.append(FoundLog(_name(path), log, address, info.get("size")))
+        found_logs.append(FoundLog(_file_name(path), log, address, info.get("size")))
         if _is_local(files):
             add_input(Path(path))
     return found_logs
@@ -130,7 +130,7 @@ def local_file(address: str) -> Iterator[Path]:
             "Increase the limit with --max-size MB.",
         )
     with TemporaryDirectory(prefix="px4fuse-") as folder:
-        local = Path(folder, _name(path))
+        local = Path(folder, _file_name(path))
         files.get_file(path, str(local))
         yield local
 
@@ -156,6 +156,6 @@ def _is_local(files: AbstractFileSystem) -> bool:
     return isinstance(files, LocalFileSystem)
 
 
-def _name(path: str) -> str:
+def _file_name(path: str) -> str:
     """Return the file name of a path or URL, without the query of a URL."""
     return PurePosixPath(path.partition("?")[0]).name or "log"
