@@ -59,7 +59,7 @@ def passes(time_s: Array, heading_deg: float, length_m: float, across_m: float =
 
 
 def flight_along(path: Any = passes, *, boot_s: float = BOOT_S, **parts: Any) -> Flight:
-    """Fly another path than the aisle's, which repeats itself."""
+    """Fly another path than the aisle's, which is periodic."""
 
     def motion(time_s: Array, heading_deg: float, length_m: float) -> tuple[Array, Array, Array]:
         h = 1e-3
@@ -214,7 +214,7 @@ def test_frame_is_told_by_the_fit_unless_the_columns_name_it(flight: Flight, fra
     assert_same_track(track, flight.positions[0], 1e-9)
     alignment, _ = placed(flight, replace(file, frame=frame))
     assert alignment.frame == frame
-    assert alignment.frame_reason == "from the names of the file's columns"
+    assert alignment.frame_reason == "from the column names of the file"
 
 
 def test_an_aisle_at_45_degrees_without_height_does_not_tell_the_frame() -> None:
@@ -274,7 +274,7 @@ def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(flight, yaw_de
     turned, shifted = map(float, seen.groups())
     assert turn(turned, yaw_deg) < 0.5
     assert shifted == pytest.approx(np.hypot(*origin_m[:2]), abs=0.1)
-    assert warning.endswith("give --position-yaw auto.")
+    assert warning.endswith("Give --position-yaw auto.")
     alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
     assert alignment.misplaced == alignment.warnings == ()
 
@@ -282,7 +282,7 @@ def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(flight, yaw_de
 def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) -> None:
     wrong, _ = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings
-    assert warning.startswith("The file hardly follows the EKF2 position (correlation ")
+    assert warning.startswith("The position file does not match the EKF2 position (correlation ")
     assert wrong.correlation < 0.7
     file = recorded(flight, yaw_deg=40.0)
     alignment, track = placed(flight, file, yaw_deg="auto", clock_offset_s=OFFSET_S)
@@ -297,7 +297,7 @@ def test_a_height_that_runs_against_ekf2s_and_another_day_are_warned_of(flight: 
     other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
     alignment = placed(other, file, frame="enu")[0]
     (height,), (day,) = alignment.misplaced, alignment.warnings
-    assert "height runs against EKF2's" in height
+    assert "heights of file and EKF2" in height
     assert "file and log are 100 s apart" in day
 
 
@@ -339,7 +339,7 @@ def test_without_ekf2_the_imu_gives_clock_and_yaw(noise: float) -> None:
     assert alignment.origin_m == (0.0, 0.0, 0.0)
     assert alignment.residual_rms_m is None
     assert alignment.correlation > 0.7
-    assert any("which was left at 0" in warning for warning in alignment.warnings)
+    assert any("set to 0" in warning for warning in alignment.warnings)
 
 
 def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
@@ -397,7 +397,7 @@ def test_files_that_cannot_be_of_the_flight_are_refused(flight: Flight) -> None:
             align_position_file(flight, file, frame="enu", clock_offset_s=offset)
     stamps = file.samples.index.to_numpy().copy()
     stamps[-1] += 2e5
-    with pytest.raises(MissingDataError, match="spans more than a day"):
+    with pytest.raises(MissingDataError, match="spans more than one day"):
         align_position_file(
             flight, replace(file, samples=file.samples.set_axis(pd.Index(stamps))), frame="enu"
         )

@@ -110,7 +110,7 @@ def test_every_part_that_lacks_is_taken_and_moved(record):
     np.testing.assert_allclose(joined.airborne, np.array(full.airborne) + 5.0, atol=1e-9)
     assert joined.streams["imu"] == full.streams["imu"]
     assert joined.streams["ekf2_variance"] == full.streams["ekf2_variance"]
-    assert "could not be checked" in joined.log.notes[-1]
+    assert "not verified that both are of the same flight" in joined.log.notes[-1]
 
 
 def test_times_in_records_move_too(sample_flight):

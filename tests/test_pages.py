@@ -360,7 +360,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a colour a little": (
         content(once(rb"/c0 cs 0\.3\d+ 0\.3", b"/c0 cs 0.5 0.3")), "drawing operation", False,
     ),
-    "another digit": (other_digit, "its text has", False),
+    "another digit": (other_digit, "text ", False),
     "a white rectangle": (drawn(WHITE), "drawing operation", False),
     "points of a plot erased": (
         content(once(rb"[\d.]+ [\d.]+ l (?=[\d.]+ [\d.]+ l )", b"")), "drawing operation", False,
@@ -382,12 +382,12 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "a text invisible": (content(once(rb"BT 0 Tr", b"BT 3 Tr")), "drawing operation", False),
     "a letter far aside": (
-        content(once(rb"\)(-?[\d.]+)\(", rb")-9000(")), "its text has", False,
+        content(once(rb"\)(-?[\d.]+)\(", rb")-9000(")), "text ", False,
     ),
     "a letter a little aside": (
-        content(once(rb"\)(-?[\d.]+)\(", rb")150(")), "its text has", False,
+        content(once(rb"\)(-?[\d.]+)\(", rb")150(")), "text ", False,
     ),
-    "a text less": (content(once(rb"\[\([^]]*\]TJ", b"[]TJ")), "its text has", False),
+    "a text less": (content(once(rb"\[\([^]]*\]TJ", b"[]TJ")), "text ", False),
     "the page clipped": (
         content(lambda c: b"0 0 300 300 re W n\n" + c), "drawing operation 1 ", False,
     ),

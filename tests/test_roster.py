@@ -259,11 +259,11 @@ def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("text", "column", "says"),
     [
-        (CANVAS, "", r"several columns.*--column: Quiz, Lab 3\."),
-        (CANVAS, "Roll", "no column for the grade"),
-        (CANVAS, "Lab 4", "no column for the grade"),
-        (CANVAS, "Final Score", "no column for the grade"),
-        ("id,name\n1,A\n", "", "no column for the grade"),
+        (CANVAS, "", r"several grade columns.*--column: Quiz, Lab 3\."),
+        (CANVAS, "Roll", "no grade column"),
+        (CANVAS, "Lab 4", "no grade column"),
+        (CANVAS, "Final Score", "no grade column"),
+        ("id,name\n1,A\n", "", "no grade column"),
     ],
 )
 def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column, says) -> None:

@@ -107,17 +107,17 @@ CHECKED = [
     ("consistent", NORTH, {}, 0.0, "leave --axis out"),
     ("consistent", changed(**UNDERSTATED), {}, 0.0, "understated "),
     ("consistent", changed(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
-     "what is left no setting fixes"),
-    ("clock", EXAMPLE, {}, 1.0, "what the data ask for"),
+     "no setting corrects the rest"),
+    ("clock", EXAMPLE, {}, 1.0, "the 95 % interval of the maximum-likelihood estimate"),
     ("clock", changed(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed(clock=NONE), {}, 0.0, "too few of them"),
-    ("clock", LOOP, {}, 0.0, "compares no filters"),
-    ("clock", changed(**JUMPS), {}, 0.5, "say in your form"),
-    ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form says"),
-    ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "say in your form"),
+    ("clock", LOOP, {}, 0.0, "is not a compare report"),
+    ("clock", changed(**JUMPS), {}, 0.5, "state its time in your form"),
+    ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
+    ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "state its time in your form"),
     ("loop", LOOP, {}, 1.0, "went from 0.41 m to 0.26 m"),
-    ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "makes it worse"),
+    ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "increases the error"),
     ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
     ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
@@ -171,7 +171,7 @@ class TestForm:
     @pytest.mark.parametrize(
         ("form", "said"),
         [
-            ({}, "is not in your report"),
+            ({}, "your report contains no form"),
             ({"log_sha256": "c" * 64}, "was made for another log"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "gremlins"}]}, "cannot be read (kind"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
@@ -239,7 +239,7 @@ class TestScore:
 
     def test_a_log_that_nobody_was_given(self):
         made = assessed(noted("", student__id="s01"), key=key(sha256="c" * 64))
-        assert "Ask for a report on the log that was handed out" in made.pending
+        assert "not about a log of the answer key" in made.pending
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_whatever_can_be_read_can_be_scored(self, results):
@@ -297,7 +297,7 @@ class TestWhatStudentsRead:
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
             ({"items": assessed().items, "pending": "Add uwb.csv to --logs."},
-             ("pending: they do not count yet",), "--logs"),
+             ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip
     def test_feedback(self, values, there, absent):
@@ -402,7 +402,7 @@ class TestClassFlags:
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
         made = class_flags([of(1, form=mine), of(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}
-        assert "The form has the numbers of" in made["1.pdf"][0]
+        assert "The answer form has the same numbers as" in made["1.pdf"][0]
         # two may be by chance
         theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
         apart = replace(mine, quantities=(0.123, None, 0.3))

@@ -183,7 +183,7 @@ def test_a_zip_that_a_student_handed_in_is_told_and_not_opened(tmp_path):
     assert who(found[0].name) == ("Roe", "1")
     with pytest.raises(ResultsError) as refused:
         read_report(read(found[0]), found[0].name)
-    assert str(refused.value) == f"{name}: not a PDF: hand in the file that px4fuse wrote."
+    assert str(refused.value) == f"{name}: not a PDF. Hand in the file that px4fuse wrote."
     assert notes == (
         "Files passed over that are not PDFs: 1.",
         "Zip files not opened: 1; give a platform's export by its own name.",
@@ -200,10 +200,10 @@ def test_a_class_has_more_files_than_a_student(tmp_path):
 
 
 def test_nothing_there(tmp_path):
-    with pytest.raises(SettingsError, match="no regular file, and no folder"):
+    with pytest.raises(SettingsError, match="not a file or folder"):
         find_submissions([tmp_path / "absent"])
     write(tmp_path / "a.txt", b"")
-    with pytest.raises(SettingsError, match="No PDF was found") as caught:
+    with pytest.raises(SettingsError, match="No PDF found") as caught:
         find_submissions([tmp_path])
     assert "\n" not in str(caught.value)
 
@@ -339,7 +339,7 @@ def test_entries_that_are_not_read_say_why(tmp_path):
     found, notes = find_submissions([write(tmp_path / "x.zip", bytes(content))])
     by_name = {each.name: each for each in found}
     assert "symbolic link" in reason(by_name["link.pdf"])
-    assert "a method that is not read" in reason(by_name["packed.pdf"])
+    assert "is not supported" in reason(by_name["packed.pdf"])
     assert reason(by_name["locked.pdf"]) == "locked.pdf: encrypted in its zip file."
     assert read(by_name["same.pdf"]) == b"last"
     assert notes[0].startswith("x.zip: 1 entries have the name of another one")
