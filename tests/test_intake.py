@@ -117,16 +117,16 @@ def test_a_report_that_was_saved_again():
 
 @pytest.mark.parametrize(("pdf", "said"), [
     (b"", "not a PDF. Hand in the file that px4fuse wrote."),
-    (b"%PDF-1.4 and no more", "cut off"),
-    (REAL[: len(REAL) // 2], "cut off"),
+    (b"%PDF-1.4 and no more", "the end of the PDF is missing"),
+    (REAL[: len(REAL) // 2], "the end of the PDF is missing"),
     (REAL[:300_000] + b"\n%%EOF\n", DAMAGED),
     (b"%PDF-1.4\nstartxref\n5\n%%EOF", DAMAGED),
     (b"%PDF-1.4\n" + bytes(intake.MAX_BYTES), "larger than 25 MB"),
-    (small(None), "printed to PDF, which leaves the results out. Hand in the original"),
-    (small(name="../../results.json"), "called '../../results.json', not 'results.json'"),
+    (small(None), "printed to PDF, which removes attachments. Hand in the original"),
+    (small(name="../../results.json"), "name of the attached file is '../../results.json', not 'results.json'"),
     (small(name="C:\\results.json"), "the name of the attached file is"),
     (small(name="\u202ex\x1b[2J" * 50), "the name of the attached file is"),
-    (small(edit=lambda w: w.add_attachment("results.json", b"{}")), "more than one file is"),
+    (small(edit=lambda w: w.add_attachment("results.json", b"{}")), "several attachments"),
     (raw(CATALOG, b"<< /Type /Pages /Kids [] /Count 0 >>"), "the PDF has no pages"),
 ], ids=range(12))  # fmt: skip
 def test_what_is_no_report(pdf, said):
@@ -136,7 +136,7 @@ def test_what_is_no_report(pdf, said):
 def test_two_streams_under_one_name():
     embedded = stream(JSON, b"/Type /EmbeddedFile")
     two = with_attachment(embedded, b"/F (results.json) /EF << /F 5 0 R /UF 4 0 R >>")
-    assert "more than one file is attached" in reason(two)
+    assert "several attachments" in reason(two)
     names = with_attachment(embedded, b"/F (results.json) /UF (x.exe) /EF << /F 5 0 R >>")
     assert "results.json / x.exe" in reason(names)
 
@@ -219,7 +219,7 @@ ACTS = {
 @pytest.mark.parametrize(("said", "edit"), ACTS.items(), ids=ACTS)
 def test_what_acts_is_named(edit, said):
     assert said in reason(small(edit=edit))
-    assert "it contains" in reason(small(edit=edit))
+    assert "the PDF contains" in reason(small(edit=edit))
 
 
 @pytest.mark.parametrize("edit", [

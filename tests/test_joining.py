@@ -162,7 +162,7 @@ def test_recordings_that_do_not_overlap_are_refused_with_both_spans(record):
 
 def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
     moved = replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0)
-    with pytest.raises(MissingDataError, match="not of the same flight: EKF2's positions differ"):
+    with pytest.raises(MissingDataError, match="are different flights: their EKF2 positions differ"):
         join(sample_flight, replace(tlog_flight, ekf2=moved))
 
 
@@ -170,5 +170,5 @@ def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
 def test_two_flights_whose_boot_clocks_overlap_are_told_apart(shared_logs, sample_flight):
     other = read_log(shared_logs / "mavlink" / "v1.16.1_aisle_clock_nosync.tlog")
     other = replace(other, log=replace(other.log, boot_time_s=sample_flight.log.boot_time_s))
-    with pytest.raises(MissingDataError, match="not of the same flight"):
+    with pytest.raises(MissingDataError, match="different flights"):
         join(sample_flight, other)

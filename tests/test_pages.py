@@ -408,11 +408,11 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "an inline image": (
         drawn(b"BI /W 1 /H 1 /BPC 8 /CS /G ID \xff EI"), "drawing operation", False,
     ),
-    "a long content": (content(lambda c: c * 5), "/Contents: its content", False),
+    "a long content": (content(lambda c: c * 5), "/Contents: the content", False),
     "a comment": (content(lambda c: c + b"\n% x\n"), "drawing operation", False),
     "a second content stream": (second_content, "/Contents is of another type", True),
     "an array of contents": (contents_in_an_array, "/Contents is of another type", True),
-    "content taken for a JPEG": (jpeg_content, "/Contents is packed", True),
+    "content taken for a JPEG": (jpeg_content, "/Contents has another compression", True),
     # resources
     "an image": (
         drawn(b"q 300 0 0 90 50 690 cm /X Do Q", resource("/XObject", "/X", image())),
@@ -467,7 +467,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "the first page away": (kids(lambda k: k[1:]), "", False),
     "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "", False),
-    "a page more": (kids(lambda k: [*k, k[0]]), "px4fuse draws 3 pages", False),
+    "a page more": (kids(lambda k: [*k, k[0]]), "px4fuse draws only 3 pages", False),
     "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "", False),
     # the document
     "an opening action": (root("/OpenAction", array()), "an action", True),

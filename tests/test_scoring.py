@@ -90,7 +90,7 @@ CHECKED = [
     ("tuning", changed(tuning__horizontal=NONE), {"setting": "sigma_z_m"}, 0.0, "too few of them"),
     ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "leave --axis out"),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
-     "The error is 0.06499; at most 0.05 was asked for."),
+     "The error is 0.06499; required: at most 0.05."),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
     ("number", EXAMPLE, {"path": RMSE, "at_least": 0.07, "zero_at": 0.06}, 0.5, ""),
     ("number", EXAMPLE, {"path": "axes.*.filters.kf.nis_mean", "at_least": 0.82}, 0.0,
@@ -102,10 +102,10 @@ CHECKED = [
     ("number", NORTH, {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}, 0.0,
      "leave --axis out"),
     ("consistent", changed(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
-    ("consistent", EXAMPLE, {}, 0.72, "overstated 1.06 times in σ"),
-    ("consistent", changed(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times in σ"),
+    ("consistent", EXAMPLE, {}, 0.72, "σ of KF is 1.06 times too large"),
+    ("consistent", changed(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times too small"),
     ("consistent", NORTH, {}, 0.0, "leave --axis out"),
-    ("consistent", changed(**UNDERSTATED), {}, 0.0, "understated "),
+    ("consistent", changed(**UNDERSTATED), {}, 0.0, "times too small"),
     ("consistent", changed(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
      "no setting corrects the rest"),
     ("clock", EXAMPLE, {}, 1.0, "the 95 % interval of the maximum-likelihood estimate"),
@@ -116,7 +116,7 @@ CHECKED = [
     ("clock", changed(**JUMPS), {}, 0.5, "state its time in your form"),
     ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
     ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "state its time in your form"),
-    ("loop", LOOP, {}, 1.0, "went from 0.41 m to 0.26 m"),
+    ("loop", LOOP, {}, 1.0, "changed from 0.41 m to 0.26 m"),
     ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "increases the error"),
     ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
     ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
@@ -146,7 +146,7 @@ def test_the_clock_of_a_flight_that_was_handed_out_is_not_the_student_s_choice()
 
 TRUTH = FormTruth(
     (TrueMistake("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, VerdictTruth("consistent"),
-    VerdictTruth("consistent"), ("coasted, then reset",), (), (0.5, 0.1, 0.2),
+    VerdictTruth("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
 
@@ -165,13 +165,13 @@ class TestForm:
         assert "You found dropout." in comment
         points, comment = checked("answers", filled(["yaw"], student__id="s01"), key=key())
         assert points == 0.0
-        assert "you missed dropout (the positions are silent that long)" in comment.lower()
+        assert "you missed dropout (gap in the position source of this length)" in comment.lower()
         assert "not in your flight: yaw" in comment
 
     @pytest.mark.parametrize(
         ("form", "said"),
         [
-            ({}, "your report contains no form"),
+            ({}, "report contains no form"),
             ({"log_sha256": "c" * 64}, "was made for another log"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "gremlins"}]}, "cannot be read (kind"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
@@ -192,7 +192,7 @@ class TestForm:
     def test_a_mistyped_id_costs_nothing_where_the_platform_knows_it(self, owner_id, points):
         mistyped = filled(["dropout"], student__id="s02")
         items = assessed(mistyped, key=key(), owner_id=owner_id).items
-        assert [item.points for item in items if "your flight" in item.title] == [points]
+        assert [item.points for item in items if "Mistakes" in item.title] == [points]
 
     def test_a_text_waits_for_the_instructor(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
@@ -293,7 +293,7 @@ class TestWhatStudentsRead:
             ({"items": assessed().items, "flags": ("copied",)},
              ("Lab 2 Report a.pdf Student Ann Lee, 1001",), "copied"),
             ({"verdict": Verdict("cannot verify", ("one", "page 3: two"), False)},
-             ("could not be verified: one; page 3: two. Make it again",), "Points"),
+             ("could not be verified: one; page 3: two. Make a new report",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
             ({"items": assessed().items, "pending": "Add uwb.csv to --logs."},
@@ -350,9 +350,9 @@ def test_what_stands_out_in_one_report(values, said):
     ("option", "stated", "said"),
     [
         ("position_drift_m", 3.9, ""),
-        ("position_drift_m", 50.0, "--drift is 50 m per 100 m; usual is 1 m."),
+        ("position_drift_m", 50.0, "--drift is 50 m per 100 m (default 1 m)."),
         ("position_drift_m", 0.2, "--drift is 0.2 m per 100 m"),
-        ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m; usual is 3 °."),
+        ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m (default 3 °)."),
     ],
 )
 def test_own_flags_stated_drift_far_from_usual(option, stated, said):
