@@ -59,7 +59,7 @@ def passes(time_s: Array, heading_deg: float, length_m: float, across_m: float =
 
 
 def flight_along(path: Any = passes, *, boot_s: float = BOOT_S, **parts: Any) -> Flight:
-    """Fly another path than the aisle's, which repeats itself."""
+    """Fly another path than the aisle's, which is periodic."""
 
     def motion(time_s: Array, heading_deg: float, length_m: float) -> tuple[Array, Array, Array]:
         h = 1e-3
@@ -214,7 +214,7 @@ def test_frame_is_told_by_the_fit_unless_the_columns_name_it(flight: Flight, fra
     assert_same_track(track, flight.positions[0], 1e-9)
     alignment, _ = placed(flight, replace(file, frame=frame))
     assert alignment.frame == frame
-    assert alignment.frame_reason == "from the names of the file's columns"
+    assert alignment.frame_reason == "from the column names of the file"
 
 
 def test_an_aisle_at_45_degrees_without_height_does_not_tell_the_frame() -> None:
@@ -269,12 +269,12 @@ def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(flight, yaw_de
     assert alignment.yaw_deg == 0.0
     assert off_s(alignment) < 0.03
     (warning,) = alignment.misplaced
-    seen = re.search(r"turned by ([-0-9.]+)° and shifted by ([0-9.]+) m against", warning)
+    seen = re.search(r"rotated by ([-0-9.]+)° and shifted by ([0-9.]+) m relative", warning)
     assert seen
     turned, shifted = map(float, seen.groups())
     assert turn(turned, yaw_deg) < 0.5
     assert shifted == pytest.approx(np.hypot(*origin_m[:2]), abs=0.1)
-    assert warning.endswith("give --position-yaw auto.")
+    assert warning.endswith("Give --position-yaw auto.")
     alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
     assert alignment.misplaced == alignment.warnings == ()
 
@@ -282,7 +282,7 @@ def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(flight, yaw_de
 def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) -> None:
     wrong, _ = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings
-    assert warning.startswith("The file hardly follows the EKF2 position (correlation ")
+    assert warning.startswith("The position file does not match the EKF2 position (correlation ")
     assert wrong.correlation < 0.7
     file = recorded(flight, yaw_deg=40.0)
     alignment, track = placed(flight, file, yaw_deg="auto", clock_offset_s=OFFSET_S)
@@ -297,8 +297,8 @@ def test_a_height_that_runs_against_ekf2s_and_another_day_are_warned_of(flight: 
     other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
     alignment = placed(other, file, frame="enu")[0]
     (height,), (day,) = alignment.misplaced, alignment.warnings
-    assert "height runs against EKF2's" in height
-    assert "file and log are 100 s apart" in day
+    assert "heights of file and EKF2" in height
+    assert "file and log differ by 100 s" in day
 
 
 # -- what real files are like ----------------------------------------------------------------------
@@ -339,7 +339,7 @@ def test_without_ekf2_the_imu_gives_clock_and_yaw(noise: float) -> None:
     assert alignment.origin_m == (0.0, 0.0, 0.0)
     assert alignment.residual_rms_m is None
     assert alignment.correlation > 0.7
-    assert any("which was left at 0" in warning for warning in alignment.warnings)
+    assert any("set to 0" in warning for warning in alignment.warnings)
 
 
 def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
@@ -348,7 +348,7 @@ def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
     assert placed(blind, recorded(flight, frame="nwu"))[0].frame == "nwu"
     alignment, _ = placed(blind, recorded(flight, yaw_deg=120.0), frame="enu")
     assert off_s(alignment) < 0.05
-    assert "seems turned by 1" in alignment.misplaced[-1]
+    assert "is rotated by 1" in alignment.misplaced[-1]
     assert "shifted" not in alignment.misplaced[-1]
     # an EKF2 that stands still leaves it to the IMU
     still = replace(flight, ekf2=replace(flight.ekf2, state=flight.ekf2.state * 0.0))
@@ -365,7 +365,7 @@ BOTH_SPANS = r"the log covers 2416\.25 s to 2536\.25 s of the boot clock, the fi
 def test_what_stands_still_is_placed_by_a_given_offset_alone() -> None:
     flight = flight_along(partial(passes, across_m=0.0), length_m=0.0)
     for parts in ({}, {"ekf2": unavailable("EKF2")}):
-        said = rf"^uwb\.csv: .*hardly moves; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
+        said = rf"^uwb\.csv: .*hardly change; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
         with pytest.raises(MissingDataError, match=said):
             align_position_file(replace(flight, **parts), recorded(flight), frame="enu")
     alignment, track = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S)
@@ -393,11 +393,11 @@ def test_files_that_cannot_be_of_the_flight_are_refused(flight: Flight) -> None:
     """By an offset without overlap, over days, of a few positions."""
     file = recorded(flight)
     for offset in (0.0, OFFSET_S + 121.0, OFFSET_S - 121.0):
-        with pytest.raises(MissingDataError, match="does not overlap the log; " + BOTH_SPANS):
+        with pytest.raises(MissingDataError, match="does not overlap the log ." + BOTH_SPANS):
             align_position_file(flight, file, frame="enu", clock_offset_s=offset)
     stamps = file.samples.index.to_numpy().copy()
     stamps[-1] += 2e5
-    with pytest.raises(MissingDataError, match="spans more than a day"):
+    with pytest.raises(MissingDataError, match="spans more than one day"):
         align_position_file(
             flight, replace(file, samples=file.samples.set_axis(pd.Index(stamps))), frame="enu"
         )
@@ -411,7 +411,7 @@ def test_a_file_of_another_flight_is_refused(flight: Flight) -> None:
         radius = 3.0 + np.sin(7.0 * angle)
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1)
 
-    with pytest.raises(MissingDataError, match="does not follow the EKF2 position"):
+    with pytest.raises(MissingDataError, match="does not match the EKF2 position"):
         align_position_file(flight, recorded(flight_along(other)), frame="enu")
 
 
@@ -419,7 +419,7 @@ def test_a_file_of_another_flight_is_refused(flight: Flight) -> None:
 def test_a_flight_that_repeats_itself_needs_the_offset(yaw: Any) -> None:
     flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
     file = recorded(flight)
-    said = r"path leaves the clock open: offsets [1-6]0\.\d s apart fit.*"
+    said = r"from this path; offsets that differ by [1-6]0\.\d s fit.*"
     with pytest.raises(MissingDataError, match=said + BOTH_SPANS + r".*Give `clock_offset_s`\.$"):
         align_position_file(flight, file, frame="enu", yaw_deg=yaw)
     alignment, _ = placed(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
@@ -435,13 +435,13 @@ def test_a_flight_that_nearly_repeats_itself_is_warned_of() -> None:
     alignment, _ = placed(flight, recorded(flight), frame="enu")
     assert off_s(alignment) < 0.03
     (warning,) = alignment.warnings
-    assert re.match(r"A clock offset [-+]19\.\d s from this one fits nearly as well, ", warning)
+    assert re.match(r"A time offset that differs by [-+]19\.\d s fits nearly as well ", warning)
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"frame": "utm"}, "`frame` utm: not a known frame. Choose from ned, enu, nwu."),
+    ({"frame": "utm"}, "Frame utm is not known. Use one of ned, enu, nwu."),
     ({"yaw_deg": float("nan")}, "`yaw_deg` nan is not a finite number."),
-    ({"yaw_deg": "north"}, "`yaw_deg` north: give degrees, or auto."),
+    ({"yaw_deg": "north"}, "`yaw_deg` north is not valid: give degrees or auto."),
     ({"clock_offset_s": float("inf")}, "`clock_offset_s` inf is not a finite number."),
 ])  # fmt: skip
 def test_invalid_options(flight: Flight, options: dict[str, Any], message: str) -> None:

@@ -47,7 +47,7 @@ def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
     (claim,) = found.mistakes
     assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)
-    assert found.verdict_ours == "overstated"
+    assert found.verdict_ours == "underconfident"
     assert ClaimedMistake("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
     assert ClaimedMistake("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
 
@@ -56,16 +56,16 @@ def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("a" * 30_000, "more than the limit"),
-        ("a." * 400 + "b = 1", "a line of more than 500"),
-        ("x = " + "[" * 450, "Correct it there"),
-        ("log_sha256 = 'x'", "Correct it there"),
+        ("a." * 400 + "b = 1", "a line has more than 500"),
+        ("x = " + "[" * 450, "Correct the form"),
+        ("log_sha256 = 'x'", "Correct the form"),
         (EMPTY.replace('kind = ""', 'kind = "gremlins"'), "'gremlins' is not one of"),
-        (EMPTY + CLAIM.format("yaw", "size = 900"), "none that it can have"),
+        (EMPTY + CLAIM.format("yaw", "size = 900"), "is out of range"),
         (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = nan"), "size"),
         (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = true"), "size"),
         (EMPTY.replace('kind = ""', 'kind = "yaw"\ncolour = 1'), "colour"),
         (EMPTY + CLAIM.format("yaw", "") * 2, "twice"),
-        (EMPTY + CLAIM.format("none", "") + CLAIM.format("yaw", ""), "one or the other"),
+        (EMPTY + CLAIM.format("none", "") + CLAIM.format("yaw", ""), "only one of them"),
         (EMPTY + CLAIM.format("yaw", 'unit = "kg"'), "'kg' is not one of"),
         (EMPTY + CLAIM.format("yaw", 'panel = "sky"'), "'sky' is not one of"),
         (EMPTY + CLAIM.format("yaw", 'parameter = "EKF3"'), "'EKF3' is not one of"),

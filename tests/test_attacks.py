@@ -130,7 +130,7 @@ def test_the_honest_report_is_verified_and_names_both(honest: GradedReport) -> N
     assert honest.pending == ""
     assert honest.flags == ()
     points = {item.title: item.points / item.of for item in honest.items}
-    assert points["What is wrong with your flight"] > 0.4, honest.items
+    assert points["Mistakes of the flight"] > 0.4, honest.items
 
 
 # ------------------------------------------------------------------ words

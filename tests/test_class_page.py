@@ -152,7 +152,7 @@ def test_pending_points_stand_apart_from_those_that_count() -> None:
     assert "10.3&nbsp;/&nbsp;16" in text
     cells = [row[0][3] for row in content(text)["rows"]]
     assert cells[2:] == [["pending", "", "12 proposed"],
-                         ["13 / 20", 13.0, "said by you", "", 0.65]]  # fmt: skip
+                         ["13 / 20", 13.0, "set by instructor", "", 0.65]]  # fmt: skip
 
 
 def test_what_is_not_finite_too_long_or_too_much() -> None:
@@ -242,7 +242,7 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     page.click("#all")
     assert len(page.names()) == len(CLASS)
     for status, names in (("numbers differ", ["ada"]), ("flagged", ["ada", MARKUP]),
-                          ("to read", [MARKUP]), ("nothing handed in", ["Mia"])):  # fmt: skip
+                          ("to read", [MARKUP]), ("no submission", ["Mia"])):  # fmt: skip
         page.choose("#filter-0", status)
         assert page.names() == names
     page.choose("#filter-0", "missed: outliers")

@@ -14,7 +14,7 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.answers import CURES, MISTAKES, PANELS, Answers, ClaimedMistake
+from px4fuse.answers import CURES, MISTAKES, PANELS, Answers, ClaimedMistake, update_values
 from px4fuse.assignment.drawing import draw
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
@@ -29,8 +29,8 @@ pytestmark = pytest.mark.usefixtures("quick_filter")
 LATE = TrueMistake("clock-offset", 0.2, 0.17, 0.23)
 GAP = TrueMistake("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
 TRUTH = FormTruth(
-    (LATE, GAP), 0.1, VerdictTruth("understated", 2.0), VerdictTruth("overstated", 1.2),
-    ("followed the wrong positions", "coasted, then reset"), ("fused at the wrong time",),
+    (LATE, GAP), 0.1, VerdictTruth("overconfident", 2.0), VerdictTruth("underconfident", 1.2),
+    ("followed wrong positions", "dead-reckoned, then reset"), ("fused at the wrong time",),
     (0.5, (3.0, 7.0), -0.2),
 )  # fmt: skip
 RIGHT = Answers(
@@ -50,13 +50,13 @@ RIGHT = Answers(
         ),
         ClaimedMistake("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
     ),
-    verdict_ours="understated",
-    verdict_ekf2="overstated",
-    ekf2_did=("followed the wrong positions", "coasted, then reset"),
+    verdict_ours="overconfident",
+    verdict_ekf2="underconfident",
+    ekf2_did=("followed wrong positions", "dead-reckoned, then reset"),
     quantities=(0.505, (3.0, 7.0), -0.2),
 )
 CLEAN = FormTruth(
-    (), 0.1, VerdictTruth("consistent"), VerdictTruth("consistent"), ("nothing unusual",),
+    (), 0.1, VerdictTruth("consistent"), VerdictTruth("consistent"), ("normal",),
     ("followed the positions",), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
@@ -115,7 +115,7 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     (replace(RIGHT, mistakes=(ClaimedMistake("none"),)), NO_MISTAKES),
     (replace(RIGHT, verdict_ours="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 12.5}),
-    (replace(RIGHT, ekf2_did=("coasted, then reset",)), {"verdicts": 12.5}),
+    (replace(RIGHT, ekf2_did=("dead-reckoned, then reset",)), {"verdicts": 12.5}),
     (replace(RIGHT, quantities=(0.53, (3.0,), None)), {"quantities": 5.0}),
     (replace(RIGHT, quantities=(9.0, (), None)), {"verdicts": 7.5, "quantities": 0.0}),
 ]
@@ -160,9 +160,9 @@ def test_a_constant_form_does_not_pay_on_loops() -> None:
         sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.typed]
         measured = [size + rng.normal(0.0, 0.4) for size in sizes]
         wrong = [TrueMistake("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
-        verdicts = VerdictTruth("overstated", 7.0), VerdictTruth("understated", 1.1)
+        verdicts = VerdictTruth("underconfident", 7.0), VerdictTruth("overconfident", 1.1)
         truths.append(
-            FormTruth(tuple(wrong), 0.01, *verdicts, ("nothing unusual",), (), (0.5, 0.1, ()))
+            FormTruth(tuple(wrong), 0.01, *verdicts, ("normal",), (), (0.5, 0.1, ()))
         )
     for kind in ("open-end", "none"):
         for each in constants(truths, kind):
@@ -193,6 +193,7 @@ def simulation_of(typed: str) -> flights.Simulation:
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
+    form = update_values(form)  # the forms were filled in before schema 4
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]

@@ -110,7 +110,7 @@ def test_every_part_that_lacks_is_taken_and_moved(record):
     np.testing.assert_allclose(joined.airborne, np.array(full.airborne) + 5.0, atol=1e-9)
     assert joined.streams["imu"] == full.streams["imu"]
     assert joined.streams["ekf2_variance"] == full.streams["ekf2_variance"]
-    assert "could not be checked" in joined.log.notes[-1]
+    assert "not verified that both are of the same flight" in joined.log.notes[-1]
 
 
 def test_times_in_records_move_too(sample_flight):
@@ -162,7 +162,7 @@ def test_recordings_that_do_not_overlap_are_refused_with_both_spans(record):
 
 def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
     moved = replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0)
-    with pytest.raises(MissingDataError, match="not of the same flight: EKF2's positions differ"):
+    with pytest.raises(MissingDataError, match="are different flights: their EKF2 positions differ"):
         join(sample_flight, replace(tlog_flight, ekf2=moved))
 
 
@@ -170,5 +170,5 @@ def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
 def test_two_flights_whose_boot_clocks_overlap_are_told_apart(shared_logs, sample_flight):
     other = read_log(shared_logs / "mavlink" / "v1.16.1_aisle_clock_nosync.tlog")
     other = replace(other, log=replace(other.log, boot_time_s=sample_flight.log.boot_time_s))
-    with pytest.raises(MissingDataError, match="not of the same flight"):
+    with pytest.raises(MissingDataError, match="different flights"):
         join(sample_flight, other)

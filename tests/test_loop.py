@@ -326,7 +326,7 @@ def test_reported_variances_count_where_they_grow() -> None:
     with_growing = replace(odometry, position_variance_m2=growing)
     grown, _, words = odometry_variances(with_growing, nodes, OdometryNoise())
     np.testing.assert_allclose(grown.sum(), 0.4 - 0.001, rtol=0.05)
-    assert "as the log's own position variances grow" in words
+    assert "growth of the logged position variances" in words
 
 
 def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:

@@ -218,7 +218,7 @@ def test_graphs_that_cannot_be_solved_are_refused() -> None:
     poses[4, 1] = np.nan
     for bad, said in (
         (graph.select_edges((graph.second < 10) | (graph.first >= 10)),
-         "falls into 2 parts: vertex 10 is not joined to"),
+         "2 disconnected parts: vertex 10 is not connected to"),
         (replace(graph, information=graph.information * 0.0), "falls into 30 parts"),
         (graph.select_edges(np.zeros(len(graph.first), dtype=bool)), "has no edges"),
         (replace(graph, poses=poses), "not a finite number"),
@@ -414,7 +414,7 @@ def test_gate_needs_odometry() -> None:
     graph = odometry_graph(2, 1e-3)
     edge = len(graph.first) - 1
     gap = graph.select_edges(np.arange(len(graph.first)) != 10)
-    with pytest.raises(TrajectoryError, match="No odometry edge joins vertices 10 and 11"):
+    with pytest.raises(TrajectoryError, match="No odometry edge connects vertices 10 and 11"):
         gate(gap, [edge - 1])
     for at, direction, said in (
         (12, 2, "has a direction without information"),

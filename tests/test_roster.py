@@ -107,13 +107,13 @@ def test_spellings(tmp_path, content) -> None:
 
 
 BAD_ROSTERS = {
-    "no id column": ("a,b\n1,2\n", "no column tells who"), "empty": ("", "empty"),
+    "no id column": ("a,b\n1,2\n", "no column identifies the student"), "empty": ("", "empty"),
     "header alone": ("id,name\n", "0 students"),
     "empty id": ("id,name\n1,A\n,B\n", "the id of 'B'"),
     "same id": ("id\n1\n2\n1\n", "rows 2 and 4 have the same id '1'"),
     "same but for case": ("id\nab\nAB\n", "rows 2 and 3"),
-    "same file": ("id\na/b\na:b\n", "the id of 'a:b' no file of its own"),
-    "nothing left": ("id\n///\n", "letters or digits"), "binary": (b"\x00\x01\x02id", "not text"),
+    "same file": ("id\na/b\na:b\n", "the id of 'a:b' cannot be used as a file name"),
+    "nothing left": ("id\n///\n", "letters or digits"), "binary": (b"\x00\x01\x02id", "not a text file"),
     "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
     "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students"),
     "too long": (b"id\n" + b"1" * 20_000_001, "more than the limit"),
@@ -229,7 +229,7 @@ def test_a_platforms_table_comes_back_with_two_columns_filled(
     if text is MOODLE:
         assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"
     if text is not BLACKBOARD:
-        assert any("more than the platform's 100" in note for note in notes)
+        assert any("above the maximum of the platform (100)" in note for note in notes)
 
 
 def test_a_row_is_found_by_the_participant_alone(tmp_path) -> None:
@@ -242,7 +242,7 @@ def test_a_row_is_found_by_the_participant_alone(tmp_path) -> None:
 def test_who_is_not_in_the_table_is_said(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
     _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
-    assert notes == ("table.csv: it has no row for Max Roe.",)
+    assert notes == ("table.csv: no row for Max Roe.",)
 
 
 def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
@@ -259,11 +259,11 @@ def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("text", "column", "says"),
     [
-        (CANVAS, "", r"several columns.*--column: Quiz, Lab 3\."),
-        (CANVAS, "Roll", "no column for the grade"),
-        (CANVAS, "Lab 4", "no column for the grade"),
-        (CANVAS, "Final Score", "no column for the grade"),
-        ("id,name\n1,A\n", "", "no column for the grade"),
+        (CANVAS, "", r"several grade columns.*--column: Quiz, Lab 3\."),
+        (CANVAS, "Roll", "no grade column"),
+        (CANVAS, "Lab 4", "no grade column"),
+        (CANVAS, "Final Score", "no grade column"),
+        ("id,name\n1,A\n", "", "no grade column"),
     ],
 )
 def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column, says) -> None:

@@ -90,7 +90,7 @@ CHECKED = [
     ("tuning", changed(tuning__horizontal=NONE), {"setting": "sigma_z_m"}, 0.0, "too few of them"),
     ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "leave --axis out"),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
-     "The error is 0.06499; at most 0.05 was asked for."),
+     "The error is 0.06499; required: at most 0.05."),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
     ("number", EXAMPLE, {"path": RMSE, "at_least": 0.07, "zero_at": 0.06}, 0.5, ""),
     ("number", EXAMPLE, {"path": "axes.*.filters.kf.nis_mean", "at_least": 0.82}, 0.0,
@@ -102,22 +102,22 @@ CHECKED = [
     ("number", NORTH, {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}, 0.0,
      "leave --axis out"),
     ("consistent", changed(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
-    ("consistent", EXAMPLE, {}, 0.72, "overstated 1.06 times in σ"),
-    ("consistent", changed(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times in σ"),
+    ("consistent", EXAMPLE, {}, 0.72, "σ of KF is 1.06 times too large"),
+    ("consistent", changed(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times too small"),
     ("consistent", NORTH, {}, 0.0, "leave --axis out"),
-    ("consistent", changed(**UNDERSTATED), {}, 0.0, "understated "),
+    ("consistent", changed(**UNDERSTATED), {}, 0.0, "times too small"),
     ("consistent", changed(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
-     "what is left no setting fixes"),
-    ("clock", EXAMPLE, {}, 1.0, "what the data ask for"),
+     "no setting corrects the rest"),
+    ("clock", EXAMPLE, {}, 1.0, "the 95 % interval of the maximum-likelihood estimate"),
     ("clock", changed(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed(clock=NONE), {}, 0.0, "too few of them"),
-    ("clock", LOOP, {}, 0.0, "compares no filters"),
-    ("clock", changed(**JUMPS), {}, 0.5, "say in your form"),
-    ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form says"),
-    ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "say in your form"),
-    ("loop", LOOP, {}, 1.0, "went from 0.41 m to 0.26 m"),
-    ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "makes it worse"),
+    ("clock", LOOP, {}, 0.0, "is not a compare report"),
+    ("clock", changed(**JUMPS), {}, 0.5, "state its time in your form"),
+    ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
+    ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "state its time in your form"),
+    ("loop", LOOP, {}, 1.0, "changed from 0.41 m to 0.26 m"),
+    ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "increases the error"),
     ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
     ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
@@ -146,7 +146,7 @@ def test_the_clock_of_a_flight_that_was_handed_out_is_not_the_student_s_choice()
 
 TRUTH = FormTruth(
     (TrueMistake("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, VerdictTruth("consistent"),
-    VerdictTruth("consistent"), ("coasted, then reset",), (), (0.5, 0.1, 0.2),
+    VerdictTruth("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
 
@@ -165,13 +165,13 @@ class TestForm:
         assert "You found dropout." in comment
         points, comment = checked("answers", filled(["yaw"], student__id="s01"), key=key())
         assert points == 0.0
-        assert "you missed dropout (the positions are silent that long)" in comment.lower()
+        assert "you missed dropout (gap in the position source of this length)" in comment.lower()
         assert "not in your flight: yaw" in comment
 
     @pytest.mark.parametrize(
         ("form", "said"),
         [
-            ({}, "is not in your report"),
+            ({}, "report contains no form"),
             ({"log_sha256": "c" * 64}, "was made for another log"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "gremlins"}]}, "cannot be read (kind"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
@@ -192,7 +192,7 @@ class TestForm:
     def test_a_mistyped_id_costs_nothing_where_the_platform_knows_it(self, owner_id, points):
         mistyped = filled(["dropout"], student__id="s02")
         items = assessed(mistyped, key=key(), owner_id=owner_id).items
-        assert [item.points for item in items if "your flight" in item.title] == [points]
+        assert [item.points for item in items if "Mistakes" in item.title] == [points]
 
     def test_a_text_waits_for_the_instructor(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
@@ -239,7 +239,7 @@ class TestScore:
 
     def test_a_log_that_nobody_was_given(self):
         made = assessed(noted("", student__id="s01"), key=key(sha256="c" * 64))
-        assert "Ask for a report on the log that was handed out" in made.pending
+        assert "not about a log of the answer key" in made.pending
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_whatever_can_be_read_can_be_scored(self, results):
@@ -293,11 +293,11 @@ class TestWhatStudentsRead:
             ({"items": assessed().items, "flags": ("copied",)},
              ("Lab 2 Report a.pdf Student Ann Lee, 1001",), "copied"),
             ({"verdict": Verdict("cannot verify", ("one", "page 3: two"), False)},
-             ("could not be verified: one; page 3: two. Make it again",), "Points"),
+             ("could not be verified: one; page 3: two. Make a new report",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
             ({"items": assessed().items, "pending": "Add uwb.csv to --logs."},
-             ("pending: they do not count yet",), "--logs"),
+             ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip
     def test_feedback(self, values, there, absent):
@@ -350,9 +350,9 @@ def test_what_stands_out_in_one_report(values, said):
     ("option", "stated", "said"),
     [
         ("position_drift_m", 3.9, ""),
-        ("position_drift_m", 50.0, "--drift is 50 m per 100 m; usual is 1 m."),
+        ("position_drift_m", 50.0, "--drift is 50 m per 100 m (default 1 m)."),
         ("position_drift_m", 0.2, "--drift is 0.2 m per 100 m"),
-        ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m; usual is 3 °."),
+        ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m (default 3 °)."),
     ],
 )
 def test_own_flags_stated_drift_far_from_usual(option, stated, said):
@@ -402,7 +402,7 @@ class TestClassFlags:
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
         made = class_flags([of(1, form=mine), of(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}
-        assert "The form has the numbers of" in made["1.pdf"][0]
+        assert "The answer form has the same numbers as" in made["1.pdf"][0]
         # two may be by chance
         theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
         apart = replace(mine, quantities=(0.123, None, 0.3))

@@ -67,7 +67,7 @@ def test_folders_are_searched_and_sorted(tmp_path):
         write(tmp_path / name, PDF)
     found, notes = find_submissions([tmp_path])
     assert [each.name for each in found] == ["A/Report.PDF", "b/report.pdf", "c.pdf"]
-    assert notes == ("Files passed over that are not PDFs: 3.",)
+    assert notes == ("Ignored files (not PDF): 3.",)
     assert [read(each) for each in found] == [PDF] * 3
     assert all(each.entry == "" for each in found)
 
@@ -150,7 +150,7 @@ def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
     for place in (path, tmp_path / "unpacked"):
         (found,), notes = find_submissions([place])
         person = found.origin.person
-        assert notes == ("Files passed over that are not PDFs: 1.",)
+        assert notes == ("Ignored files (not PDF): 1.",)
         assert person == Person(
             "0042", "Doe, Jane", "jane@example.edu", numbers={"gradescope": "31"}
         )
@@ -161,7 +161,7 @@ def test_metadata_that_cannot_be_read_is_said(tmp_path):
     bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
     (found,), (note,) = find_submissions([write(tmp_path / "export.zip", bomb)])
     assert found.origin.person == Person("", numbers={"gradescope": "3"})
-    assert note.startswith("submission_metadata.yml: it shrinks more than 100 times")
+    assert note.startswith("submission_metadata.yml: the zip entry is compressed more than 100 times")
 
 
 def test_times_of_entries_are_kept(tmp_path):
@@ -183,10 +183,10 @@ def test_a_zip_that_a_student_handed_in_is_told_and_not_opened(tmp_path):
     assert who(found[0].name) == ("Roe", "1")
     with pytest.raises(ResultsError) as refused:
         read_report(read(found[0]), found[0].name)
-    assert str(refused.value) == f"{name}: not a PDF: hand in the file that px4fuse wrote."
+    assert str(refused.value) == f"{name}: not a PDF. Hand in the file that px4fuse wrote."
     assert notes == (
-        "Files passed over that are not PDFs: 1.",
-        "Zip files not opened: 1; give a platform's export by its own name.",
+        "Ignored files (not PDF): 1.",
+        "Zip files not opened: 1. Name the export of a platform on the command line.",
     )
     # the same where the export was unpacked
     write(tmp_path / "unpacked" / name, handed_in)
@@ -200,10 +200,10 @@ def test_a_class_has_more_files_than_a_student(tmp_path):
 
 
 def test_nothing_there(tmp_path):
-    with pytest.raises(SettingsError, match="no regular file, and no folder"):
+    with pytest.raises(SettingsError, match="not a file or folder"):
         find_submissions([tmp_path / "absent"])
     write(tmp_path / "a.txt", b"")
-    with pytest.raises(SettingsError, match="No PDF was found") as caught:
+    with pytest.raises(SettingsError, match="No PDF found") as caught:
         find_submissions([tmp_path])
     assert "\n" not in str(caught.value)
 
@@ -214,7 +214,7 @@ def test_a_damaged_zip_leaves_the_others(tmp_path):
     found, notes = find_submissions([bad, good])
     assert [each.name for each in found] == ["a.pdf"]
     assert len(notes) == 1
-    assert "bad.zip: passed over: it cannot be read (damaged)." in notes
+    assert "bad.zip: ignored: it cannot be read (damaged)." in notes
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights that tests do not have")
@@ -293,7 +293,7 @@ def test_files_that_are_too_large(tmp_path):
 def test_bombs_and_lies(tmp_path, monkeypatch):
     packed = zipped({"bomb.pdf": bytes(20_000_000)})
     path = write(tmp_path / "x.zip", packed)
-    assert "shrinks more than 100 times" in reason(only(path))
+    assert "compressed more than 100 times" in reason(only(path))
     path.write_bytes(zipped({"large.pdf": bytes(MAX_BYTES + 1)}))
     assert "larger than 25 MB" in reason(only(path))
     # a declared size that is smaller than what there is: zipfile stops there, and the sum is off
@@ -318,7 +318,7 @@ def test_bounds_of_a_whole_zip_file(tmp_path, monkeypatch, limit, value, said):
     monkeypatch.setattr(submissions, limit, value)
     found, notes = find_submissions([path, other])
     assert [each.file for each in found] == [other]
-    assert any(note.startswith("x.zip: passed over: ") and said in note for note in notes)
+    assert any(note.startswith("x.zip: ignored: ") and said in note for note in notes)
 
 
 def test_entries_that_are_not_read_say_why(tmp_path):
@@ -339,8 +339,8 @@ def test_entries_that_are_not_read_say_why(tmp_path):
     found, notes = find_submissions([write(tmp_path / "x.zip", bytes(content))])
     by_name = {each.name: each for each in found}
     assert "symbolic link" in reason(by_name["link.pdf"])
-    assert "a method that is not read" in reason(by_name["packed.pdf"])
-    assert reason(by_name["locked.pdf"]) == "locked.pdf: encrypted in its zip file."
+    assert "is not supported" in reason(by_name["packed.pdf"])
+    assert reason(by_name["locked.pdf"]) == "locked.pdf: the zip entry is encrypted."
     assert read(by_name["same.pdf"]) == b"last"
     assert notes[0].startswith("x.zip: 1 entries have the name of another one")
     by_name["same.pdf"].file.unlink()

@@ -200,7 +200,7 @@ def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> None:
     expected = usual.total - usual.counting.items[0].points + 1.0
     assert of(third, 1).total == pytest.approx(expected)
     assert of(third, 40).total == 12.0
-    assert "overrides.csv: nobody has the id 0099." in third.notes
+    assert "overrides.csv: no student has the id 0099." in third.notes
     changed = {key for key, value in points(third).items() if value != points(outcome)[key]}
     assert changed == {"0001", "0040"}
     text = (lab.output / "feedback" / "0001.txt").read_text(encoding="utf-8")

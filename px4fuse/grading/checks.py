@@ -140,7 +140,7 @@ class Evidence:
         """Form about this log, or the reason why it is missing."""
         answers = self.results.student.answers
         if not isinstance(answers, Answers):
-            return "your report contains no form: make the report with --answers FORM.toml"
+            return "your report contains no form: make the report with --answers answers.toml"
         try:
             check(answers)
         except ValueError as error:
