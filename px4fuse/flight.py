@@ -1,13 +1,12 @@
-"""The data model: what every reader makes and everything else takes.
+"""Data model of a flight, created by the readers and used by all other modules.
 
-Times are float seconds on the autopilot's boot clock, counted from the first sample of data (whose
-own boot time is ``boot_time_s`` of the log), and they are times of *measurement*, not of
-publication. Vectors are NED (north, east, down) in m, m/s and m/s², or body FRD (forward, right,
-down) where said. Time series are pandas frames whose index is time in seconds, named ``time_s``;
-every column's unit stands in its name or in the field's description.
+Times are seconds on the autopilot's boot clock since the first sample of data, whose boot time is
+``LogInfo.boot_time_s``. They are *measurement* times, not publication times. Vectors are NED
+(north, east, down) in m, m/s and m/s², or body FRD (forward, right, down) if stated. Time series
+are pandas frames with the index ``time_s``; column names contain the unit.
 
-What was looked for and not found is an :class:`Unavailable`; it travels to the report and is never
-replaced by zero, an empty plot or a "pass".
+Missing data are :class:`Unavailable`, which the report lists. They are never replaced by zero, an
+empty plot or a "pass".
 """
 
 from __future__ import annotations
@@ -24,19 +23,19 @@ from px4fuse.display import one_line_repr
 from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.origin import Origin
 from px4fuse.record import NotNegative, Record, Vector
-from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - for everybody
+from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
 from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 
 AxisName = Literal["north", "east", "down"]
-# Below this share of intervals near the median, samples come in bursts
+# Fraction of intervals near the median, below which the samples are in bursts
 BURST_SHARE = 0.8
-# Methods of a ClockMap that know no time of measurement
+# Methods of a ClockMap without a measurement time
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
 
 
 class Columns:
-    """Names of columns of all tables of a flight, with their units."""
+    """Column names of all tables of a flight, with units."""
 
     POSITION: Final = ["north_m", "east_m", "down_m"]
     VELOCITY: Final = ["north_m_s", "east_m_s", "down_m_s"]
@@ -47,7 +46,7 @@ class Columns:
     ANGULAR_RATE: Final = ["forward_rad_s", "right_rad_s", "down_rad_s"]
     QUATERNION: Final = ["w", "x", "y", "z"]
     ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
-    # What EKF2's filter holds at its fusion horizon, whatever the PX4 release logs it as
+    # State and variances of EKF2 at the fusion horizon, common to all PX4 releases
     GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right", "down")]
     ACCELEROMETER_BIAS: Final = [
         f"accelerometer_bias_{axis}_m_s2" for axis in ("forward", "right", "down")
@@ -76,7 +75,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class FlightMode:
-    """A stretch (s) in one flight mode, by the name that PX4's users know."""
+    """Time interval (s) in one flight mode, with the name that QGroundControl shows."""
 
     start_s: float
     end_s: float
@@ -84,36 +83,36 @@ class FlightMode:
 
 
 class Alignment(Record, frozen=True, kw_only=True):
-    """How an external position file was placed into the flight.
+    """Alignment of an external position file with the flight in time and space.
 
-    A position p of the file becomes origin + Rz(yaw) · C · p, where C turns its frame into NED.
+    A position p of the file becomes origin + Rz(yaw) · C · p, where C converts its frame to NED.
 
     Attributes
     ----------
     frame, frame_reason : str
-        "ned", "enu" or "nwu", and why.
+        "ned", "enu" or "nwu", and the reason.
     yaw_deg : float
-        Rotation about down, clockwise seen from above, applied after the frame.
+        Rotation about down after C, clockwise seen from above.
     yaw_sigma_deg : float or None
-        Its standard deviation where it was estimated.
+        Standard deviation of an estimated yaw.
     yaw_reason : str
     origin_m : tuple of float
-        Added after the rotation, NED.
+        Translation after the rotation (NED).
     clock_offset_s : float
-        Added to the file's time stamps to give the autopilot's boot clock.
+        Offset added to the timestamps of the file to obtain boot times.
     clock_offset_sigma_s : float or None
-        Its standard deviation where it was estimated.
+        Standard deviation of an estimated clock offset.
     clock_reason : str
     reference : str
-        What it was matched with: "EKF2 position", "IMU", or "" where nothing was.
+        Reference of the estimates: "EKF2 position", "IMU", or "" if nothing was estimated.
     correlation : float or None
-        Of the file's track with the reference after alignment (1 is perfect).
+        Correlation of the track with the reference after alignment; 1 is perfect.
     residual_rms_m : float or None
-        Horizontal, root mean square per axis; None where the reference has no position.
+        Horizontal residual (RMS per axis); None if the reference has no position.
     misplaced : tuple of str
-        Where its frame is another one, each a sentence.
+        Sentences on errors of the frame.
     warnings : tuple of str
-        What is poorly determined, each a sentence.
+        Sentences on values with a large uncertainty.
     """
 
     frame: str
@@ -134,48 +133,47 @@ class Alignment(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class PositionTrack:
-    """One external position track found in the log.
+    """External position track.
 
     Attributes
     ----------
     name : str
-        The name that ``--position-source`` takes; the PX4 topic where there is one.
+        Name for ``--position-source``; the PX4 topic if there is one.
     origin : Origin
-        Where it comes from and how it got here, with all that follows from it.
+        Kind of the source and path to the log.
     description : str
-        What it is, for a person.
+        Description for the user.
     samples : DataFrame, shape (n, 6)
-        ``north_m, east_m, down_m`` and their reported variances ``north_m2, east_m2, down_m2``
-        (NaN where the sender gave none or the topic has none). NaN positions were dropped.
+        ``north_m, east_m, down_m`` and the reported variances ``north_m2, east_m2, down_m2`` (NaN
+        if not sent or not logged). Rows without position are dropped.
     frame : str
         "NED", "FRD" (x is forward at start, not north) or "unknown".
     clock : str
-        Which clock the time stamps are on.
+        Clock of the timestamps.
     topics : tuple of str
-        The topics or messages that it was read from.
+        Topics or messages with the data.
     log : str
-        Name of the file that it was read from.
+        Name of the file with the data.
     clock_map : ClockMap or None
-        How the sender's clock was mapped to the autopilot's, where that was done here.
+        Map from the sender's clock to the boot clock, if px4fuse made one.
     alignment : Alignment or None
-        Of a track from a file of its own.
+        Alignment of a track from a position file.
     orientation : DataFrame, shape (m, 7), or None
-        Quaternion ``w, x, y, z`` that turns body FRD into ``frame``, and its reported variances
-        about the body's axes ``forward_rad2, right_rad2, down_rad2`` (NaN where none was given).
-        None where the sender gave no orientation, or only ever the same one: a positioning
-        system, no odometry.
+        Quaternion ``w, x, y, z`` that rotates body FRD to ``frame``, and the reported variances
+        about the body axes ``forward_rad2, right_rad2, down_rad2`` (NaN if not sent). None if the
+        sender gave no orientation or a constant one: a positioning system, not odometry.
     velocity : DataFrame, shape (n, 6), or None
         ``north_m_s, east_m_s, down_m_s`` and their variances ``north_m2_s2, …`` at the times of
-        ``samples``, where the source measures it by itself: GNSS.
+        ``samples``, if the source measures velocity (GNSS).
     age_s : float
-        What EKF2 takes a sample to be older than its stamp, as far as that was taken off already.
+        Delay from measurement to timestamp that EKF2 assumes and that is already subtracted.
     barometer : DataFrame or None
-        ``down_m`` by the barometer, at times of its own, where that is what "down" is to be.
+        Barometer height ``down_m`` at its times, if it is used for the down axis.
     lever_arm_m : tuple of float
-        Where EKF2 takes the sensor to be in the body (forward, right, down); the positions are the
-        sensor's.
+        Sensor position in the body frame (forward, right, down) that EKF2 assumes; the track is
+        the position of the sensor.
     notes : tuple of str
-        Joins and what they dropped.
+        Sentences on joined and dropped samples.
     """
 
     name: str
@@ -198,11 +196,11 @@ class PositionTrack:
     __repr__ = one_line_repr
 
     def aid(self, axis: str) -> Aid | None:
-        """What EKF2 takes it as along an axis; None where EKF2 never fuses it."""
+        """Return the EKF2 aid of this source along an axis; None if EKF2 never fuses it."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
     def description_fields(self) -> dict[str, Any]:
-        """What is written of it, and of where it comes from, by the names in results."""
+        """Return the descriptive fields of the results (JSON) by name."""
         names = (
             "name",
             "kind",
@@ -220,22 +218,22 @@ class PositionTrack:
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second between gaps (NaN with fewer than two samples)."""
+        """Sample rate (Hz) without gaps; NaN for fewer than two samples."""
         return sample_rate(self.samples)
 
 
 @dataclass(frozen=True)
 class Reset:
-    """One reset of EKF2's output: the new state is the old one plus ``delta``.
+    """Reset of EKF2's published state: the new state is the old one plus ``delta``.
 
     Attributes
     ----------
     time_s : float
-        Time of the first sample after it.
+        Time of the first sample after the reset.
     quantity : str
         "position" or "velocity".
     delta : tuple of float
-        North, east, down in m or m/s; 0 for axes that were not reset.
+        North, east, down (m or m/s); 0 for axes that were not reset.
     """
 
     time_s: float
@@ -243,8 +241,7 @@ class Reset:
     delta: tuple[float, float, float]
 
 
-# EKF2_PREDICT_US, ekf2_params.c
-EKF2_STEP_S = 0.010
+EKF2_STEP_S = 0.010  # s; default of EKF2_PREDICT_US (ekf2_params.c)
 BIAS_NOT_LOGGED = Unavailable(
     "EKF2 accelerometer bias",
     "estimator_sensor_bias and estimator_states are not logged",
@@ -260,54 +257,54 @@ HORIZON_NOT_LOGGED = Unavailable(
 RECORD_NOT_LOGGED = Unavailable(
     "EKF2 state at the fusion horizon",
     "estimator_states is not logged",
-    ("Record a ULog with PX4 v1.12 or newer and SDLOG_PROFILE bit 0 (default), and add it."),
+    "Record a ULog with PX4 v1.12 or newer and SDLOG_PROFILE bit 0 (default), and add it.",
 )
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
-# Of a sample of optical flow in EKF2's low pass of them (_flow_vel_body_lpf, ekf.h)
+# Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf, ekf.h)
 FLOW_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class FusionRecord:
-    """What the log tells of the inside of EKF2's filter: where a replay of it starts from.
+    """Logged data of EKF2 at its fusion horizon, from which the replay starts.
 
     Attributes
     ----------
     parameters : mapping
-        Every EKF2_ parameter in the log, by PX4 name, in PX4's units, as at the log's start.
+        All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
     delayed : DataFrame, shape (n, 43)
-        State and variances at the fusion horizon. ``w, x, y, z`` turns body FRD into NED; velocity
-        and position NED (horizontal position NaN where PX4 keeps it as latitude and longitude);
-        biases of gyro (rad/s) and accelerometer (m/s²), body FRD; magnetic field of the earth
-        (NED) and of the body (FRD), in gauss; then the variances of attitude error about north,
+        State and variances at the fusion horizon. ``w, x, y, z`` rotates body FRD to NED; velocity
+        and position are NED (horizontal position NaN if PX4 stores latitude and longitude); biases
+        of gyro (rad/s) and accelerometer (m/s²) are in body FRD; magnetic fields of the earth
+        (NED) and the body (FRD) are in gauss. Then the variances of attitude error about north,
         east and down, of velocity, position, the biases and both fields.
     per_step_biases : bool
-        Whether this release keeps the biases as increments per prediction (up to v1.14).
+        True if this release stores biases as increments per prediction (up to v1.14).
     other_aiding : tuple of str
-        Horizontal aiding besides vision position that EKF2 used at any time.
+        Horizontal aids besides vision position that EKF2 used at any time.
     vision_age_s : Series
-        How long after its measurement stamp each external vision sample was published (s), by that
-        stamp; empty where not logged.
+        Delay (s) from measurement to publication of each external vision sample, indexed by
+        measurement time; empty if not logged.
     field_gauss : DataFrame, shape (m, 4) or (m, 7)
-        Magnetic field that was measured, body FRD, by time of measurement, and ``fused_3d``: 1
-        where EKF2 fused all of it, 0 where only its heading; empty where not logged. From v1.16 on
-        also EKF2's low pass of all its innovations (expected minus measured).
+        Measured magnetic field (body FRD) and ``fused_3d``, 1 while EKF2 fuses all components, 0
+        while it fuses the heading only; empty if not logged. Since v1.16 also EKF2's low-pass
+        filtered innovations (expected minus measured).
     flow : DataFrame, shape (l, 5)
-        Velocity of the body by optical flow, ``forward_m_s`` and ``right_m_s`` (FRD), by the time
-        that EKF2 takes the last of ``samples`` to be of, which are ``interval_s`` apart and count
-        for less the older they are (:data:`FLOW_SHARE`); ``noise_m2_s2`` is R of each. Empty where
-        the log does not hold it.
+        Velocity from optical flow, ``forward_m_s`` and ``right_m_s`` (body FRD): weighted mean of
+        ``samples`` values at intervals of ``interval_s``, with higher weight of later ones
+        (:data:`FLOW_SHARE`). The index is the time of the last value, ``noise_m2_s2`` is R of
+        each. Empty if not logged.
     latitude_deg : float
-        Of the origin; NaN where the log has none.
+        Latitude of the origin; NaN if not logged.
     altitude_m : float
-        Of the origin, where EKF2 keeps its height as altitude above the sea (from v1.16); else 0.
+        Altitude of the origin if EKF2 stores altitude above sea level (since v1.16); otherwise 0.
     height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 2)
-        By how much its height is above the reference's: ``bias_m`` and its variance ``bias_m2``.
+        Height of the aid minus height of the reference: ``bias_m``, with variance ``bias_m2``.
     states : mapping from :data:`GROUND_EFFECT` and :data:`BAD_ACCELERATION` to Series
-        1 while EKF2 takes the rotors' wash to disturb the barometer, and the vertical acceleration
-        to be wrong; 0 while not, step functions. Without those that the log does not tell.
+        Step functions: 1 while EKF2 detects ground effect on the barometer, or wrong vertical
+        acceleration; otherwise 0. Only those that are logged.
     """
 
     parameters: Mapping[str, float]
@@ -326,11 +323,11 @@ class FusionRecord:
 
     @property
     def keeps_latitude(self) -> bool:
-        """Whether EKF2 keeps its position as latitude and longitude (from v1.16)."""
+        """True if EKF2 stores its position as latitude and longitude (since v1.16)."""
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
-        """Whether EKF2 was in one of :attr:`states` then; not where the log does not tell."""
+        """Return a mask of the times in one of :attr:`states`; all False if not logged."""
         known = self.states.get(state)
         return (
             np.zeros(len(times_s), bool) if known is None else step_values_at(known, times_s) > 0.0
@@ -339,26 +336,24 @@ class FusionRecord:
 
 @dataclass(frozen=True)
 class AidLog:
-    """What a log has of one aid of EKF2.
+    """Logged data of one EKF2 aid.
 
     Attributes
     ----------
     topics : tuple of str
-        Where its innovations, and their variances, are from.
+        Topics with the innovations and their variances.
     axes : tuple of str
     samples : DataFrame
-        By time of measurement, for each axis: ``innovation_<axis>`` (measurement minus prediction)
-        and ``variance_<axis>`` (S); where the aid has a topic of its own also ``noise_<axis>``
-        (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0), of external
-        vision's position ``observation_<axis>`` as well. In the aid's unit, variances in its
-        square.
+        Indexed by measurement time, for each axis: ``innovation_<axis>`` (measurement minus
+        prediction) and ``variance_<axis>`` (S). From ``estimator_aid_src`` topics also
+        ``noise_<axis>`` (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0),
+        for external vision position ``observation_<axis>``. In the unit of the aid or its square.
     enabled : Series or None
-        1 while EKF2 means to fuse it, 0 while it does not, a step function; None where the log
-        does not tell.
+        Step function: 1 while fusion of the aid is enabled, otherwise 0; None if not logged.
     parameters : mapping
-        EKF2's for this aid, by PX4 name, as at the log's start.
+        EKF2 parameters of the aid at the start of the log, by PX4 name.
     excluded_count : int
-        Innovations without a variance near in time, which are not among the samples.
+        Number of innovations that were dropped because no variance is near in time.
     """
 
     topics: tuple[str, ...]
@@ -372,47 +367,47 @@ class AidLog:
 
 
 def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
-    """Values of a step function at some times; before its first step that of the first."""
+    """Return the values of a step function; before its first time, the first value."""
     at = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
     return np.asarray(steps, dtype=np.float64)[at]
 
 
 @dataclass(frozen=True)
 class Ekf2:
-    """EKF2's output, variances and innovations, of the instance that was primary at each time.
+    """State, variances and innovations of EKF2, from the primary instance at each time.
 
     Attributes
     ----------
     state : DataFrame, shape (n, 6)
-        Position and velocity (m, m/s, NED) exactly as published, resets included.
+        Position and velocity (m, m/s, NED) as published, including resets.
     variance : DataFrame, shape (n, 6), or Unavailable
         Position and velocity variances (m², m²/s²).
-    innovations : mapping from axis name to DataFrame, or to Unavailable
-        Per axis: ``innovation_m`` (measurement minus prediction: PX4's own sign is flipped, here
-        and only here), ``innovation_variance_m2``, ``observation_variance_m2`` (NaN where not
-        logged), ``test_ratio``, ``fused``, ``rejected`` (1, 0, or NaN where not logged).
+    innovations : mapping from axis name to DataFrame or Unavailable
+        ``innovation_m`` (measurement minus prediction; opposite to PX4's sign),
+        ``innovation_variance_m2``, ``observation_variance_m2`` (NaN if not logged),
+        ``test_ratio``, ``fused``, ``rejected`` (1, 0, or NaN if not logged).
     innovation_topics : tuple of str
     fusing : DataFrame or Unavailable
-        Columns ``horizontal``, ``vertical``, ``yaw``: 1 while EKF2 reports that it fuses external
-        vision for them, a step function.
+        Step functions ``horizontal``, ``vertical``, ``yaw``: 1 while EKF2 reports fusion of
+        external vision for them.
     resets : tuple of Reset
     instances : tuple of (float, int)
-        Primary instance from each time on.
+        (Start time, primary instance from then on).
     gate : float
-        EKF2_EVP_GATE in standard deviations.
+        EKF2_EVP_GATE (in √S).
     notes : tuple of str
-        Joins and what they dropped, time bases, and the like.
+        Sentences on dropped samples and on the times.
     accelerometer_bias : DataFrame, shape (n, 3), or Unavailable
         Estimated bias (m/s², body FRD) that EKF2 subtracts from the specific force.
     step_s : float
-        Time between two of its predictions.
+        Prediction interval.
     horizon_s : float or Unavailable
-        How far its fusion runs behind its output: the state at t knows measurements up to
-        t - horizon, carried to t by the IMU.
+        Delay of the fusion horizon: the state at t contains measurements up to t - horizon,
+        propagated to t with the IMU.
     record : FusionRecord or Unavailable
-        The inside of the filter, as far as it is logged.
-    aids : mapping from PX4's name to AidLog
-        What the log has of everything that EKF2 can fuse.
+        Data at the fusion horizon.
+    aids : mapping from PX4 name to AidLog
+        Logged data of all aids that EKF2 can fuse.
     """
 
     state: pd.DataFrame
@@ -435,16 +430,16 @@ class Ekf2:
 
 @dataclass(frozen=True)
 class Truth:
-    """A reference that no estimator used: simulation ground truth or motion capture.
+    """Ground truth that no estimator used: from simulation or motion capture.
 
     Attributes
     ----------
     name : str
-        The topic.
+        Topic, message or track name.
     samples : DataFrame, shape (n, 6)
-        Position and velocity (m, m/s, NED); velocity is NaN where not logged.
+        Position and velocity (m, m/s, NED); velocity is NaN if not logged.
     attitude : DataFrame, shape (m, 4), or None
-        Quaternion ``w, x, y, z`` that turns body FRD into NED; None where not logged.
+        Quaternion ``w, x, y, z`` that rotates body FRD to NED; None if not logged.
     """
 
     name: str
@@ -461,7 +456,7 @@ MODES_NOT_LOGGED = Unavailable(
 )
 
 
-# equal to itself only: what is made of it is kept by it
+# eq=False: hash and equality by identity, because caches use flights as keys
 @dataclass(frozen=True, eq=False)
 class Flight:
     """One recorded flight.
@@ -470,33 +465,33 @@ class Flight:
     ----------
     log : LogInfo
     imu : DataFrame or Unavailable
-        Specific force (m/s², body FRD, not bias corrected) and angular rate (rad/s, body FRD), and
-        ``clipped``, above 0 where an accelerometer was at the end of its range, where logged.
+        Specific force (m/s², body FRD, not bias corrected), angular rate (rad/s, body FRD) and, if
+        logged, ``clipped``: above 0 if an accelerometer reached the limit of its range.
     attitude : DataFrame or Unavailable
-        Quaternion w, x, y, z that turns body FRD into NED.
+        Quaternion w, x, y, z that rotates body FRD to NED.
     positions : tuple of PositionTrack
-        Every external position track found, in order of preference.
+        All external position tracks, in order of preference.
     ekf2 : Ekf2 or Unavailable
     truth : Truth or Unavailable
     airborne : tuple of (float, float), or Unavailable
-        Stretches (s) in which the land detector says that the vehicle flies; empty if never.
+        Intervals (s) in which the land detector reports flight; empty if none.
     missing : tuple of Unavailable
-        What was looked for and not found, with the remedy.
+        Missing parts, with reason and action.
     streams : mapping from part to Stream
-        Where each part was read from: "imu", "attitude", "ekf2_state", "ekf2_variance",
-        "ekf2_innovations", "ekf2_fusing", "truth", "airborne", as far as there is one.
+        Source of each available part: "imu", "attitude", "ekf2_state", "ekf2_variance",
+        "ekf2_innovations", "ekf2_fusing", "truth", "airborne".
     clocks : tuple of ClockMap
-        Clocks other than the autopilot's that were mapped to it.
+        Maps from other clocks to the boot clock.
     unused : tuple of Unused
-        What the log holds besides, and why it is not used.
+        Other position-related data in the log that px4fuse does not use.
     inputs : tuple of InputFile
-        Files read beside the log.
+        Files read in addition to the log.
     modes : tuple of FlightMode, or Unavailable
-        In order of time, without overlap.
+        Flight modes in order of time, without overlap.
     tumble_spans : tuple of (float, float)
-        Stretches (s) in which PX4's failure detector found roll or pitch beyond their limits.
+        Intervals (s) in which PX4's failure detector reports roll or pitch beyond the limits.
     barometer : DataFrame or None
-        ``down_m`` by the pressure, from a height that is not known.
+        Barometer height ``down_m``, with unknown zero.
     """
 
     log: LogInfo
@@ -519,16 +514,16 @@ class Flight:
 
 
 def sort_by_preference(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:
-    """Position tracks in the order in which a comparison prefers them."""
+    """Sort position tracks by preference for a comparison, best first."""
     return tuple(sorted(tracks, key=lambda track: track.origin.preference))
 
 
 def sample_rate(samples: pd.DataFrame) -> float:
-    """Rate of a time-indexed frame in Hz, gaps left out; NaN below two samples.
+    """Return the sample rate (Hz) of a time-indexed frame without gaps; NaN below two samples.
 
-    From the mean of all intervals up to three times the median one: a thinned topic alternates
-    between two intervals, of which the median knows only one. Samples that come in bursts have no
-    regular interval, so that all of them count.
+    The rate is the inverse mean of all intervals up to three times the median. The median alone
+    would be wrong for a decimated topic, which alternates between two intervals. For samples in
+    bursts, without a regular interval, the mean of all intervals is used.
     """
     if len(samples) < 2:
         return float("nan")

@@ -1,4 +1,4 @@
-"""Where a position comes from and how it got here, with all that follows from it."""
+"""Origin of a position track: kind of source, path to the log, and their properties."""
 
 from typing import Literal
 
@@ -14,18 +14,18 @@ Passage = Literal[
 
 
 class Origin(Record, frozen=True):
-    """What a position source is; the tracks of a flight have one each.
+    """Kind of a position source and its path to the log.
 
     Attributes
     ----------
     kind : str
-        "uwb" stands for any positioning system that sends no orientation, "vio" for any odometry.
+        "uwb" is any positioning system without orientation, "vio" is any odometry.
     passage : str
-        How it got from the sender into the flight.
+        Path from the sender to the log.
     aid : Aid or None
-        What EKF2 takes it as, with EKF2's parameters for it; None where EKF2 never fuses it.
+        EKF2 aid of this source, with its EKF2 parameters; None if EKF2 never fuses it.
     is_automatic : bool
-        Whether it may be chosen without being asked for: GNSS only where EKF2 fused it.
+        True if it may be selected by default; for GNSS only if EKF2 fused it.
     """
 
     kind: PositionKind
@@ -35,46 +35,45 @@ class Origin(Record, frozen=True):
 
     @property
     def may_drift(self) -> bool:
-        """Whether its error may grow with the way, as that of an odometry does.
+        """True if the error may grow with the distance travelled, as for odometry.
 
-        A log does not tell odometry from motion capture that is sent in the same messages, hence
-        "may". What drifts in no case: a positioning system without orientation (UWB), motion
-        capture sent as such, GNSS, and a positioning system's own file.
+        A log does not distinguish odometry from motion capture sent in the same messages. UWB,
+        motion capture in its own messages, GNSS and position files do not drift.
         """
         return self.kind == "vio"
 
     @property
     def reconstructed(self) -> bool:
-        """Whether it was derived from what EKF2 logs instead of being logged as it arrived."""
+        """True if it was derived from EKF2's logged data instead of logged as received."""
         return self.passage in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
-        """Whether it holds the samples of the sender, all of them."""
+        """True if it contains all samples of the sender."""
         return self.passage in ("given file", "as it arrived")
 
     @property
     def is_vision(self) -> bool:
-        """Whether EKF2 takes it as external vision."""
+        """True if EKF2 fuses it as external vision."""
         return self.aid == EV_POS
 
     @property
     def fused_as_gnss(self) -> bool:
-        """Whether EKF2 takes it as GNSS."""
+        """True if EKF2 fuses it as GNSS."""
         return self.aid == GNSS_POS
 
     @property
     def is_gnss(self) -> bool:
-        """Whether it is satellite navigation, whose errors are slow for the most part.
+        """True for satellite navigation, whose errors are mostly time-correlated.
 
-        Multipath and the atmosphere change over seconds to minutes: what R has to cover is larger
-        than what differs from one position to the next.
+        Multipath and atmospheric errors change over seconds to minutes, so R must be larger than
+        the differences of consecutive positions suggest.
         """
         return self.kind == "gnss"
 
     @property
     def preference(self) -> int:
-        """Its place in :data:`ORIGINS`; the least is the best."""
+        """Index in :data:`ORIGINS`; the smallest is preferred."""
         places = [(known.aid, known.passage) for known in ORIGINS]
         return places.index((self.aid, self.passage))
 
@@ -86,12 +85,12 @@ ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
 LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
 FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
 GNSS = Origin("gnss", "as it arrived", GNSS_POS, is_automatic=False)
-# In order of preference. A file given by hand is taken to be of the system that was sent to EKF2
+# In order of preference. A position file is assumed to be from the system that EKF2 fused
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 
 
 def find_origin(kind: str, passage: str) -> Origin:
-    """The origin of this kind that got here in this way."""
+    """Return the known origin of this kind and path to the log."""
     return next(
         known_origin
         for known_origin in ORIGINS
@@ -100,5 +99,5 @@ def find_origin(kind: str, passage: str) -> Origin:
 
 
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:
-    """The same, as an odometry where the external vision has an orientation that turns."""
+    """Change the kind "uwb" to "vio" if the orientation of the track changes (``turns``)."""
     return replace(origin, kind="vio") if origin.kind == "uwb" and turns else origin

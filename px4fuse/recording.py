@@ -1,4 +1,4 @@
-"""What a recording is: the log, its senders and clocks, and what was read from where."""
+"""Description of a recording: log file, senders, clocks, and source of each part."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,28 +9,28 @@ from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
 
 class Dropout(Record, frozen=True):
-    """A stretch that the logger lost: start and length in seconds."""
+    """Interval that the logger lost: start and duration in s."""
 
     start_s: float
     duration_s: NotNegative
 
 
 class Sender(Record, frozen=True):
-    """One MAVLink sender that a recording heard.
+    """MAVLink sender in a recording.
 
     Attributes
     ----------
     system, component : int
         MAVLink ids.
     description : str
-        What it says it is ("PX4 quadrotor", "companion computer").
+        Type from its heartbeat ("PX4 quadrotor", "companion computer").
     messages : int
-        Messages with a good checksum.
+        Messages with a valid checksum.
     lost_share : float or None
-        Share of its messages that the recording lacks, by the sequence numbers; None where it
-        does not count them.
+        Fraction of its messages missing in the recording, by the sequence numbers; None if the
+        sender does not count its messages.
     chosen : bool
-        Whether it is the autopilot that the flight was read from.
+        True for the autopilot of the flight.
     """
 
     system: int
@@ -42,29 +42,29 @@ class Sender(Record, frozen=True):
 
 
 class ClockMap(Record, frozen=True):
-    """How one clock was mapped to the autopilot's boot clock.
+    """Map from one clock to the autopilot's boot clock.
 
-    boot = stamp + offset + drift · (stamp - middle of the stamps)
+    boot = timestamp + offset + drift · (timestamp - middle of the timestamps)
 
     Attributes
     ----------
     clock : str
-        Which clock ("UNIX time of system 1, component 197").
+        Name of the clock ("UNIX time of system 1, component 197").
     method : str
         "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time", "arrival time" or "position in the
         stream".
     pairs : int
-        Pairs of readings that it rests on.
+        Number of pairs of clock readings.
     offset_s : float
         Boot clock minus this clock, at the middle of the pairs.
     drift_ppm : float
-        How much faster the boot clock runs (parts per million).
+        Rate of the boot clock minus rate of this clock (parts per million).
     jitter_s : float
         Standard deviation of the pairs about the fitted line (1.4826 · median absolute deviation).
     note : str
-        What to keep in mind; may be empty.
+        Limitation of the map; may be empty.
     distinct_stamps : int or None
-        How many values the stamps take where those do not tell the time.
+        Number of distinct timestamps if the timestamps are not usable as a clock.
     """
 
     clock: str
@@ -79,16 +79,16 @@ class ClockMap(Record, frozen=True):
 
 @dataclass(frozen=True)
 class Stream:
-    """Where one part of a flight was read from.
+    """Source of one part of a flight.
 
     Attributes
     ----------
     topics : tuple of str
         PX4 topics or MAVLink messages.
     clock : str
-        Which clock its time stamps were given on.
+        Clock of the timestamps.
     log : str
-        Name of the file.
+        File name.
     """
 
     topics: tuple[str, ...]
@@ -98,7 +98,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class Unused:
-    """Something in the log that bears on position but that px4fuse does not use, and why."""
+    """Position-related topic or message that px4fuse does not use, with the reason."""
 
     name: str
     count: int
@@ -106,7 +106,7 @@ class Unused:
 
 
 class InputFile(Record, frozen=True):
-    """A file that was read beside the log: name without its folder, hash, size, and its part."""
+    """File read in addition to the log: name without folder, hash, size and role."""
 
     name: str
     sha256: Sha256
@@ -115,53 +115,54 @@ class InputFile(Record, frozen=True):
 
 
 class LogInfo(Record, frozen=True, omit_defaults=False):
-    """What the log is.
+    """Description of the log file.
 
     Attributes
     ----------
     name : str
-        File name without its folder.
+        File name without folder.
     sha256 : str
-        Of the file's bytes.
+        Hash of the file content.
     bytes : int
+        File size.
     format : str
-        "ULog", "MAVLink tlog" (with time of receipt) or "MAVLink stream" (without).
+        "ULog", "MAVLink tlog" (with receive times) or "MAVLink stream" (without).
     firmware : str
-        For example "PX4 v1.16.1"; "unknown" where the log does not say.
+        For example "PX4 v1.16.1"; "unknown" if not in the log.
     firmware_hash : str
         Git hash, or "unknown".
     hardware : str
     boot_time_s : float
         Boot clock (s) of time zero, the first sample of data.
     duration_s : float
-        Span of the data, not of the file: some logs carry one stale message hours away. In a ULog
-        of the IMU (or else of the densest topic), in MAVLink of what carries the boot clock.
+        Duration of the data: in a ULog of the IMU (or else of the topic with most samples), in
+        MAVLink of the messages with boot time. Single messages hours away are ignored.
     dropouts : tuple of Dropout
-        As the logger itself reported them.
+        Dropouts that the logger reported.
     parameters : mapping
-        Parameters that bear on fusion and logging, by PX4 name, as they were at the log's start.
+        Parameters of fusion and logging at the start of the log, by PX4 name.
     notes : tuple of str
-        What the reader had to do: samples with impossible time stamps, clocks that were mapped.
+        Sentences on dropped samples and mapped clocks.
     damage : tuple of str
-        What of the file could not be read, and how much that is: sentences.
+        Sentences on unreadable parts of the file.
     bytes_read : int
         Part of ``bytes`` that was read as complete messages.
     ends_in_flight : bool
-        Whether the land detector still says "flying" at the end of the data.
+        True if the land detector reports flight at the end of the data.
     restarts : int or None
-        How often the boot clock began again: then one part of the recording was read.
+        Number of restarts of the boot clock; only one part of the recording is used then.
     receipt_went_back : int or None
-        How often the recording computer's clock was set back.
+        Number of backward steps of the recording computer's clock.
     dropped : mapping
-        Samples whose time stamps cannot be, by topic or file.
+        Number of samples with invalid timestamps, by topic, message or file.
     autopilot : str
-        "PX4", "ArduPilot", or what the log says.
+        "PX4", "ArduPilot", or the name in the log.
     start_unix_s : float or None
-        UNIX time of time zero, by whichever clock the log has it from; None where it has none.
+        UNIX time of time zero; None if not in the log.
     senders : tuple of Sender
-        Of a MAVLink recording, most messages first.
+        Senders of a MAVLink recording, most messages first.
     vehicle : str
-        Identifier of the flight controller, hexadecimal; empty where the log has none.
+        Hexadecimal identifier of the flight controller; empty if not in the log.
     """
 
     name: str
@@ -191,5 +192,5 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
 
     @property
     def has_ulog(self) -> bool:
-        """Whether its autopilot writes a ULog: ArduPilot writes DataFlash, which is not read."""
+        """True if the autopilot writes ULog files; ArduPilot writes DataFlash instead."""
         return self.autopilot != "ArduPilot"
