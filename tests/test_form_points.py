@@ -161,9 +161,7 @@ def test_a_constant_form_does_not_pay_on_loops() -> None:
         measured = [size + rng.normal(0.0, 0.4) for size in sizes]
         wrong = [TrueMistake("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
         verdicts = VerdictTruth("underconfident", 7.0), VerdictTruth("overconfident", 1.1)
-        truths.append(
-            FormTruth(tuple(wrong), 0.01, *verdicts, ("normal",), (), (0.5, 0.1, ()))
-        )
+        truths.append(FormTruth(tuple(wrong), 0.01, *verdicts, ("normal",), (), (0.5, 0.1, ())))
     for kind in ("open-end", "none"):
         for each in constants(truths, kind):
             form = replace(each, quantities=(None, None, ()))

@@ -162,7 +162,9 @@ def test_recordings_that_do_not_overlap_are_refused_with_both_spans(record):
 
 def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
     moved = replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0)
-    with pytest.raises(MissingDataError, match="are different flights: their EKF2 positions differ"):
+    with pytest.raises(
+        MissingDataError, match="are different flights: their EKF2 positions differ"
+    ):
         join(sample_flight, replace(tlog_flight, ekf2=moved))
 
 

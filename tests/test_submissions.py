@@ -161,7 +161,9 @@ def test_metadata_that_cannot_be_read_is_said(tmp_path):
     bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
     (found,), (note,) = find_submissions([write(tmp_path / "export.zip", bomb)])
     assert found.origin.person == Person("", numbers={"gradescope": "3"})
-    assert note.startswith("submission_metadata.yml: the zip entry is compressed more than 100 times")
+    assert note.startswith(
+        "submission_metadata.yml: the zip entry is compressed more than 100 times"
+    )
 
 
 def test_times_of_entries_are_kept(tmp_path):

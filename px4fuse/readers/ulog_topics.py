@@ -135,7 +135,7 @@ class _Reader(ULog):  # type: ignore[misc]
     MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
 
     def _check_packet_corruption(self, header: Any) -> bool:
-        # pyulog accepts unknown message types up to 10,000 bytes; valid types are capital letters
+        # pyulog accepts unknown types up to 10,000 bytes; valid types are capital letters
         is_corrupt: bool = super()._check_packet_corruption(header)
         if not ord("A") <= header.msg_type <= ord("Z"):
             self._file_corrupt = is_corrupt = True
