@@ -56,7 +56,7 @@ from px4fuse.verification.verification import (
     NO_LOG,
     RELATIVE_TOLERANCE,
     compare_results,
-    flattened,
+    flatten,
     verify,
 )
 
@@ -170,9 +170,9 @@ def test_compare_results_numbers_1e_4_apart_differ(aisle: Base) -> None:
     for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
         theirs = nudged(ours, share)
         found = {one.path for one in compare_results(theirs, ours)[0]}
-        wide = verification.ESTIMATES if least == RELATIVE_TOLERANCE else ()
+        wide = verification.ESTIMATE_PATHS if least == RELATIVE_TOLERANCE else ()
         expected = {
-            path[:120] for path, value in flattened(ours)
+            path[:120] for path, value in flatten(ours)
             if isinstance(value, float) and abs(value) > 0.01 and not path.startswith(wide)
         }  # fmt: skip
         assert len(expected) > 100
