@@ -328,11 +328,11 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     # fonts
     "glyphs exchanged by a map": (exchanged_glyphs, "/CIDToGIDMap is of another type", True),
     "outlines exchanged": (
-        replaced(descriptor, "/FontFile2", exchanged_outlines), "/FontFile2: its content", False,
+        replaced(descriptor, "/FontFile2", exchanged_outlines), "/FontFile2: the content", False,
     ),
     "letters exchanged": (
         replaced(font("/f0"), "/ToUnicode", lambda c: c.replace(b"> <0031>", b"> <0039>")),
-        "/ToUnicode: its content", False,
+        "/ToUnicode: the content", False,
     ),
     "widths": (descendant("/W", array(N(0), N(60), N(0))), "/W has 3 parts", True),
     "the default width": (descendant("/DW", N(900)), "/DW is '900'", False),
@@ -508,15 +508,15 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a subject": (titled(Subject="verified"), "an entry /Subject", True),
     "XMP's title": (
         replaced(lambda w: w.root_object, "/Metadata",
-                 lambda c: c.replace(b"px4fuse loop", b"verified:")), "/Metadata: its", False,
+                 lambda c: c.replace(b"px4fuse loop", b"verified:")), "/Metadata: the", False,
     ),
     "XMP with entities": (
         replaced(lambda w: w.root_object, "/Metadata",
                  lambda c: c.replace(b"?><x:", b'?><!DOCTYPE a [<!ENTITY b "c">]><x:')),
-        "/Metadata: its", False,
+        "/Metadata: the", False,
     ),
     "XMP that is no XML": (
-        replaced(lambda w: w.root_object, "/Metadata", lambda c: c + b"<"), "it cannot be read",
+        replaced(lambda w: w.root_object, "/Metadata", lambda c: c + b"<"), "cannot be read",
         True,
     ),
 }  # fmt: skip
@@ -587,7 +587,7 @@ FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "a hybrid table": (hybrid, "a second table of objects"),
     "a later generation": (later_generation, "/Contents: an object of a later"),
     "a key twice": (
-        lambda pdf: pdf.replace(b"/Tabs/S", b"/Tabs/S/Tabs/S", 1), "it cannot be read",
+        lambda pdf: pdf.replace(b"/Tabs/S", b"/Tabs/S/Tabs/S", 1), "cannot be read",
     ),
     "no end": (lambda pdf: pdf[: pdf.rfind(b"startxref")], ""),
     "nothing": (lambda _: b"", ""),

@@ -170,7 +170,7 @@ def test_compare_results_numbers_1e_4_apart_differ(aisle: Base) -> None:
     for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
         theirs = nudged(ours, share)
         found = {one.path for one in compare_results(theirs, ours)[0]}
-        wide = verification.ESTIMATES if least == RELATIVE_TOLERANCE else ()
+        wide = verification.ESTIMATE_PATHS if least == RELATIVE_TOLERANCE else ()
         expected = {
             path[:120] for path, value in flatten(ours)
             if isinstance(value, float) and abs(value) > 0.01 and not path.startswith(wide)
