@@ -73,7 +73,7 @@ def test_group_by_cause_lists_consequences_after_cause(given: Any, told: Any) ->
 
 def test_verdict_notes_small_factor_and_not_white_are_listed(sample: Analysis) -> None:
     small, white = verdict_notes(sample)
-    assert "ours aisle overstated 1.09× in σ" in small
+    assert "KF aisle (1.09×)" in small
     assert "ours down p < 0.001" in white
 
 

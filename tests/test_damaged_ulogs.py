@@ -98,9 +98,9 @@ def test_read_ulog_damaged_states_the_loss(content, whole, capsys, kind: str, pl
         kept_before = at / len(content) - 0.01
         assert kept > (kept_before if at > len(data) - MAX_MESSAGE_BYTES else 0.85)
     said = " ".join(log.damage)
-    stated = re.search(r"([\d.]+) s of the IMU are missing before the end at ([\d.]+) s", said)
+    stated = re.search(r"([\d.]+) s of ([\d.]+) s of IMU data are missing", said)
     if kept < 1.0 - MAX_SILENT_LOSS:
-        assert stated or "ends in mid-message after" in said or log.ends_in_flight
+        assert stated or "ends within a message after" in said or log.ends_in_flight
     if stated and kind != "flipped":
         missing_s, end_s = map(float, stated.groups())
         assert missing_s == pytest.approx(end_s - len(flight.imu) / IMU_HZ, abs=0.3)
@@ -112,13 +112,13 @@ def test_read_ulog_rubbish_inside_keeps_the_flight(content, whole, rubbish: byte
     flight = read_ulog("long.ulg", content[:at] + rubbish + content[at:])
     assert count_samples(flight) > 0.999 * whole
     assert flight.log.bytes - flight.log.bytes_read == pytest.approx(len(rubbish), abs=2000)
-    assert "0.0 s of the IMU are missing" in flight.log.damage[0]
+    assert "0.0 s of 40.0 s of IMU data are missing" in flight.log.damage[0]
 
 
 def test_read_ulog_damaged_definition_ends(content) -> None:
     """pyulog alone repeats the rest of the file where a definition is longer than it."""
     cut = content[: content.index(b"vehicle_attitude:")]
-    with patience(), pytest.raises(LogError, match="without any data"):
+    with patience(), pytest.raises(LogError, match="this ULog contains no data"):
         read_ulog("cut.ulg", cut[:-3] + struct.pack("<HB", 60_000, 0) + bytes(100))
 
 
@@ -153,12 +153,12 @@ def test_read_log_cut_off_states_the_end(tmp_path, sample_log, share: float) -> 
     assert flight.log.ends_in_flight
     assert flight.log.bytes_read == pytest.approx(share * len(content), abs=1000)
     (said,) = flight.log.damage
-    assert f"ends in mid-message after {flight.log.duration_s:.1f} s, in flight" in said
+    assert f"ends within a message after {flight.log.duration_s:.1f} s, in flight" in said
     if share > 0.1:
         return
     found = find(run_comparison(ComparisonRequest(log=str(path))))
     (named,) = [one for one in found if one.id == "log_damaged"]
-    assert named.message.startswith("The file ends in mid-message")
+    assert named.message.startswith("The file ends within a message")
 
 
 def test_cli_damaged_log_prints_the_loss(tmp_path, sample_log, monkeypatch, capsys) -> None:
@@ -171,8 +171,8 @@ def test_cli_damaged_log_prints_the_loss(tmp_path, sample_log, monkeypatch, caps
         code, out, err = run_main(monkeypatch, capsys, *arguments)
         assert (code, "Traceback" in err) == (0, False)
         said = " ".join(out.split())  # lines are wrapped
-        assert "the file ends in mid-message after 24.0 s, in flight" in said
-        assert "0.8 s of the IMU are missing before the end at 24.0 s" in said
+        assert "the file ends within a message after 24.0 s, in flight" in said
+        assert "0.8 s of 24.0 s of IMU data are missing" in said
 
 
 def test_info_unreadable_log_exits_with_one_line(tmp_path, monkeypatch, capsys) -> None:
@@ -181,7 +181,7 @@ def test_info_unreadable_log_exits_with_one_line(tmp_path, monkeypatch, capsys) 
     for command in ("info", "compare"):
         code, out, err = run_main(monkeypatch, capsys, command, path)
         assert (code, out, len(err.splitlines())) == (2, "", 1)
-        assert "without any data" in err
+        assert "this ULog contains no data" in err
 
 
 # IMU samples that a reader with its own resynchronisation finds, which pyulog does not
@@ -197,4 +197,4 @@ def test_read_log_real_damage_loses_little(shared_logs, name: str) -> None:
     count, lost = DAMAGED[name]
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     assert count * (1.0 - lost) < len(flight.imu) < count
-    assert "s of the IMU are missing before the end at" in flight.log.damage[0]
+    assert re.search(r"[\d.]+ s of [\d.]+ s of IMU data are missing", flight.log.damage[0])

@@ -123,7 +123,10 @@ def test_a_report_that_was_saved_again():
     (b"%PDF-1.4\nstartxref\n5\n%%EOF", DAMAGED),
     (b"%PDF-1.4\n" + bytes(intake.MAX_BYTES), "larger than 25 MB"),
     (small(None), "printed to PDF, which removes attachments. Hand in the original"),
-    (small(name="../../results.json"), "name of the attached file is '../../results.json', not 'results.json'"),
+    (
+        small(name="../../results.json"),
+        "name of the attached file is '../../results.json', not 'results.json'",
+    ),
     (small(name="C:\\results.json"), "the name of the attached file is"),
     (small(name="\u202ex\x1b[2J" * 50), "the name of the attached file is"),
     (small(edit=lambda w: w.add_attachment("results.json", b"{}")), "several attachments"),

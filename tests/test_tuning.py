@@ -232,7 +232,7 @@ def test_tune_drifting_source_gets_random_walk() -> None:
         (Noise(0.1, None, None), "0.1 m or more"),
         (Noise(None, None, 0.05), "at most 0.05 m"),
         (Noise(None, 8.0, None), "at least 8 m"),
-        (Noise(None, None, None), "not determined"),
+        (Noise(None, None, None), "unknown"),
     ],
 )
 def test_format_noise_at_search_end_is_a_bound(noise: Noise, said: str) -> None:
@@ -242,7 +242,7 @@ def test_format_noise_at_search_end_is_a_bound(noise: Noise, said: str) -> None:
 @pytest.mark.parametrize(
     ("noise", "expected"),
     [
-        (Noise(None, None, None), "not determinable"),
+        (Noise(None, None, None), "not identifiable"),
         (Noise(None, None, 0.25), "at most 0.25"),
         (Noise(None, 8.0, None), "at least 8"),
         (Noise(0.1, None, 0.2), "0.1 (0-0.2)"),

@@ -16,7 +16,7 @@ from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight
-from px4fuse.report.whatif import column_heads, reading, rows, sweep_table
+from px4fuse.report.whatif import NOT_PREDICTABLE, column_heads, reading, rows, sweep_table
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
 from px4fuse.results.reading import read_results
@@ -83,7 +83,7 @@ def test_whatif_without_set_uses_ml_estimates(estimated: WhatIfAnalysis) -> None
     assert estimated.asked
     assert set(estimated.changes) == {"EKF2_EVP_NOISE"}
     assert estimated.changes["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
-    assert "what the data ask for" in column_heads(estimated)[-1]
+    assert "maximum-likelihood estimate" in column_heads(estimated)[-1]
     table, found = {label.strip(): cells for label, *cells in rows(estimated)}, estimated.whatif
     every = (found.logged, found.replayed, found.whatif[0])
     assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
@@ -101,9 +101,9 @@ def test_whatif_sweep_keeps_set_parameters(swept: WhatIfAnalysis) -> None:
     assert sweep_table(swept)[0][0] == "EKF2_EVP_NOISE (m)"
     assert [row[0] for row in sweep_table(swept)[1]] == ["0.05", "0.1", "0.2"]
     best, error, *_ = reading(swept)
-    assert "nearest to 1 at EKF2_EVP_NOISE 0.1" in best
+    assert "closest to 1 at EKF2_EVP_NOISE 0.1" in best
     least = min(values, key=lambda value: value.position_rmse_to_truth_m)
-    assert f"least at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
+    assert f"smallest at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
 
 
 def test_whatif_log_without_replay_data_gives_reason(sample_log: Path) -> None:
@@ -177,9 +177,10 @@ def test_unpredictable_change_has_no_numbers(sample_flight: Flight) -> None:
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")
     told = run_what_if(request, flight=sample_flight)
     table = rows(told)
-    assert {line[3] for line in table} == {"chaotic"}
-    assert all("chaotic" not in line[:3] for line in table)
-    assert [line[1] for line in sweep_table(told)[1]] == ["chaotic", "chaotic"]
+    assert {line[3] for line in table} == {NOT_PREDICTABLE}
+    assert all(NOT_PREDICTABLE not in line[:3] for line in table)
+    assert [line[1] for line in sweep_table(told)[1]] == [NOT_PREDICTABLE] * 2
     said = " ".join(reading(told))
-    assert "Chaotic: more than 35% would be rejected, or 2 mm of noise" in said
-    assert "nearest to 1" not in said
+    assert "Not predictable: more than 35% of the samples would be rejected" in said
+    assert "2 mm of position noise would change the result" in said
+    assert "closest to 1" not in said

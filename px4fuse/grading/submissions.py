@@ -255,7 +255,7 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
         yield Submission(path.resolve(), "", path.name)
         return
     if not path.is_dir():
-        raise SettingsError(f"{one_line(str(path), MAX_NAME)}is not a file or folder.")
+        raise SettingsError(f"{one_line(str(path), MAX_NAME)} is not a file or folder.")
     root = path.resolve()
     outside = 0
     for file in files_below(root):  # symbolic links to folders are not entered
