@@ -1,8 +1,7 @@
-"""Write small MAVLink recordings with pymavlink: stamps, links, senders and clocks on demand.
+"""Write small MAVLink recordings with pymavlink, with chosen times, links, senders and clocks.
 
-The made flight swings along the aisle of :func:`flights.motion`, so that every message has a closed
-form. Clocks are lines of the autopilot's boot clock; a message is received ``delay`` after it was
-sent, never before.
+The flight moves along the aisle of :func:`flights.motion`, so every message has a closed form. The
+other clocks are functions of the boot clock. A message is received ``delay`` after it was sent.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ Address = tuple[int, int]
 AUTOPILOT: Address = (1, 1)
 COMPANION: Address = (1, 197)
 GROUND: Address = (255, 190)
-BOOT_S = 50.0  # boot clock at the flight's start
-UNIX_S = 1_700_000_000.0  # UNIX time at boot
+BOOT_S = 50.0  # s; boot clock at the start of the flight
+UNIX_S = 1_700_000_000.0  # s; UNIX time at boot
 HEADING_DEG, LENGTH_M = 30.0, 10.0
 LEAST_DELAY_S = 0.002
 MESSAGES = {message.msgname: message for message in dialect.mavlink_map.values()}
@@ -40,7 +39,7 @@ VELOCITY_VARIANCE = (0.04, 0.05, 0.06)
 
 
 def message(name: str, /, **fields: Any) -> Any:
-    """A pymavlink message; fields that are not given are zero."""
+    """Make a pymavlink message; fields that are not given are zero."""
     kind = MESSAGES[name]
     values = []
     lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
@@ -61,7 +60,7 @@ def frame(
     v1: bool = False,
     key: bytes | None = None,
 ) -> bytes:
-    """One frame; ``key`` signs it."""
+    """Return the bytes of one frame, signed with ``key`` if given."""
     link = dialect.MAVLink(None, srcSystem=sender[0], srcComponent=sender[1])
     link.seq = sequence % 256
     if key is not None:
@@ -80,7 +79,7 @@ def raw_frame(
     flags: int = 0,
     v1: bool = False,
 ) -> bytes:
-    """One frame with any payload; ``seed`` is the checksum's last byte (CRC_EXTRA)."""
+    """Return one frame with any payload; ``seed`` is CRC_EXTRA."""
     if v1:
         head = bytes([len(payload), sequence, *sender, number])
     else:
@@ -92,16 +91,16 @@ def raw_frame(
 
 
 def stamp(received_us: int, link: int | None = None) -> bytes:
-    """A tlog's stamp; MAVProxy puts the link's number into the lowest bits."""
+    """Return the receive time of a tlog; MAVProxy writes the link number in the lowest bits."""
     us = received_us if link is None else received_us & ~3 | link
     return int(us).to_bytes(8, "big")
 
 
 @dataclass
 class Recorder:
-    """What a ground station hears, in any order; written in order of receipt.
+    """Messages that a ground station receives, written in order of receipt.
 
-    ``sent`` holds time of receipt (s, UNIX), sender, message and link.
+    ``sent`` contains receive time (s, UNIX), sender, message and link.
     """
 
     sent: list[tuple[float, Address, Any, int | None]] = field(default_factory=list)
@@ -114,7 +113,7 @@ class Recorder:
         return self
 
     def frames(self) -> list[tuple[int, int | None, bytes]]:
-        """Time of receipt (µs), link and frame, with each sender's sequence by link."""
+        """Return receive time (µs), link and frame, with sequence numbers per sender and link."""
         sequence: defaultdict[tuple[Address, int | None], int] = defaultdict(int)
         out = []
         for received, sender, made, link in sorted(self.sent, key=lambda item: item[0]):
@@ -131,7 +130,7 @@ class Recorder:
 
 
 def boot(flight: Flight, samples: pd.DataFrame) -> np.ndarray:
-    """Boot times of samples, s."""
+    """Return the boot times (s) of samples."""
     return samples.index.to_numpy() + flight.log.boot_time_s
 
 
@@ -140,43 +139,43 @@ def track_of(flight: Flight, name: str) -> PositionTrack:
 
 
 def same(boot_s: float) -> float:
-    """The autopilot's own boot clock."""
+    """Return the boot time unchanged."""
     return boot_s
 
 
 def unix(boot_s: float) -> float:
-    """A UNIX clock without drift."""
+    """Convert boot time to UNIX time (s) without drift."""
     return UNIX_S + boot_s
 
 
 @dataclass
 class Aisle:
-    """A flight along the aisle, as MAVLink carries it.
+    """Flight along the aisle, recorded as MAVLink.
 
     Attributes
     ----------
     seconds : float
     start_s : float
-        Boot clock at its first message.
+        Boot time of the first message.
     system : int
     clock : callable
-        Boot time to the companion's own clock, s.
+        Converts boot time to the companion's clock (s).
     receiver : callable
-        Boot time to the clock that stamps the recording, s.
+        Converts boot time to the clock of the receive times (s).
     delay : callable
-        Of a generator: one link delay, s; never below :data:`LEAST_DELAY_S`.
+        Draws a link delay (s) from a random generator; at least :data:`LEAST_DELAY_S`.
     asks, replies : bool
-        Whether the companion asks for TIMESYNC, and whether it replies to the autopilot.
+        True if the companion sends TIMESYNC requests, or replies to those of the autopilot.
     system_time : bool
-        Whether the autopilot knows UNIX time.
+        True if the autopilot sends SYSTEM_TIME with UNIX time.
     uwb : str or None
-        The message that carries the position to the autopilot, at 5 Hz.
+        Message with the position for the autopilot, at 5 Hz.
     estimator : int
-        MAV_ESTIMATOR_TYPE of ``uwb`` where that is ODOMETRY.
+        MAV_ESTIMATOR_TYPE if ``uwb`` is ODOMETRY.
     noise_m : float
     imu_hz : float
     state : str or None
-        The message that carries EKF2's state, at 20 Hz.
+        Message with EKF2's state, at 20 Hz.
     """
 
     seconds: float = 40.0
@@ -198,7 +197,7 @@ class Aisle:
     seed: int = 1
 
     def record(self, into: Recorder | None = None) -> Recorder:
-        """Let a ground station listen."""
+        """Add the messages of the flight to a recorder."""
         rng = np.random.default_rng(self.seed)
         recorder = into or Recorder()
         autopilot, companion = (self.system, AUTOPILOT[1]), (self.system, COMPANION[1])
@@ -223,7 +222,7 @@ class Aisle:
                 hear(boot, autopilot, self.own_state(boot))
         for boot in self.times(10.0):
             if self.replies:
-                # asked at boot, replied a delay later, received after another
+                # request at boot; reply after one link delay, received after another
                 at = boot + self.delay(rng)
                 hear(boot, autopilot, message("TIMESYNC", ts1=ns(boot)))
                 hear(at, companion, message("TIMESYNC", tc1=ns(self.clock(at)), ts1=ns(boot)))
@@ -238,15 +237,15 @@ class Aisle:
         return recorder
 
     def times(self, rate_hz: float) -> list[float]:
-        """Boot times at which something is sent."""
+        """Return the boot times (s) of messages at a fixed rate."""
         return (self.start_s + np.arange(round(self.seconds * rate_hz)) / rate_hz).tolist()
 
     def path(self, boot_s: float) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration, NED."""
+        """Return position, velocity and acceleration (NED)."""
         return _path(boot_s - self.start_s)
 
     def landed(self, boot_s: float) -> int:
-        """On the ground in the first and the last quarter."""
+        """Return MAV_LANDED_STATE: on the ground in the first and the last quarter."""
         share = (boot_s - self.start_s) / self.seconds
         return 2 if 0.25 <= share < 0.75 else 1
 
@@ -267,7 +266,7 @@ class Aisle:
         return message(self.uwb, covariance=triangle(POSE_VARIANCE), **{name: at}, **xyz(here))
 
 
-@lru_cache(maxsize=100_000)  # most flights send at the same times
+@lru_cache(maxsize=100_000)  # most flights use the same times
 def _path(time_s: float) -> tuple[Array, Array, Array]:
     p, v, a = motion(np.array([time_s]), HEADING_DEG, LENGTH_M)
     for each in (p, v, a):
@@ -292,7 +291,7 @@ def xyz(values: Any, suffix: str = "", *, prefix: str = "") -> dict[str, float]:
 
 
 def triangle(diagonal: tuple[float, ...]) -> list[float]:
-    """Upper triangle of a 6×6 covariance; what is not on the diagonal must not be read."""
+    """Return the upper triangle of a 6×6 covariance, with invalid off-diagonal values."""
     made = np.full(21, 99.0)
     made[[0, 6, 11]] = diagonal
     return made.tolist()
@@ -324,7 +323,7 @@ def odometry(
 
 @dataclass
 class Heard:
-    """One message as pymavlink's own reader gives it."""
+    """Message as read by pymavlink."""
 
     start: int
     received_us: int
@@ -335,7 +334,7 @@ class Heard:
 
 @contextlib.contextmanager
 def pymavlink_as_v2() -> Iterator[Any]:
-    """pymavlink's file reader with the dialect "all", its globals put back afterwards."""
+    """Provide pymavlink's file reader with the dialect "all"; restore its globals afterwards."""
     before = {name: os.environ.get(name) for name in ("MAVLINK20", "MAVLINK_DIALECT")}
     os.environ["MAVLINK20"] = "1"
     from pymavlink import mavutil
@@ -352,7 +351,7 @@ def pymavlink_as_v2() -> Iterator[Any]:
 
 
 def heard_by_pymavlink(path: Path, *, stamped: bool) -> tuple[dict[str, list[Heard]], int]:
-    """Everything that recv_match gives, by message name, and how many are of unknown ids."""
+    """Return all messages of pymavlink's reader by name, and the number of unknown ids."""
     found: defaultdict[str, list[Heard]] = defaultdict(list)
     unknown = 0
     with pymavlink_as_v2() as mavutil:

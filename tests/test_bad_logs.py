@@ -1,7 +1,8 @@
-"""Damaged, foreign and empty files: a flight or one line of explanation, and nothing else.
+"""Damaged, unsupported and empty files: a flight or a px4fuse error.
 
-Whatever the bytes are, :func:`read_log` returns a flight or raises one of px4fuse's own errors. It
-does not hang, it does not print and it does not leak an exception of the parser.
+:func:`read_log` returns one of both for any content.
+
+It ends in limited time, prints nothing and raises no exception of the parser.
 """
 
 import contextlib
@@ -29,8 +30,8 @@ from px4fuse.results.build import outcome_results
 from px4fuse.results.contract import to_json
 
 
-def outcome(path: Path) -> Flight | Px4FuseError:
-    """Read a log as a person's script would; anything but the two outcomes fails the test."""
+def read_or_error(path: Path) -> Flight | Px4FuseError:
+    """Return the flight or the px4fuse error; fail on any other exception or printed text."""
     printed = io.StringIO()
     result: Flight | Px4FuseError
     with contextlib.redirect_stdout(printed), patience():
@@ -45,15 +46,15 @@ def outcome(path: Path) -> Flight | Px4FuseError:
     return result
 
 
-def refusal(path: Path) -> str:
-    result = outcome(path)
-    assert isinstance(result, LogError), "this file must be refused"
+def read_error(path: Path) -> str:
+    result = read_or_error(path)
+    assert isinstance(result, LogError), "this file must be rejected"
     return str(result)
 
 
-def analysed(path: Path) -> Flight | None:
-    """Read a log and, where it can be read, take it as far as its axes."""
-    flight = outcome(path)
+def read_and_make_axes(path: Path) -> Flight | None:
+    """Read a log and make its axes; return None if it is rejected."""
+    flight = read_or_error(path)
     if isinstance(flight, Px4FuseError):
         return None
     with contextlib.suppress(Px4FuseError):
@@ -89,10 +90,10 @@ def analysed(path: Path) -> Flight | None:
         ),
     ],
 )  # fmt: skip
-def test_what_is_no_log_or_holds_nothing_of_use(tmp_path, content, words):
+def test_read_log_other_content_is_rejected(tmp_path, content, words):
     path = tmp_path / "other.ulg"
     path.write_bytes(content)
-    assert words in refusal(path)
+    assert words in read_error(path)
 
 
 @pytest.mark.parametrize(
@@ -103,22 +104,22 @@ def test_what_is_no_log_or_holds_nothing_of_use(tmp_path, content, words):
         ("log.pdf", b"%PDF-1.7 and so on", "a PDF", "verify log.pdf LOG"),
     ],
 )
-def test_what_is_no_log_gets_the_command_that_was_meant(tmp_path, name, content, what, command):
+def test_read_log_other_file_type_suggests_command(tmp_path, name, content, what, command):
     (tmp_path / name).write_bytes(content)
-    said = refusal(tmp_path / name)
-    assert said.startswith(f"{name}: {what}")
-    assert said.endswith(f"px4fuse {command}.")
+    message = read_error(tmp_path / name)
+    assert message.startswith(f"{name}: {what}")
+    assert message.endswith(f"px4fuse {command}.")
 
 
-def test_a_mistyped_name_gets_the_one_that_was_meant(tmp_path):
+def test_read_log_mistyped_name_suggests_file(tmp_path):
     make_log().write(tmp_path / "aisle_uwb.ulg")
-    assert refusal(tmp_path / "aisle_uvb.ulg").endswith("Did you mean aisle_uwb.ulg?")
+    assert read_error(tmp_path / "aisle_uvb.ulg").endswith("Did you mean aisle_uwb.ulg?")
 
 
-def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
+def test_read_log_without_used_topics_has_no_parts(tmp_path):
     at = stamps(2.0, 10.0)
     log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
-    flight = outcome(log.write(tmp_path / "battery.ulg"))
+    flight = read_or_error(log.write(tmp_path / "battery.ulg"))
     parts = (flight.imu, flight.attitude, flight.ekf2, flight.truth, flight.airborne)
     assert all(isinstance(part, Unavailable) for part in parts)
     assert set(parts[:4]) <= set(flight.missing)
@@ -133,8 +134,8 @@ def test_a_log_of_topics_that_are_none_of_ours(tmp_path):
         choose_source(flight)
 
 
-def test_a_format_that_contains_itself(tmp_path):
-    """A nested format that never ends must not end the program."""
+def test_read_log_recursive_format_ends(tmp_path):
+    """A format that contains itself must not cause infinite recursion."""
     path = tmp_path / "nested.ulg"
     content = make_log("v1.16", 1.0).encode()
     name = b"vehicle_attitude:"
@@ -143,13 +144,13 @@ def test_a_format_that_contains_itself(tmp_path):
     text = b"vehicle_attitude:uint64_t timestamp;vehicle_attitude a;"
     message = struct.pack("<HB", len(text), ord("F")) + text
     path.write_bytes(content[: at - 3] + message + content[at + length :])
-    outcome(path)
+    read_or_error(path)
 
 
 @pytest.mark.parametrize("key", ["char[4] ver_sw_release", "uint32_t[1] ver_sw_release",
                                  "float ver_sw_release"])  # fmt: skip
-def test_a_release_number_of_another_type(tmp_path, key):
-    """One flipped bit in the name of a type, and the release is no number any more."""
+def test_read_log_release_of_other_type_is_read(tmp_path, key):
+    """A damaged type name makes the release number another type."""
     content = make_log("v1.16", 1.0).encode()
     old = b"uint32_t ver_sw_release"
     at = content.index(old) - 1
@@ -158,15 +159,15 @@ def test_a_release_number_of_another_type(tmp_path, key):
     new = struct.pack("<H", size) + b"I" + bytes([len(key)]) + key.encode()
     path = tmp_path / "release.ulg"
     path.write_bytes(content[: at - 3] + new + content[at + 1 + len(old) :])
-    flight = outcome(path)
+    flight = read_or_error(path)
     assert len(flight.imu) == 100
 
 
 # ---- logs without a part ----------------------------------------------------------------------
 
 
-def read_of(log: Log, tmp_path: Path) -> Flight:
-    flight = outcome(log.write(tmp_path / "made.ulg"))
+def write_and_read(log: Log, tmp_path: Path) -> Flight:
+    flight = read_or_error(log.write(tmp_path / "made.ulg"))
     assert isinstance(flight, Flight)
     return flight
 
@@ -180,9 +181,9 @@ def read_of(log: Log, tmp_path: Path) -> Flight:
         ("vehicle_land_detected", "airborne"),
     ],
 )
-def test_a_log_without_a_part(tmp_path, topic, part):
-    """Each part is missing alone, and says so."""
-    flight = read_of(make_log("v1.16", 2.0).drop(topic), tmp_path)
+def test_read_log_missing_topic_makes_one_part_unavailable(tmp_path, topic, part):
+    """Only the part of the missing topic is unavailable."""
+    flight = write_and_read(make_log("v1.16", 2.0).drop(topic), tmp_path)
     for name in ("imu", "attitude", "ekf2", "airborne"):
         assert isinstance(getattr(flight, name), Unavailable) == (name == part)
     assert (getattr(flight, part) in flight.missing) == (part != "airborne")
@@ -194,7 +195,7 @@ def test_a_log_without_a_part(tmp_path, topic, part):
 
 
 def rich_log() -> Log:
-    """Every topic that is read in v1.16, with the fields that are optional."""
+    """Make a v1.16 log with all topics that are read, including optional fields."""
     log = make_log("v1.16", 2.0)
     at = stamps(2.0, 5.0)
     count = len(at)
@@ -216,30 +217,30 @@ def rich_log() -> Log:
 
 
 @pytest.mark.parametrize("name", sorted(rich_log().names()))
-def test_each_field_left_out_in_turn(tmp_path, name):
-    """PX4 adds and removes fields between releases, and a damaged format loses one."""
+def test_read_log_missing_field_is_read(tmp_path, name):
+    """Fields may be missing in other PX4 releases or in a damaged format."""
     for field in rich_log()[name].keys() - {"timestamp"}:
         log = rich_log()
         del log[name][field]
-        assert analysed(log.write(tmp_path / "made.ulg")) is not None, field
+        assert read_and_make_axes(log.write(tmp_path / "made.ulg")) is not None, field
 
 
 # ---- impossible values ------------------------------------------------------------------------
 
 
-def test_all_time_stamps_zero(tmp_path):
+def test_read_log_all_timestamps_zero_is_rejected(tmp_path):
     log = make_log("v1.16", 2.0)
     for made in log.topics:
         made.fields["timestamp"][:] = 0
         made.fields.get("timestamp_sample", np.zeros(1))[:] = 0
-    assert "time stamp" in refusal(log.write(tmp_path / "zero.ulg"))
+    assert "all timestamps are zero" in read_error(log.write(tmp_path / "zero.ulg"))
 
 
-def test_one_topic_with_all_time_stamps_zero(tmp_path):
-    """As ekf2_innovations in a real log of 2016."""
+def test_read_log_topic_with_zero_timestamps_is_noted(tmp_path):
+    """ekf2_innovations of a real log of 2016 had this fault."""
     log = make_log("v1.9", 2.0)
     log["ekf2_innovations"]["timestamp"][:] = 0
-    flight = read_of(log, tmp_path)
+    flight = write_and_read(log, tmp_path)
     assert isinstance(flight.ekf2.innovations["north"], Unavailable)
     assert any("ekf2_innovations" in note for note in flight.log.notes)
 
@@ -248,15 +249,15 @@ def test_one_topic_with_all_time_stamps_zero(tmp_path):
     "name", ["sensor_combined", "vehicle_attitude", "vehicle_visual_odometry",
              "vehicle_local_position", "estimator_aid_src_ev_pos"],
 )  # fmt: skip
-def test_time_stamps_that_go_back(tmp_path, name):
-    """Samples out of order are dropped and counted; those that stay are at their own place."""
+def test_read_log_swapped_timestamps_are_dropped_with_note(tmp_path, name):
+    """Samples out of order are dropped and counted; the others keep their times."""
     log = make_log("v1.16", 4.0)
     index = next(i for i, made in enumerate(log.topics) if made.name == name)
     count = len(log[name]["timestamp"])
     order = np.arange(count)
     order[[5, 12]] = order[[12, 5]]
     log.topics[index] = take(log.topics[index], order)
-    flight = read_of(log, tmp_path)
+    flight = write_and_read(log, tmp_path)
     frames = [flight.imu, flight.attitude, flight.ekf2.state, flight.ekf2.innovations["north"]]
     frames += [track.samples for track in flight.positions]
     assert all((np.diff(frame.index) > 0).all() for frame in frames)
@@ -265,20 +266,20 @@ def test_time_stamps_that_go_back(tmp_path, name):
     np.testing.assert_allclose(state["north_m"], position(state.index)[:, 0], rtol=1e-6)
 
 
-def test_a_clock_that_starts_again(tmp_path):
-    """A reboot in mid-log: the longer half is kept, in order."""
+def test_read_log_clock_restart_keeps_longer_part(tmp_path):
+    """After a reboot during the log, the longer part is kept."""
     log = make_log("v1.16", 4.0)
     for made in log.topics:
         for name in ("timestamp", "timestamp_sample"):
             if name in made.fields:
                 late = seconds_of(made.fields["timestamp"]) >= 3.0
                 made.fields[name][late] -= np.uint64(3_000_000)
-    flight = read_of(log, tmp_path)
+    flight = write_and_read(log, tmp_path)
     assert flight.log.duration_s == pytest.approx(2.99, abs=0.2)
     assert (np.diff(flight.imu.index) > 0).all()
 
 
-NOT_THERE = {
+MISSING_PARTS = {
     ("sensor_combined", "accelerometer_m_s2"): lambda flight: flight.imu,
     ("vehicle_attitude", "q"): lambda flight: flight.attitude,
     ("vehicle_visual_odometry", "position"): lambda flight: None,
@@ -290,13 +291,13 @@ NOT_THERE = {
 
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
-@pytest.mark.parametrize(("name", "field"), NOT_THERE)
-def test_not_a_number_everywhere(tmp_path, name, field, value):
-    """What holds no finite number is missing, not zero, and the rest of the flight stays."""
+@pytest.mark.parametrize(("name", "field"), MISSING_PARTS)
+def test_read_log_field_never_finite_is_unavailable(tmp_path, name, field, value):
+    """A part without finite values is unavailable, not zero; other parts stay."""
     log = make_log("v1.16", 2.0)
     log[name][field][:] = value
-    flight = analysed(log.write(tmp_path / "made.ulg"))
-    part = NOT_THERE[name, field](flight)
+    flight = read_and_make_axes(log.write(tmp_path / "made.ulg"))
+    part = MISSING_PARTS[name, field](flight)
     if part is None:
         assert name not in [track.name for track in flight.positions]
     else:
@@ -304,8 +305,8 @@ def test_not_a_number_everywhere(tmp_path, name, field, value):
 
 
 @pytest.mark.parametrize("value", [7.4e8, -1.1e4])
-def test_a_force_that_no_sensor_measures_is_damage(tmp_path, value):
-    """A single one made the noises' information indefinite by rounding (found by fuzzing)."""
+def test_read_log_impossible_force_is_dropped(tmp_path, value):
+    """One such sample made the information matrix of the noises indefinite (found by fuzzing)."""
     log = make_log("v1.16", 10.0)
     log["sensor_combined"]["accelerometer_m_s2"][500, 2] = value
     flight = read_log(log.write(tmp_path / "l.ulg"))
@@ -313,22 +314,22 @@ def test_a_force_that_no_sensor_measures_is_damage(tmp_path, value):
     assert flight.imu["down_m_s2"].abs().max() < 10.0
 
 
-def test_not_a_number_here_and_there(tmp_path):
+def test_read_log_single_nan_samples_are_dropped(tmp_path):
     log = make_log("v1.16", 2.0)
     log["sensor_combined"]["accelerometer_m_s2"][[10, 20], 1] = np.nan
     log["vehicle_attitude"]["q"][7, 3] = np.nan
     log["vehicle_attitude"]["q"][:5] = 0.0
     log["vehicle_local_position"]["vx"][4] = np.nan
-    flight = read_of(log, tmp_path)
+    flight = write_and_read(log, tmp_path)
     assert (len(flight.imu), len(flight.attitude), len(flight.ekf2.state)) == (198, 34, 19)
 
 
 @pytest.mark.parametrize("parameter", ["EKF2_EV_DELAY", "EKF2_EVP_GATE"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_parameters_that_are_no_numbers(tmp_path, parameter, value):
+def test_read_log_parameter_not_finite_keeps_finite_times(tmp_path, parameter, value):
     log = make_log("v1.16", 2.0)
     log.parameters[parameter] = value
-    flight = analysed(log.write(tmp_path / "made.ulg"))
+    flight = read_and_make_axes(log.write(tmp_path / "made.ulg"))
     for track in flight.positions:
         assert np.isfinite(track.samples.index).all()
 
@@ -350,8 +351,10 @@ def test_parameters_that_are_no_numbers(tmp_path, parameter, value):
 def test_parameter_out_of_range_becomes_default_with_note(tmp_path, parameter, value, note):
     log = rich_log()
     log.parameters[parameter] = value
-    flight = read_of(log, tmp_path)
-    assert [said for said in flight.log.notes if parameter in said] == [f"{parameter} {note}"]
+    flight = write_and_read(log, tmp_path)
+    assert [message for message in flight.log.notes if parameter in message] == [
+        f"{parameter} {note}"
+    ]
     assert flight.log.parameters.get(parameter) != value
     assert flight.ekf2.step_s == 0.01
     assert all(aid.parameters.get(parameter) != value for aid in flight.ekf2.aids.values())
@@ -361,16 +364,16 @@ def test_parameter_at_float32_end_of_range_is_kept(tmp_path):
     log = make_log("v1.16", 2.0)
     lowest = float(np.float32(0.01))  # 0.0099999998
     log.parameters |= {"EKF2_EVP_NOISE": lowest, "EKF2_GYR_NOISE": float(np.float32(0.1))}
-    flight = read_of(log, tmp_path)
+    flight = write_and_read(log, tmp_path)
     assert flight.log.parameters["EKF2_EVP_NOISE"] == lowest
     assert flight.log.notes == ()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_too_few_samples_of_everything(tmp_path, count):
+def test_read_log_up_to_two_samples_per_topic_is_handled(tmp_path, count):
     log = make_log("v1.16", 2.0)
     log.topics = [take(made, range(count)) for made in log.topics]
-    result = outcome(log.write(tmp_path / "made.ulg"))
+    result = read_or_error(log.write(tmp_path / "made.ulg"))
     if count == 0:
         assert isinstance(result, LogError)
     else:
@@ -378,7 +381,7 @@ def test_too_few_samples_of_everything(tmp_path, count):
         assert isinstance(result.imu, Unavailable) == (count == 1)
 
 
-def at_last_stamp(log: Log) -> None:
+def flags_at_largest_time(log: Log) -> None:
     log["estimator_status_flags"]["timestamp"][:] = np.uint64(2**64 - 1)
     log["estimator_status_flags"]["timestamp_sample"][:] = np.uint64(2**64 - 1)
 
@@ -404,7 +407,7 @@ def truth_impossible(log: Log) -> None:
 
 
 @pytest.mark.parametrize(
-    "damage", [at_last_stamp, flags_late, one_state, source_frozen, truth_impossible],
+    "damage", [flags_at_largest_time, flags_late, one_state, source_frozen, truth_impossible],
     ids=lambda one: one.__name__,
 )  # fmt: skip
 def test_compare_of_damaged_part_writes_finite_results(tmp_path, damage):
@@ -419,20 +422,20 @@ def test_compare_of_damaged_part_writes_finite_results(tmp_path, damage):
         assert any(reason in missing.reason for missing in results.missing)
 
 
-def test_states_with_a_negative_variance_are_left_out(tmp_path):
-    """Their square root was NaN, with a warning."""
+def test_ekf2_record_drops_negative_variance(tmp_path):
+    """The square root of a negative variance would be NaN, with a warning."""
     log = make_log("v1.16", 2.0)
     states = log["estimator_states"]
     states["states"][:, 0] = 1.0
     states["covariances"][2, 7] = -1e-9
-    assert len(read_of(log, tmp_path).ekf2.record.delayed) == len(states["timestamp"]) - 1
+    assert len(write_and_read(log, tmp_path).ekf2.record.delayed) == len(states["timestamp"]) - 1
 
 
-def test_info_of_an_aid_with_one_sample_gives_no_rate(tmp_path):
+def test_info_aid_with_one_sample_has_no_rate(tmp_path):
     log = make_log("v1.16", 20.0)
     name = "estimator_aid_src_ev_hgt"
     log.topics = [take(one, [50]) if one.name == name else one for one in log.topics]
-    flight = read_of(log, tmp_path)
+    flight = write_and_read(log, tmp_path)
     aids = next(one for one in take_inventory(flight).abilities if one.name == "aids")
     assert "external vision, height 1 sample" in aids.reason
     assert "nan" not in aids.reason
@@ -444,7 +447,7 @@ def test_info_of_an_aid_with_one_sample_gives_no_rate(tmp_path):
     ("name", "column"),
     [("vehicle_visual_odometry", "position"), ("sensor_combined", "accelerometer_m_s2")],
 )
-def test_impossible_values_are_damage_and_no_command_computes_with_them(
+def test_commands_impossible_values_print_no_nan(
     tmp_path, monkeypatch, capsys, name, column, whole, value, command
 ):
     """Warnings of overflow are errors in these tests."""

@@ -1,7 +1,7 @@
-"""What a MAVLink recording means: units, frames, directions, and the ULog of the same flight.
+"""MAVLink recordings: units, frames, directions, and comparison with the ULog of the same flight.
 
-The fuzz tests make PX4FUSE_FUZZ_CASES cases (60 unless that environment variable says
-otherwise), the same ones every time::
+The number of fuzz cases is the environment variable PX4FUSE_FUZZ_CASES (default 60); the cases are
+the same in every run::
 
     PX4FUSE_FUZZ_CASES=20000 python -m pytest tests/test_mavlink.py -k fuzz
 """
@@ -62,7 +62,7 @@ VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 PAIRS = ("v1.13.3_aisle_hwlogvision", "v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync")
 
 
-def without(aisle: Aisle, *names: str) -> Recorder:
+def record_without(aisle: Aisle, *names: str) -> Recorder:
     recorder = aisle.record()
     recorder.sent = [s for s in recorder.sent if s[2].get_type() not in names]
     return recorder
@@ -79,11 +79,11 @@ def reason(flight: Flight, what: str) -> str:
     return next(str(part) for part in flight.missing if part.what == what)
 
 
-# ---- the made flight as a whole -----------------------------------------------------------------
+# ---- whole simulated flight ---------------------------------------------------------------------
 
 
-def test_the_made_flight_comes_back(read):
-    """Everything against its closed form, HIGHRES_IMU before a denser SCALED_IMU."""
+def test_read_mavlink_simulated_flight_equals_closed_form(read):
+    """All parts equal their closed form; HIGHRES_IMU is preferred to a denser SCALED_IMU."""
     aisle = Aisle(asks=True)
     made = aisle.record()
     flight = read(add(made, 100.0, lambda t: message("SCALED_IMU", time_boot_ms=ms(t))))
@@ -111,10 +111,10 @@ def test_the_made_flight_comes_back(read):
     assert_allclose(variance, np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6)
 
 
-def test_mavlink_1_and_a_raw_stream_say_the_same(read):
-    """MAVLink 1 has no ids above 255, so the state is LOCAL_POSITION_NED."""
+def test_read_mavlink_version_1_and_raw_stream_are_equal(read):
+    """MAVLink 1 has no ids above 255, so the state message is LOCAL_POSITION_NED."""
     aisle = Aisle(state="LOCAL_POSITION_NED")
-    recorder = without(aisle, "ODOMETRY")
+    recorder = record_without(aisle, "ODOMETRY")
     as_2 = read(recorder)
     recorder.v1 = True
     as_1 = read(recorder)
@@ -126,8 +126,8 @@ def test_mavlink_1_and_a_raw_stream_say_the_same(read):
     assert_frame_equal(as_2.positions[0].samples, as_1.positions[0].samples)
 
 
-def test_duplicates_over_two_links_are_one(read):
-    """MAVProxy with two radios: every message twice, the second time later."""
+def test_read_mavlink_duplicates_over_two_links_are_removed(read):
+    """MAVProxy with two radios records every message twice, with a delay."""
     aisle = Aisle(asks=True)
     once = aisle.record()
     twice = Recorder()
@@ -146,8 +146,8 @@ def test_duplicates_over_two_links_are_one(read):
 
 
 @pytest.mark.parametrize("name", ["SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3"])
-def test_scaled_imu_is_in_milli_g_and_milliradians(read, name):
-    recorder = add(without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
+def test_imu_scaled_imu_is_converted_to_si_units(read, name):
+    recorder = add(record_without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
         name, time_boot_ms=ms(t), xacc=1000, yacc=-500, zacc=-1000, xgyro=1000, ygyro=-20, zgyro=3,
     ))  # fmt: skip
     imu = read(recorder).imu
@@ -156,18 +156,18 @@ def test_scaled_imu_is_in_milli_g_and_milliradians(read, name):
     assert_allclose(imu[Columns.ANGULAR_RATE].iloc[0], [1.0, -0.02, 0.003], rtol=1e-12)
 
 
-def test_raw_imu_is_refused_with_the_reason(read):
-    recorder = add(without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
+def test_imu_raw_imu_is_unavailable_with_reason(read):
+    recorder = add(record_without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
         "RAW_IMU", time_usec=us(t), xacc=17, zacc=-998,
     ))  # fmt: skip
     flight = read(recorder)
     assert isinstance(flight.imu, Unavailable)
-    assert "2000 RAW_IMU were refused, since raw counts have no unit" in reason(flight, "IMU")
+    assert "2000 RAW_IMU messages were not used: raw counts have no unit" in reason(flight, "IMU")
     assert [(u.name, u.count) for u in flight.unused] == [("RAW_IMU", 2000)]
 
 
-def test_of_several_imus_in_one_message_the_busiest_is_taken(read):
-    recorder = without(Aisle(), "HIGHRES_IMU")
+def test_imu_several_ids_uses_most_frequent(read):
+    recorder = record_without(Aisle(), "HIGHRES_IMU")
     add(recorder, 50.0, lambda t: message("HIGHRES_IMU", time_usec=us(t), xacc=2.0, id=1))
     add(recorder, 10.0, lambda t: message("HIGHRES_IMU", time_usec=us(t) + 7, xacc=9.0, id=0))
     imu = read(recorder).imu
@@ -178,19 +178,19 @@ def test_of_several_imus_in_one_message_the_busiest_is_taken(read):
 # ---- attitude -----------------------------------------------------------------------------------
 
 
-def test_euler_angles_become_the_quaternion_that_turns_frd_into_ned(read):
+def test_attitude_euler_angles_become_quaternion(read):
     roll, pitch, yaw = 0.1, -0.3, 2.0
-    recorder = add(without(Aisle(), "ATTITUDE_QUATERNION"), 30.0, lambda t: message(
+    recorder = add(record_without(Aisle(), "ATTITUDE_QUATERNION"), 30.0, lambda t: message(
         "ATTITUDE", time_boot_ms=ms(t), roll=roll, pitch=pitch, yaw=yaw,
     ))  # fmt: skip
     flight = read(recorder)
     assert flight.streams["attitude"].topics == ("ATTITUDE",)
     got = Rotation.from_quat(flight.attitude[Columns.QUATERNION].to_numpy()[0], scalar_first=True)
-    # first about the nose, then about the wing, then about the vertical
+    # rotations about the body x axis, then y, then the vertical
     about = [Rotation.from_rotvec(turn) for turn in ([roll, 0, 0], [0, pitch, 0], [0, 0, yaw])]
     expected = about[2].as_matrix() @ about[1].as_matrix() @ about[0].as_matrix()
     assert_allclose(got.as_matrix(), expected, atol=1e-6)
-    # nose up is negative down: pitch < 0 here, so the nose points down
+    # down component of the nose direction is -sin(pitch)
     assert got.as_matrix()[2, 0] == pytest.approx(-np.sin(pitch), abs=1e-6)
 
 
@@ -206,25 +206,25 @@ def test_euler_angles_become_the_quaternion_that_turns_frd_into_ned(read):
     (12, "", [], []),
     (255, "", [], []),
 ])  # fmt: skip
-def test_external_odometry_is_turned_into_ned(read, frame_id, name, position, variance):
+def test_positions_odometry_frame_is_converted_to_ned(read, frame_id, name, position, variance):
     flight = read(add(Aisle(uwb=None, asks=True).record(), 30.0, lambda t: odometry(
         us(unix(t)), [1.0, 2.0, 3.0], [0, 0, 0], estimator=3, frame_id=frame_id,
         attitude=Rotation.from_euler("z", 0.1 * t),
     ), COMPANION))  # fmt: skip
     if not name:
         assert flight.positions == ()
-        assert "0 finite samples" in reason(flight, "position source ODOMETRY_VIO")
+        assert "only 0 finite samples" in reason(flight, "position source ODOMETRY_VIO")
         return
     [track] = flight.positions
     assert (track.name, track.frame) == ("ODOMETRY_VIO", name)
     assert_array_equal(track.samples[Columns.POSITION].iloc[5], position)
     assert_allclose(track.samples[Columns.POSITION_VARIANCE].iloc[5], variance)
-    # what a sender of ENU or FLU calls its body is not known
+    # the body axes of a sender of ENU or FLU are unknown
     assert (track.orientation is None) == (frame_id in (4, 21))
 
 
 BODY = Rotation.from_euler("ZYX", [120.0, 10.0, -20.0], degrees=True)
-# What turns a velocity in this frame into NED: of the body, NED, ENU, FLU
+# Rotation matrix to NED by MAV_FRAME: body (8, 12), NED (1), ENU (4), FLU (21)
 TO_NED = {
     8: BODY.as_matrix(), 12: BODY.as_matrix(), 1: np.eye(3),
     4: np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), 21: np.diag([1, -1, -1]),
@@ -232,10 +232,10 @@ TO_NED = {
 
 
 @pytest.mark.parametrize("child", TO_NED)
-def test_a_velocity_is_turned_with_its_variances(read, child):
+def test_ekf2_velocity_and_variance_are_rotated_to_ned(read, child):
     """PX4 v1.13: v_NED = R v and var_i = Σ_j R_ij² var_j."""
     velocity, matrix = np.array([1.0, -0.5, 0.25]), TO_NED[child]
-    recorder = add(without(Aisle(), "ODOMETRY"), 30.0, lambda t: odometry(
+    recorder = add(record_without(Aisle(), "ODOMETRY"), 30.0, lambda t: odometry(
         us(t), [1, 2, 3], velocity, estimator=8, child=child, attitude=BODY,
     ))  # fmt: skip
     ekf2 = read(recorder).ekf2
@@ -251,8 +251,8 @@ def test_a_velocity_is_turned_with_its_variances(read, child):
     (2, "ODOMETRY_VISION", RECEIVED), (3, "ODOMETRY_VIO", RECEIVED),
     (6, "ODOMETRY_MOCAP", MOTION_CAPTURE), (4, "", None), (8, "", None),
 ])  # fmt: skip
-def test_odometry_to_the_autopilot_is_a_position_by_its_estimator(read, estimator, name, origin):
-    """And EKF2's own ODOMETRY beside it stays EKF2's. GPS and AUTOPILOT are no input of PX4."""
+def test_positions_odometry_estimator_type_gives_track(read, estimator, name, origin):
+    """ODOMETRY from the autopilot remains EKF2's state; types GPS and AUTOPILOT are no input."""
     flight = read(Aisle(uwb="ODOMETRY", estimator=estimator, asks=True))
     if not name:
         assert flight.positions == ()
@@ -269,7 +269,7 @@ def test_odometry_to_the_autopilot_is_a_position_by_its_estimator(read, estimato
         assert_allclose(given.iloc[0], POSE_VARIANCE, rtol=1e-6)
 
 
-def test_motion_capture_is_truth_where_another_source_feeds_ekf2(read):
+def test_truth_motion_capture_besides_other_source(read):
     aisle = Aisle(asks=True)
     recorder = aisle.record()
     add(recorder, 50.0, lambda t: message(
@@ -283,8 +283,8 @@ def test_motion_capture_is_truth_where_another_source_feeds_ekf2(read):
     assert [t.name for t in flight.positions] == ["VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP"]
 
 
-def test_positions_without_a_number_and_variances_of_zero(read):
-    """NaN positions are dropped; a variance of 0 or NaN is none."""
+def test_positions_nan_dropped_and_variance_zero_is_nan(read):
+    """NaN positions are dropped; a variance of 0 or NaN is not given."""
     recorder = Aisle(uwb=None, asks=True).record()
     kinds = itertools.cycle(range(4))
 
@@ -304,8 +304,8 @@ def test_positions_without_a_number_and_variances_of_zero(read):
 
 
 @pytest.mark.parametrize("state", ["LOCAL_POSITION_NED", "ODOMETRY"])
-def test_estimator_status_stands_in_for_variances(read, state):
-    """Its horizontal accuracy is the root of the sum over both axes."""
+def test_ekf2_variance_from_estimator_status(read, state):
+    """The horizontal accuracy is the root of the sum of both variances."""
     recorder = Aisle(state="LOCAL_POSITION_NED" if state != "ODOMETRY" else None).record()
     if state == "ODOMETRY":
         nothing = [float("nan")] * 21
@@ -332,7 +332,7 @@ LATITUDE, LONGITUDE, HEIGHT_M = 47.0, 8.0, 500.0
 
 
 def degrees(aisle: Aisle, boot_s: float) -> tuple[float, float, float, np.ndarray]:
-    """Latitude, longitude, height and velocity of the made flight, about its first sample."""
+    """Return latitude, longitude, height and velocity of the flight, about its first sample."""
     position, velocity, _ = aisle.path(boot_s)
     d = position - aisle.path(BOOT_S)[0]
     latitude = LATITUDE + np.degrees(d[0] / EARTH_RADIUS_M)
@@ -350,8 +350,8 @@ def simulated(name: str, aisle: Aisle, boot_s: float):
 
 
 @pytest.mark.parametrize("name", ["HIL_STATE_QUATERNION", "SIMSTATE"])
-def test_simulation_truth_is_projected_about_its_first_sample(read, name):
-    """At the time of receipt, since its own stamp is 0 in PX4."""
+def test_truth_simulation_is_projected_about_first_sample(read, name):
+    """The time is the receive time, because the timestamp is 0 in PX4."""
     aisle = Aisle(asks=True)
     flight = read(add(aisle.record(), 25.0, lambda t: simulated(name, aisle, t)))
     assert flight.truth.name == name
@@ -380,14 +380,14 @@ def parameter(name: bytes, value: int | float, *, by_bytes: bool):
 
 
 @pytest.mark.parametrize(("autopilot", "by_bytes"), [(12, True), (3, False)])
-def test_integer_parameters_are_bytes_in_px4_and_casts_in_ardupilot(read, autopilot, by_bytes):
-    recorder = without(Aisle(), "HEARTBEAT")
+def test_parameters_integer_encoding_depends_on_autopilot(read, autopilot, by_bytes):
+    recorder = record_without(Aisle(), "HEARTBEAT")
     add(recorder, 1.0, lambda t: heartbeat(2, autopilot))
     for i, (name, value) in enumerate(
         {b"EKF2_EV_CTRL": 15, b"SDLOG_PROFILE": 129, b"EKF2_EVP_GATE": 3.5, b"X": 7}.items()
     ):
         recorder.hear(unix(60.0 + i), AUTOPILOT, parameter(name, value, by_bytes=by_bytes))
-    # changed in flight: the log's start counts
+    # a change in flight is ignored; the first value is used
     later = parameter(b"EKF2_EVP_GATE", 9.0, by_bytes=by_bytes)
     recorder.hear(unix(80.0), AUTOPILOT, later)
     flight = read(recorder)
@@ -416,30 +416,32 @@ def test_parameter_out_of_range_becomes_default_with_note(read):
 
 
 @pytest.mark.parametrize(
-    "lacking", [(), ("VISION_POSITION_ESTIMATE",), ("HIGHRES_IMU", "ODOMETRY")]
+    "missing_messages", [(), ("VISION_POSITION_ESTIMATE",), ("HIGHRES_IMU", "ODOMETRY")]
 )
-def test_whoever_flies_ardupilot_is_told_nothing_that_only_px4_has(read, lacking):
-    """It writes DataFlash (.BIN), and has neither ULog nor PX4's console nor its parameters."""
-    recorder = without(Aisle(imu_hz=4.0, seconds=20.0), *lacking, "EXTENDED_SYS_STATE")
+def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
+    """ArduPilot has no ULog, no PX4 console and no PX4 parameters."""
+    recorder = record_without(
+        Aisle(imu_hz=4.0, seconds=20.0), *missing_messages, "EXTENDED_SYS_STATE"
+    )
     for at, (received, sender, made, link) in enumerate(recorder.sent):
         if made.get_type() == "HEARTBEAT" and sender == AUTOPILOT:
             recorder.sent[at] = received, sender, heartbeat(2, 3), link
     flight = read(recorder)
     assert flight.log.autopilot == "ArduPilot"
-    said = [str(part) for part in take_inventory(flight).advice]
-    said += [str(part) for part in flight.missing]
+    texts = [str(part) for part in take_inventory(flight).advice]
+    texts += [str(part) for part in flight.missing]
     if flight.positions:
-        said += [f"{f.message} {f.remedy}" for f in find(compare(flight)) if f.id != "not_px4"]
+        texts += [f"{f.message} {f.remedy}" for f in find(compare(flight)) if f.id != "not_px4"]
     else:
         with pytest.raises(MissingDataError) as refused:
             compare(flight)
-        said.append(str(refused.value))
-    for text in said:
+        texts.append(str(refused.value))
+    for text in texts:
         assert not re.search(r"ULog|PX4|SDLOG|SD card|EKF2_|mavlink stream", text), text
-    assert len(said) > 3
+    assert len(texts) > 3
 
 
-def test_the_version_is_read(read):
+def test_log_info_reads_autopilot_version(read):
     recorder = Aisle().record()
     recorder.hear(unix(60.0), AUTOPILOT, message(
         "AUTOPILOT_VERSION", flight_sw_version=0x011001FF,
@@ -462,7 +464,7 @@ def place(boot_s: float) -> dict[str, int]:
 
 
 def fix(boot_s: float, *, clock=same, fix_type: int = 3):
-    """What a receiver gives 0.11 s later; stamped by this clock."""
+    """Make a GNSS fix with a delay of 0.11 s and a timestamp of ``clock``."""
     return message(
         "GPS_RAW_INT", time_usec=us(clock(boot_s)), fix_type=fix_type, eph=90, h_acc=300,
         v_acc=500, **place(boot_s - 0.11),
@@ -474,13 +476,15 @@ def global_state(boot_s: float):
 
 
 def pressure(boot_s: float, *, clock=same):
-    """Of the standard atmosphere, over 400 m at the origin."""
+    """Make the standard pressure at the vehicle; the origin is at 400 m."""
     altitude_m = 400.0 - Aisle().path(boot_s)[0][2]
     hpa = 1013.25 * (1.0 - 0.0065 * altitude_m / 288.15) ** 5.25588
     return message("SCALED_PRESSURE", time_boot_ms=ms(clock(boot_s)), press_abs=hpa)
 
 
-def outdoors(rate_hz: float = 5.0, *, origin: bool = True, knows: bool = True, **of_fix):
+def outdoors(
+    rate_hz: float = 5.0, *, origin: bool = True, has_global_position: bool = True, **of_fix
+):
     recorder = add(Aisle(uwb=None, state="LOCAL_POSITION_NED").record(), rate_hz,
                    lambda t: fix(t, **of_fix))  # fmt: skip
     if origin:
@@ -488,12 +492,12 @@ def outdoors(rate_hz: float = 5.0, *, origin: bool = True, knows: bool = True, *
             "GPS_GLOBAL_ORIGIN", latitude=474000000, longitude=85000000, altitude=400000,
             time_usec=us(60.0),
         ))  # fmt: skip
-    return add(recorder, 2.0, global_state) if knows else recorder
+    return add(recorder, 2.0, global_state) if has_global_position else recorder
 
 
 @pytest.mark.parametrize(("origin", "clock"), [(True, same), (False, same), (False, unix)])
-def test_gnss_is_a_position_about_the_autopilots_origin(read, origin, clock):
-    """Also where the receiver stamps by its own clock."""
+def test_positions_gnss_is_relative_to_autopilot_origin(read, origin, clock):
+    """The receiver's timestamps may be boot time or UNIX time."""
     flight = read(outdoors(origin=origin, clock=clock))
     (track,) = flight.positions
     assert (track.name, track.origin.fused_as_gnss, track.origin.is_automatic) == (
@@ -509,11 +513,11 @@ def test_gnss_is_a_position_about_the_autopilots_origin(read, origin, clock):
     assert variance.to_numpy() == pytest.approx([0.09, 0.09, 0.25])
     result = compare(flight, sigma_z_given=False)
     assert result.source.name == "GPS_RAW_INT"
-    assert result.settings.sigma_z_m == 0.5  # EKF2_GPS_P_NOISE where nothing larger is stated
+    assert result.settings.sigma_z_m == 0.5  # EKF2_GPS_P_NOISE is the lower limit
 
 
-def test_the_height_of_a_recording_may_be_the_barometers(read):
-    """Pressures of the standard atmosphere's table (ISO 2533), at 400 m and 1 km."""
+def test_compare_height_barometer_uses_pressure(read):
+    """Pressures are from the table of the standard atmosphere (ISO 2533), at 400 m and 1 km."""
     altitude_m = pressure_altitude(np.array([1013.25, 966.114, 898.746]))
     assert altitude_m == pytest.approx([0.0, 400.0, 1000.0], abs=0.1)
     flight = read(add(outdoors(), 5.0, pressure))
@@ -521,26 +525,26 @@ def test_the_height_of_a_recording_may_be_the_barometers(read):
     (down,) = compare(flight, axes=("down",), height="barometer").lines
     true = np.array([Aisle().path(BOOT_S + t)[0][2] for t in down.measurement_time_s])
     assert down.measurement_m - true == pytest.approx(0.0, abs=0.05)
-    # without a time they are dropped, and it is said
+    # without a valid time they are dropped with a note
     flight = read(add(outdoors(), 5.0, lambda t: pressure(t, clock=lambda _: 0.0)))
     assert flight.barometer is None
     assert [note for note in flight.log.notes if "SCALED_PRESSURE" in note]
 
 
-def test_gnss_is_not_taken_by_itself_where_the_autopilot_does_not_know_where_it_is(read):
-    flight = read(outdoors(knows=False))
+def test_compare_gnss_without_global_position_is_not_chosen(read):
+    flight = read(outdoors(has_global_position=False))
     assert not flight.positions[0].origin.is_automatic
-    with pytest.raises(MissingDataError, match="`position_source` GPS_RAW_INT"):
+    with pytest.raises(MissingDataError, match=r"position.source`? GPS_RAW_INT"):
         compare(flight)
 
 
-def test_a_fix_that_is_sent_again_counts_once_and_one_without_3d_not_at_all(read):
+def test_positions_repeated_and_2d_fixes_are_dropped(read):
     again = read(add(outdoors(), 5.0, fix, seconds=39.9))
     assert again.positions[0].rate_hz == pytest.approx(5.0, rel=0.02)
     assert read(outdoors(fix_type=2)).positions == ()
 
 
-def test_an_empty_recording_of_heartbeats_lacks_everything_by_name(read):
+def test_read_mavlink_heartbeats_only_lists_missing_parts(read):
     flight = read(add(Recorder(), 1.0, lambda t: heartbeat()))
     for part in ("imu", "attitude", "ekf2", "truth", "airborne"):
         assert isinstance(getattr(flight, part), Unavailable)
@@ -552,33 +556,40 @@ def test_an_empty_recording_of_heartbeats_lacks_everything_by_name(read):
 
 
 def stamp_differences(tlog: Flight, ulog: Flight) -> tuple[np.ndarray, np.ndarray]:
-    """Boot time by the tlog minus by the ULog, of positions equal to the bit, and their rows."""
-    ours = track_of(tlog, "VISION_POSITION_ESTIMATE").samples
-    theirs = track_of(ulog, "vehicle_visual_odometry").samples
+    """Return tlog minus ULog boot time of identical positions, and their rows in the ULog."""
+    tlog_samples = track_of(tlog, "VISION_POSITION_ESTIMATE").samples
+    ulog_samples = track_of(ulog, "vehicle_visual_odometry").samples
 
     def keys(samples: pd.DataFrame) -> list[tuple[float, ...]]:
         single = samples[Columns.POSITION].to_numpy().astype(np.float32)
         return [tuple(row) for row in single.tolist()]
 
-    at = {key: row for row, key in enumerate(keys(theirs))}
-    pairs = [(row, at[key]) for row, key in enumerate(keys(ours)) if key in at]
-    mine, other = np.array(pairs).T
-    return boot(tlog, ours)[mine] - boot(ulog, theirs)[other], other
+    at = {key: row for row, key in enumerate(keys(ulog_samples))}
+    pairs = [(row, at[key]) for row, key in enumerate(keys(tlog_samples)) if key in at]
+    tlog_rows, other = np.array(pairs).T
+    return boot(tlog, tlog_samples)[tlog_rows] - boot(ulog, ulog_samples)[other], other
 
 
 def differences(
-    tlog: Flight, ulog: Flight, mine: pd.DataFrame, theirs: pd.DataFrame, columns: list[str]
+    tlog: Flight,
+    ulog: Flight,
+    tlog_rows: pd.DataFrame,
+    ulog_samples: pd.DataFrame,
+    columns: list[str],
 ) -> np.ndarray:
-    """The tlog's samples minus the ULog's, interpolated, at common boot times."""
-    a, b = boot(tlog, mine), boot(ulog, theirs)
+    """Return tlog samples minus interpolated ULog samples at common boot times."""
+    a, b = boot(tlog, tlog_rows), boot(ulog, ulog_samples)
     within = (a > b[0]) & (a < b[-1])
     return np.column_stack(
-        [mine[c].to_numpy()[within] - np.interp(a[within], b, theirs[c]) for c in columns]
+        [
+            tlog_rows[c].to_numpy()[within] - np.interp(a[within], b, ulog_samples[c])
+            for c in columns
+        ]
     )
 
 
-def same_flight(tlog: Flight, ulog: Flight) -> None:
-    """EKF2's state, the attitude and the truth, which do not depend on the companion's clock."""
+def assert_same_flight(tlog: Flight, ulog: Flight) -> None:
+    """Check that EKF2 state, attitude and ground truth are equal in both files."""
     states = differences(tlog, ulog, tlog.ekf2.state, ulog.ekf2.state, Columns.POSITION)
     assert len(states) > 1000
     assert np.abs(np.median(states, axis=0)).max() < 1e-3
@@ -600,26 +611,26 @@ def same_flight(tlog: Flight, ulog: Flight) -> None:
     assert np.degrees(np.median((one.inv() * other).magnitude())) < 0.5
     truth = differences(tlog, ulog, tlog.truth.samples, ulog.truth.samples, Columns.POSITION)
     assert len(truth) > 1000
-    # projected about the first sample of either recording, some millimetres apart
+    # the projection origins are the first samples of the two files, some millimetres apart
     assert np.abs(np.median(truth, axis=0)).max() < 0.015
     assert truth.std(axis=0).max() < 0.01
 
 
-def test_the_sample_tlog_and_ulog_are_one_flight(sample_log, sample_flight):
+def test_read_log_sample_tlog_and_ulog_are_equal(sample_log, sample_flight):
     tlog = read_log(sample_log.with_suffix(".tlog"))
     late, rows = stamp_differences(tlog, sample_flight)
     assert len(rows) == len(track_of(sample_flight, "vehicle_visual_odometry").samples)
     assert np.abs(late).max() < 1e-3
-    same_flight(tlog, sample_flight)
+    assert_same_flight(tlog, sample_flight)
     assert tlog.log.firmware_hash in ("unknown", sample_flight.log.firmware_hash[:16])
 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", PAIRS)
-def test_stamps_of_real_pairs_agree_with_px4_and_with_the_truth(shared_logs, name):
-    """The companion's own stamps on the boot clock, whatever PX4 took them for.
+def test_read_log_real_pairs_have_equal_times(shared_logs, name):
+    """The tlog times are the companion's timestamps converted to boot time.
 
-    Without TIMESYNC PX4 took the time of arrival, 250 ms after the measurement.
+    Without TIMESYNC the ULog has arrival times, 250 ms after the measurement.
     """
     tlog = read_log(shared_logs / "mavlink" / f"{name}.tlog")
     log = shared_logs / "simulated" / f"{name}.ulg"
@@ -633,17 +644,17 @@ def test_stamps_of_real_pairs_agree_with_px4_and_with_the_truth(shared_logs, nam
     offset = recorded["clock"]["px4_boot_minus_companion_unix_ns"] * 1e-9
     [clock] = [c for c in tlog.clocks if "component 197" in c.clock]
     assert clock.offset_s == pytest.approx(offset, abs=1e-3)
-    # every stamp that is in the file, where the simulation says that it was sent
+    # every position time equals a sent timestamp of the simulation
     stamps = [sample["usec_sent"] for sample in recorded["uwb"] if "usec_sent" in sample]
     sent = np.array(stamps) * 1e-6 + offset
-    ours = boot(tlog, track_of(tlog, "VISION_POSITION_ESTIMATE").samples)
-    nearest = np.abs(sent[None, :] - ours[:, None]).min(axis=1)
+    tlog_samples = boot(tlog, track_of(tlog, "VISION_POSITION_ESTIMATE").samples)
+    nearest = np.abs(sent[None, :] - tlog_samples[:, None]).min(axis=1)
     assert nearest.max() < 1e-3
-    same_flight(tlog, ulog)
+    assert_same_flight(tlog, ulog)
 
 
 @pytest.mark.reallogs
-def test_real_recordings_of_others(shared_logs):
+def test_read_log_real_recordings_of_other_systems(shared_logs):
     folder = shared_logs / "mavlink"
     flight = read_log(folder / "Ian-McConachie-CU_drone_position_hold_hist_40e21c1c_mav.tlog")
     [track] = flight.positions
@@ -663,7 +674,7 @@ def test_real_recordings_of_others(shared_logs):
 
 # ---- fuzz ---------------------------------------------------------------------------------------
 
-INTERESTING = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1]
+EXTREME_INTEGERS = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1]
 READ = [
     "HEARTBEAT", "HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "ATTITUDE", "ATTITUDE_QUATERNION",
     "ODOMETRY", "LOCAL_POSITION_NED", "ESTIMATOR_STATUS", "TIMESYNC",
@@ -673,8 +684,8 @@ READ = [
 SENDERS = [(1, 1), (1, 1), (1, 1), (1, 197), (2, 1), (255, 190)]
 
 
-class Chunks:
-    """Cases are made of a few hundred frames of a made recording."""
+class FuzzCases:
+    """Frames of a simulated recording, from which fuzz cases are made."""
 
     def __init__(self, folder: Path):
         self.path = folder / "fuzz.tlog"
@@ -685,13 +696,13 @@ class Chunks:
         add(made, 5.0, lambda t: message("ATT_POS_MOCAP", time_usec=us(unix(t))), COMPANION, 4.0)
         self.frames = [stamp(us_) + content for us_, _, content in made.frames()]
 
-    def reads(self, content: bytes) -> bool:
-        """Whether it is a flight; then its parts keep their promises, else it is refused."""
+    def is_read(self, content: bytes) -> bool:
+        """Return True if the content is read as a valid flight, False if it is rejected."""
         self.path.write_bytes(content)
         try:
             with patience():
                 flight = read_log(self.path)
-        except LogError:  # always one line
+        except LogError:
             return False
         self.check(flight)
         return True
@@ -718,12 +729,12 @@ class Chunks:
 
 
 @pytest.fixture(scope="module")
-def chunks(tmp_path_factory) -> Chunks:
-    return Chunks(tmp_path_factory.mktemp("fuzz"))
+def fuzz_cases(tmp_path_factory) -> FuzzCases:
+    return FuzzCases(tmp_path_factory.mktemp("fuzz"))
 
 
-def hostile_value(rng: np.random.Generator, kind: np.dtype) -> bytes:
-    """Bytes of one field: anything, an extreme value, or a time near those of the made flight."""
+def malicious_value(rng: np.random.Generator, kind: np.dtype) -> bytes:
+    """Make the bytes of one field: random, extreme, or a time near those of the flight."""
     size = kind.itemsize
     if kind.kind == "f":
         known = [0.0, 1.0, -1.0, 1e3, np.nan, np.inf, -np.inf, 3e38, 1e-38]
@@ -731,19 +742,19 @@ def hostile_value(rng: np.random.Generator, kind: np.dtype) -> bytes:
     time_s = rng.choice([0.0, unix(0.0)]) + BOOT_S + rng.uniform(0.0, 4.0)
     numbers = [
         int.from_bytes(rng.bytes(size), "little"),
-        INTERESTING[rng.integers(0, len(INTERESTING))],
+        EXTREME_INTEGERS[rng.integers(0, len(EXTREME_INTEGERS))],
         int(time_s * rng.choice([1e3, 1e6, 1e9])),
         int(rng.integers(0, 13)),
     ]
     return (numbers[rng.integers(0, 4)] % 256**size).to_bytes(size, "little")
 
 
-def hostile_frame(rng: np.random.Generator) -> bytes:
-    """A frame with a good checksum and bad content."""
+def malicious_frame(rng: np.random.Generator) -> bytes:
+    """Make a frame with a valid checksum and malicious content."""
     kind = MESSAGES[READ[rng.integers(0, len(READ))]]
     fields = [one for one, _ in wire_layout(kind.id).fields.values()]
     payload = b"".join(
-        hostile_value(rng, one.base) for one in fields for _ in range(math.prod(one.shape))
+        malicious_value(rng, one.base) for one in fields for _ in range(math.prod(one.shape))
     )
     if rng.integers(0, 8) == 0:
         payload = payload[: rng.integers(0, len(payload) + 1)]
@@ -753,34 +764,36 @@ def hostile_frame(rng: np.random.Generator) -> bytes:
     )  # fmt: skip
 
 
-def hostile_recording(rng: np.random.Generator, chunks: Chunks, pool: list[bytes]) -> bytes:
-    """A made recording of which some frames were replaced, with or without stamps."""
+def malicious_recording(
+    rng: np.random.Generator, fuzz_cases: FuzzCases, pool: list[bytes]
+) -> bytes:
+    """Make a recording with some replaced frames, with or without receive times."""
     stamped = rng.integers(0, 3) > 0
-    parts = list(chunks.frames) if rng.integers(0, 4) else []
+    parts = list(fuzz_cases.frames) if rng.integers(0, 4) else []
     if parts and rng.integers(0, 2):
         first = int(rng.integers(0, len(parts)))
         parts = parts[first : first + int(rng.integers(1, 300))]
-    # of one kind there may be many, so that a part consists of nothing else
+    # repeated frames, so that one part of a flight may consist of malicious frames only
     for _ in range(rng.integers(1, 40)):
         repeats = int(rng.integers(1, 12))
         at = int(rng.integers(0, len(parts) + 1))
         time_us = us(unix(BOOT_S + 4.0 * at / (len(parts) + 1)))
         if rng.integers(0, 10) == 0:
-            time_us = INTERESTING[rng.integers(0, len(INTERESTING))]
+            time_us = EXTREME_INTEGERS[rng.integers(0, len(EXTREME_INTEGERS))]
         made = [pool[i] for i in rng.integers(0, len(pool), repeats).tolist()]
         parts[at:at] = [stamp(min(time_us + i, 2**64 - 1)) + one for i, one in enumerate(made)]
     return b"".join(parts if stamped else [part[8:] for part in parts])
 
 
-def test_fuzz_hostile_values_in_good_frames(chunks):
+def test_fuzz_malicious_values_in_valid_frames(fuzz_cases):
     rng = np.random.default_rng(1)
     read = 0
     for case in range(FUZZ_CASES):
         if case % 250 == 0:
-            pool = [hostile_frame(rng) for _ in range(2000)]
-        content = hostile_recording(rng, chunks, pool)
+            pool = [malicious_frame(rng) for _ in range(2000)]
+        content = malicious_recording(rng, fuzz_cases, pool)
         try:
-            read += chunks.reads(content)
+            read += fuzz_cases.is_read(content)
         except Exception as error:
             error.add_note(f"case {case}")
             raise

@@ -1,4 +1,4 @@
-"""Clocks of a recording against closed forms: every made clock is a line of the boot clock."""
+"""Clock mapping of recordings whose clocks are linear functions of the boot clock."""
 
 from dataclasses import astuple
 
@@ -32,12 +32,12 @@ from px4fuse.flight import Flight, sample_rate
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_clocks import Line, fit_least_delay, map_clock
 
-NOTHING = np.zeros(0)
-NO_EXCHANGES = (NOTHING, NOTHING), (NOTHING, NOTHING)
+EMPTY = np.zeros(0)
+NO_EXCHANGES = (EMPTY, EMPTY), (EMPTY, EMPTY)
 
 
 def clock_error(flight: Flight, aisle: Aisle, track: int = 0) -> np.ndarray:
-    """Boot time that the reader gives each position, minus the true one (s)."""
+    """Return the boot time that the reader gives each position, minus the true one (s)."""
     times = flight.positions[track].samples.index.to_numpy() + flight.log.boot_time_s
     true = np.array(aisle.times(5.0))
     assert len(times) == len(true)
@@ -52,8 +52,10 @@ def clock_error(flight: Flight, aisle: Aisle, track: int = 0) -> np.ndarray:
     scale=st.floats(0.0, 0.3), seed=st.integers(0, 2**32 - 1),
 )  # fmt: skip
 @settings(max_examples=60)
-def test_offset_and_drift_come_back_under_one_sided_delays(offset, drift_ppm, least, scale, seed):
-    """1200 messages in 120 s: the least delayed of each 2 s is late by scale/20 on average."""
+def test_fit_least_delay_random_delay_recovers_offset_and_drift(
+    offset, drift_ppm, least, scale, seed
+):
+    """1200 messages in 120 s: the smallest delay in each 2 s is scale/20 on average."""
     rng = np.random.default_rng(seed)
     x = np.arange(1200) * 0.1
     exact = offset + (1.0 + drift_ppm * 1e-6) * x
@@ -66,7 +68,7 @@ def test_offset_and_drift_come_back_under_one_sided_delays(offset, drift_ppm, le
 
 
 @pytest.mark.parametrize(("span", "slope"), [(100.0, 1.00005), (20.0, 1.0)])
-def test_without_delay_the_line_is_exact_and_a_short_span_tells_no_drift(span, slope):
+def test_fit_least_delay_without_delay_is_exact(span, slope):
     x = np.linspace(0.0, span, 500)
     line = fit_least_delay(x, 7.0 + 1.00005 * x)
     assert (line.pairs, line.slope) == (500, pytest.approx(slope, abs=1e-12))
@@ -77,7 +79,7 @@ def test_without_delay_the_line_is_exact_and_a_short_span_tells_no_drift(span, s
 
 @pytest.mark.parametrize("speed", [0.04, 0.5, 10.0])
 @pytest.mark.parametrize("span", [10.0, 100.0])
-def test_a_recording_replayed_at_another_speed_is_mapped(speed, span):
+def test_fit_least_delay_replay_speed_is_recovered(speed, span):
     x = np.linspace(0.0, span, 600)
     delay = np.random.default_rng(1).exponential(0.01, len(x))
     line = fit_least_delay(x, 5.0 + speed * x + delay)
@@ -91,7 +93,7 @@ def test_a_recording_replayed_at_another_speed_is_mapped(speed, span):
 # and one of 1e321, which is infinite itself
 @example([(-2.0, 0.0), (-1e-308, 0.0), (1e-308, 1e13), (2e-308, 1e13), (2.0, 1e13)])
 @settings(max_examples=100)
-def test_any_pairs_give_a_line_that_can_be_turned_round(pairs):
+def test_fit_least_delay_any_pairs_give_invertible_line(pairs):
     x, y = np.array(pairs).T
     line = fit_least_delay(x, y)
     turned = line.inverse()
@@ -101,47 +103,46 @@ def test_any_pairs_give_a_line_that_can_be_turned_round(pairs):
     assert np.isfinite(astuple(turned)).all()
 
 
-# ---- which means a clock is mapped by -----------------------------------------------------------
+# ---- method of the clock map --------------------------------------------------------------------
 
 
 DAY_S, HOUR_S, WAY_S = 86_400.0, 3600.0, LEAST_DELAY_S
-# The flight, the method that maps the companion's clock, whose name begins so, and between which
-# errors (s) it does so
-MEANS = {
-    # the companion replies after the autopilot's question has reached it
-    "replies alone are late by the way there":
+# Case: flight, expected method, beginning of the clock's name, limits of the mean error (s)
+METHODS = {
+    # the companion replies after the autopilot's request has reached it
+    "replies only, early by the link delay":
         (Aisle(seconds=60.0), "TIMESYNC", "UNIX time", (-1.5 * WAY_S, 0.0)),
-    "questions alone are late the other way": (
+    "requests only, late by the link delay": (
         Aisle(seconds=60.0, replies=False, asks=True), "TIMESYNC", "UNIX time", (0.0, 1.5 * WAY_S),
     ),
-    "both directions cancel the way":
+    "both directions cancel the link delay":
         (Aisle(seconds=60.0, asks=True), "TIMESYNC", "UNIX time", (-0.25 * WAY_S, 0.25 * WAY_S)),
-    "TIMESYNC although the ground station's clock is an hour wrong":
+    "TIMESYNC with a ground station clock that is wrong by one hour":
         (Aisle(receiver=lambda boot: UNIX_S + HOUR_S + boot), "TIMESYNC", "UNIX time",
          (-1.5 * WAY_S, 1.5 * WAY_S)),
-    "SYSTEM_TIME is second":
+    "second choice is SYSTEM_TIME":
         (Aisle(replies=False, system_time=True), "SYSTEM_TIME", "UNIX time", (-1e-3, 1e-3)),
-    "SYSTEM_TIME is of no use to a companion with a wrong date":
+    "SYSTEM_TIME is not used for a companion with a wrong date":
         (Aisle(replies=False, system_time=True, clock=lambda boot: UNIX_S - DAY_S + boot),
          "receive time", "UNIX time", (-1.5 * WAY_S, 1.5 * WAY_S)),
-    # both ways have the same least delay, which cancels
-    "the time of receipt is last":
+    # both links have the same minimum delay, which cancels
+    "last choice is receive time":
         (Aisle(replies=False, seconds=60.0), "receive time", "UNIX time", (-1.5e-3, 1.5e-3)),
     "a boot clock needs no mapping":
         (Aisle(clock=same, replies=False), "boot clock", "system 1", (-1e-6, 1e-6)),
-    # a companion's monotonic clock reads 3 s less; TIMESYNC knows
-    "a clock that started seconds after the autopilot's is another clock":
+    # a companion's monotonic clock that started 3 s later
+    "TIMESYNC for a clock that started seconds after the autopilot's":
         (Aisle(clock=lambda boot: boot - 3.0, asks=True), "TIMESYNC", "own clock", (-WAY_S, WAY_S)),
-    "an own clock hours away is mapped by receipt":
+    "receive time for another clock hours away":
         (Aisle(clock=lambda boot: boot + 2 * HOUR_S, replies=False), "receive time", "own clock",
          (-1.5 * WAY_S, 1.5 * WAY_S)),
 }  # fmt: skip
-NOTES = {"SYSTEM_TIME": "agree on UNIX time", "receive time": "least delay"}
+NOTES = {"SYSTEM_TIME": "same UNIX time", "receive time": "minimum link delay"}
 
 
-@pytest.mark.parametrize("case", MEANS)
-def test_which_means_a_clock_is_mapped_by(read, case):
-    aisle, method, clock, (low, high) = MEANS[case]
+@pytest.mark.parametrize("case", METHODS)
+def test_clock_map_uses_best_available_method(read, case):
+    aisle, method, clock, (low, high) = METHODS[case]
     flight = read(aisle)
     found = flight.positions[0].clock_map
     assert (found.method, found.clock[: len(clock)]) == (method, clock)
@@ -160,8 +161,8 @@ def test_which_means_a_clock_is_mapped_by(read, case):
 
 
 @pytest.mark.parametrize("asks", [False, True])
-def test_stamps_of_two_values_do_not_tell_the_time(read, asks):
-    """A running TIMESYNC does not make them better."""
+def test_clock_map_two_distinct_timestamps_uses_receive_time(read, asks):
+    """TIMESYNC is not used for timestamps that are not a clock."""
     aisle = Aisle()
     recorder = replace(aisle, uwb=None, asks=asks).record()
     rng = np.random.default_rng(1)
@@ -175,14 +176,14 @@ def test_stamps_of_two_values_do_not_tell_the_time(read, asks):
     track = flight.positions[0]
     assert track.clock_map.distinct_stamps == 2
     assert track.clock_map.method == "receive time"
-    assert "2 values" in track.clock_map.note
+    assert "2 distinct values" in track.clock_map.note
     assert np.abs(clock_error(flight, aisle)).max() < 0.02
-    # of an exponential delay of 2 ms
+    # the delay is exponential with a mean of 2 ms
     assert 0.5e-3 < track.clock_map.jitter_s < 4e-3
 
 
-def test_two_companions_do_not_answer_for_each_other(read):
-    """Both ask; the autopilot's answers are told apart by what was asked."""
+def test_clock_map_two_companions_are_separated(read):
+    """Both send TIMESYNC requests; ``ts1`` assigns the autopilot's replies."""
     first = Aisle(asks=True, replies=False)
     second = replace(first, clock=lambda boot: unix(boot) + 2.0, seed=2, state=None)
     recorder = first.record()
@@ -201,8 +202,8 @@ def test_two_companions_do_not_answer_for_each_other(read):
         assert np.abs(clock_error(flight, aisle, number)).max() < 1.5 * LEAST_DELAY_S
 
 
-def test_a_ground_stations_exchanges_do_not_disturb(read):
-    """QGroundControl asks too, with its own clock, and replies to the autopilot."""
+def test_clock_map_ignores_ground_station_timesync(read):
+    """QGroundControl sends requests with its clock and replies to the autopilot."""
     aisle = Aisle(asks=True)
     recorder = aisle.record()
     for boot in aisle.times(10.0):
@@ -215,7 +216,7 @@ def test_a_ground_stations_exchanges_do_not_disturb(read):
     assert np.abs(clock_error(flight, aisle)).max() < LEAST_DELAY_S
 
 
-def test_a_raw_stream_is_mapped_by_timesync_and_by_order(read):
+def test_clock_map_raw_stream_uses_timesync_or_order(read):
     for replies, method, allowed in (
         (True, "TIMESYNC", 1.5 * LEAST_DELAY_S),
         (False, "position in the stream", 0.1),
@@ -228,8 +229,8 @@ def test_a_raw_stream_is_mapped_by_timesync_and_by_order(read):
         assert [c.clock for c in flight.clocks] == ["UNIX time of system 1, component 197"]
 
 
-def test_a_recording_without_a_boot_clock_counts_from_its_first_receipt(read):
-    """Only the companion's way to the autopilot was recorded."""
+def test_recording_without_boot_clock_starts_at_first_receipt(read):
+    """Only messages from the companion were recorded."""
     aisle = Aisle(replies=False)
     recorder = aisle.record()
     recorder.sent = [s for s in recorder.sent if s[1] == COMPANION]
@@ -241,32 +242,32 @@ def test_a_recording_without_a_boot_clock_counts_from_its_first_receipt(read):
     np.testing.assert_allclose(np.diff(times), 0.2, atol=1e-3)
 
 
-def renumbered(recorder: Recorder, change) -> Recorder:
-    """Other messages from other senders; ``change`` takes sender and message, None drops it."""
+def change_messages(recorder: Recorder, change) -> Recorder:
+    """Apply ``change`` to sender and message of each message; None drops it."""
     sent = [(at, change(sender, made), link) for at, sender, made, link in recorder.sent]
     recorder.sent = [(at, *found, link) for at, found, link in sent if found is not None]
     return recorder
 
 
-def calls_itself_autopilot(sender, made):
-    """As scripts do that copy a heartbeat."""
+def with_autopilot_heartbeat(sender, made):
+    """Give the companion the heartbeat of an autopilot, as copied by some scripts."""
     beat = made.get_type() == "HEARTBEAT" and sender == COMPANION
     return sender, heartbeat(kind=18, autopilot=0) if beat else made
 
 
 def without_heartbeat(sender, made):
-    found = calls_itself_autopilot(sender, made)
+    found = with_autopilot_heartbeat(sender, made)
     return None if made.get_type() == "HEARTBEAT" and sender != COMPANION else found
 
 
-def of_component_4(sender, made):
+def as_component_4(sender, made):
     if made.get_type() == "HEARTBEAT":
         return None
     return ((1, 4), made) if sender == AUTOPILOT else (sender, made)
 
 
-def stamped_by(boot_ms, usec):
-    """An autopilot whose stamps are made of the true ones so; None leaves those messages out."""
+def change_timestamps(boot_ms, usec):
+    """Return a change of the autopilot's timestamps; ``boot_ms`` None drops those messages."""
 
     def change(sender, made):
         if sender == AUTOPILOT and hasattr(made, "time_boot_ms"):
@@ -280,40 +281,40 @@ def stamped_by(boot_ms, usec):
     return change
 
 
-UNIX_CLOCK = stamped_by(None, lambda usec: usec + us(UNIX_S))
-STANDING = stamped_by(lambda _: 1000, lambda _: 1_000_000)
+UNIX_CLOCK = change_timestamps(None, lambda usec: usec + us(UNIX_S))
+CONSTANT_CLOCK = change_timestamps(lambda _: 1000, lambda _: 1_000_000)
 
 
 @pytest.mark.parametrize(("change", "stamped"), [
-    (calls_itself_autopilot, True), (without_heartbeat, True), (of_component_4, True),
-    (of_component_4, False), (UNIX_CLOCK, True), (UNIX_CLOCK, False), (STANDING, True),
+    (with_autopilot_heartbeat, True), (without_heartbeat, True), (as_component_4, True),
+    (as_component_4, False), (UNIX_CLOCK, True), (UNIX_CLOCK, False), (CONSTANT_CLOCK, True),
 ])  # fmt: skip
-def test_an_autopilot_is_found_by_what_it_sends_and_placed_by_what_moves(read, change, stamped):
-    """A companion that calls itself one sets points too, whose boot time is a constant."""
-    aisle = Aisle(replies=False, state=None if change is STANDING else "ODOMETRY")
-    recorder = renumbered(aisle.record(), change)
-    if change in (calls_itself_autopilot, without_heartbeat):
+def test_recording_unusual_autopilot_is_found_with_times(read, change, stamped):
+    """The companion also sends setpoints with a constant boot time."""
+    aisle = Aisle(replies=False, state=None if change is CONSTANT_CLOCK else "ODOMETRY")
+    recorder = change_messages(aisle.record(), change)
+    if change in (with_autopilot_heartbeat, without_heartbeat):
         for boot in aisle.times(100.0):
             point = message("SET_POSITION_TARGET_LOCAL_NED", time_boot_ms=10)
             recorder.hear(unix(boot), COMPANION, point)
     flight = read(recorder, stamped=stamped)
     assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
     assert sample_rate(flight.imu) == pytest.approx(aisle.imu_hz, rel=0.01)
-    if change is not STANDING:  # by the time of receipt, that one
+    if change is not CONSTANT_CLOCK:  # for constant timestamps the times are receive times
         assert len(flight.imu) == aisle.seconds * aisle.imu_hz
         np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)
 
 
-def test_a_stream_without_any_clock_says_so(read):
+def test_recording_stream_without_clock_has_note(read):
     flight = read(Recorder().hear(0.0, AUTOPILOT, heartbeat()), stamped=False)
     assert flight.log.duration_s == 0.0
-    assert any("no message in the stream carries" in note for note in flight.log.notes)
+    assert any("no message in the stream contains a time" in note for note in flight.log.notes)
 
 
 # ---- restarts, late packets, several vehicles ---------------------------------------------------
 
 
-def test_after_a_restart_only_the_longer_part_is_read(read):
+def test_recording_after_restart_longer_part_is_read(read):
     first = Aisle(seconds=20.0, start_s=500.0)
     second = Aisle(seconds=60.0, start_s=3.0, receiver=lambda boot: UNIX_S + 520.0 + boot,
                    clock=lambda boot: UNIX_S + 520.0 + boot, seed=2)  # fmt: skip
@@ -322,17 +323,17 @@ def test_after_a_restart_only_the_longer_part_is_read(read):
     assert flight.log.boot_time_s == pytest.approx(3.0, abs=0.1)
     assert flight.log.duration_s == pytest.approx(60.0, abs=0.1)
     [note] = [note for note in flight.log.notes if "restart" in note]
-    assert "went back 1 time" in note
+    assert "restarted 1 time:" in note
     assert "part 2 of 2" in note
-    # what was sent before the first message with the new boot clock is of no known boot
+    # messages before the first one with the new boot clock cannot be assigned
     times = flight.positions[0].samples.index.to_numpy() + flight.log.boot_time_s
     assert len(times) >= 299
     assert np.abs(times - second.times(5.0)[-len(times) :]).max() < 1.5 * LEAST_DELAY_S
     assert flight.airborne[0] == pytest.approx((15.0, 45.0), abs=0.1)
 
 
-def test_a_late_packet_or_one_far_ahead_is_no_restart(read):
-    """Ten seconds late, for example out of a router's queue."""
+def test_recording_late_or_early_packet_is_no_restart(read):
+    """Packets may be ten seconds late, for example from a router's queue."""
     aisle = Aisle(seconds=40.0)
     recorder = aisle.record()
     for boot in (60.0, 70.0):
@@ -346,7 +347,7 @@ def test_a_late_packet_or_one_far_ahead_is_no_restart(read):
     assert len(flight.attitude) == 800
 
 
-def test_a_position_stamped_years_ahead_is_dropped(read):
+def test_recording_timestamp_years_ahead_is_dropped(read):
     aisle = Aisle()
     recorder = aisle.record()
     end = BOOT_S + aisle.seconds
@@ -360,7 +361,7 @@ def test_a_position_stamped_years_ahead_is_dropped(read):
     assert note.startswith("3 samples")
 
 
-def test_several_vehicles_are_told_apart(read):
+def test_recording_several_vehicles_system_selects_one(read):
     busy = Aisle(seconds=30.0, system=3)
     other = Aisle(seconds=20.0, system=7, start_s=900.0, clock=lambda boot: unix(boot) - 850.0,
                   receiver=lambda boot: unix(boot) - 850.0, seed=2)  # fmt: skip
@@ -375,12 +376,12 @@ def test_several_vehicles_are_told_apart(read):
         [chosen] = [s for s in flight.log.senders if s.chosen]
         assert (chosen.system, chosen.component) == (aisle.system, 1)
     for system in (5, 255):
-        with pytest.raises(SettingsError, match=r"autopilots in the file: 3, 7\."):
+        with pytest.raises(SettingsError, match=r"Autopilots in this file: 3, 7\."):
             read(recorder, system=system)
 
 
-def test_senders_and_what_they_lost_are_described(tmp_path):
-    """Of the companion every tenth message is missing, and every twentieth is there twice."""
+def test_describe_senders_reports_lost_fraction(tmp_path):
+    """Every tenth message of the companion is missing, every twentieth is repeated."""
     aisle = Aisle(seconds=60.0)
     recorder = aisle.record()
     for boot in aisle.times(1.0):
@@ -390,10 +391,10 @@ def test_senders_and_what_they_lost_are_described(tmp_path):
     of_companion = [i for i, part in enumerate(parts) if part[13:15] == bytes(COMPANION)]
     for i in of_companion[5::10]:
         parts[i] = b""
-    for i in of_companion[7::20]:  # and some come again over a slower link
+    for i in of_companion[7::20]:  # repeated over a slower link
         parts[i + 5] += parts[i]
-    end_us, silent = recorder.frames()[-1][0], (1, 190)  # one that numbers nothing
-    parts += 5 * [stamp(end_us) + frame(heartbeat(kind=6, autopilot=8), silent, 7)]
+    end_us, constant = recorder.frames()[-1][0], (1, 190)  # sender with constant sequence number
+    parts += 5 * [stamp(end_us) + frame(heartbeat(kind=6, autopilot=8), constant, 7)]
     path.write_bytes(b"".join(parts))
     flight = read_log(path)
     described = {(s.system, s.component): s for s in flight.log.senders}
@@ -402,33 +403,33 @@ def test_senders_and_what_they_lost_are_described(tmp_path):
     assert described[GROUND].description == "ground station"
     assert described[COMPANION].lost_share == pytest.approx(0.1, abs=0.005)
     assert described[AUTOPILOT].lost_share == 0.0
-    assert described[silent].lost_share is None
-    assert [*described] == [AUTOPILOT, COMPANION, GROUND, silent]  # most messages first
+    assert described[constant].lost_share is None
+    assert [*described] == [AUTOPILOT, COMPANION, GROUND, constant]  # most messages first
 
 
 # ---- the map itself -----------------------------------------------------------------------------
 
 
-def mapped(received, *exchanges):
-    """The map of stamps of UNIX time, ten a second, that were received so."""
+def map_unix_timestamps(received, *exchanges):
+    """Return UNIX timestamps at 10 Hz and their clock map for given receive times."""
     stamps = UNIX_S + 0.1 * np.arange(len(received))
     line = Line(0.0, 0.0, 1.0, 0.0, 9)
     return stamps, map_clock("x", stamps, received, line, *exchanges, None, has_receipt=True)
 
 
-def test_a_timesync_of_another_clock_is_passed_over():
-    """It would put messages an hour before their receipt."""
+def test_map_clock_timesync_of_other_clock_is_ignored():
+    """This TIMESYNC would place messages one hour before their receipt."""
     received = np.arange(0.0, 60.0, 0.1) + 0.01
     wrong = (received, UNIX_S + 3600.0 + received), NO_EXCHANGES[1]
-    stamps, found = mapped(received, *wrong)
+    stamps, found = map_unix_timestamps(received, *wrong)
     assert found.statement.method == "receive time"
     np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
 
 
-def test_the_statement_says_what_the_map_does():
-    """boot = stamp + offset + drift · (stamp - middle of the stamps)."""
+def test_map_clock_statement_equals_map():
+    """boot = timestamp + offset + drift · (timestamp - middle of the timestamps)."""
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
-    stamps, found = mapped(received, *NO_EXCHANGES)
+    stamps, found = map_unix_timestamps(received, *NO_EXCHANGES)
     statement = found.statement
     assert statement.drift_ppm == pytest.approx(100.0, abs=0.1)
     middle = 0.5 * (stamps[0] + stamps[-1])

@@ -1,4 +1,4 @@
-"""Frames and columns against pymavlink's own reader, and frames among every kind of damage."""
+"""MAVLink frames and columns compared with pymavlink's reader, and recovery from damage."""
 
 import contextlib
 import tracemalloc
@@ -33,12 +33,12 @@ from px4fuse.readers import mavlink_frames, read_log
 from px4fuse.readers.mavlink_frames import Frames, message_name, read_frames
 
 START_US = 1_700_000_000_000_000
-# good frames that pymavlink steps over after bad bytes, because it trusts a false length there
+# valid frames that pymavlink skips after invalid bytes, because it uses a wrong length there
 BEYOND_PYMAVLINK = {
     "ArduPilot_UAVLogViewer_hist_7092460c_flight_logs.tlog": 5,
     "mbiuki_Phoenix_mission1.rlog": 17,
 }
-PARSABLE = [
+REAL_RECORDINGS = [
     path
     for path in sorted((SHARED / "logs" / "mavlink").glob("*"))
     if path.suffix in (".tlog", ".rlog", ".raw")
@@ -46,15 +46,14 @@ PARSABLE = [
 LONG_BYTES = 500_000
 ATTITUDE = message("ATTITUDE", time_boot_ms=1000, roll=0.1, pitch=-0.2, yaw=1.5)
 MANY_BYTES = 5_000_000
-# What one frame may cost beside its bytes: offsets, header fields, time of receipt, and what is
-# made of them on the way
+# Memory limit per frame besides its content: offsets, header fields, receive time, temporary arrays
 FRAME_BYTES = 150
-# and one that is decoded, whatever part of it was cut off
+# Memory limit per decoded frame, for any payload length
 DECODED_BYTES = 800
 TINY_BYTES = 1_000_000
-# What a block of the scan may cost, if every byte of it could begin a frame
+# Memory limit of one block of the scan in which every byte may begin a frame
 BLOCK_BYTES = 15_000_000
-# What 65,536 senders may cost
+# Memory limit for 65,536 senders
 SENDER_BYTES = 10_000_000
 
 
@@ -87,13 +86,13 @@ def decoded(frames: Frames, name: str) -> np.ndarray:
     return frames.table(name, frames.rows(name))
 
 
-def spoilt(made: bytes) -> bytes:
-    """With a wrong checksum."""
+def with_wrong_checksum(made: bytes) -> bytes:
+    """Change the checksum of a frame to a wrong one."""
     return made[:-1] + bytes([made[-1] ^ 1])
 
 
 def flight_and_peak(path: Path) -> tuple[Flight | None, int]:
-    """The flight, or None where it is refused, and the most memory that reading it took."""
+    """Return the flight (None if rejected) and the peak memory of reading it."""
     tracemalloc.start()
     flight = None
     with contextlib.suppress(LogError):
@@ -106,23 +105,25 @@ def flight_and_peak(path: Path) -> tuple[Flight | None, int]:
 # ---- against pymavlink ------------------------------------------------------------------------
 
 
-def same_values(kind, name: str, table: np.ndarray, heard: list[Heard]) -> None:
-    """Every field of one message type, as pymavlink decoded it."""
+def assert_same_values(kind, name: str, table: np.ndarray, heard: list[Heard]) -> None:
+    """Check that every field of one message type equals pymavlink's value."""
     types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
     for field in kind.fieldnames:
-        theirs = [one.fields[field] for one in heard]
-        mine = table[field]
+        expected_values = [one.fields[field] for one in heard]
+        values_read = table[field]
         if types[field] == "char":
             # pymavlink cuts a text at its first zero, numpy only at the end
-            texts = [value.split(b"\0")[0].decode(errors="replace") for value in mine.tolist()]
-            assert [value.split("\0")[0] for value in theirs] == texts, (name, field)
+            texts = [
+                value.split(b"\0")[0].decode(errors="replace") for value in values_read.tolist()
+            ]
+            assert [value.split("\0")[0] for value in expected_values] == texts, (name, field)
             continue
-        assert mine.shape == np.shape(theirs), (name, field)
-        expected = np.array(theirs, dtype=mine.dtype)
-        np.testing.assert_array_equal(mine, expected, err_msg=f"{name}.{field}")
+        assert values_read.shape == np.shape(expected_values), (name, field)
+        expected = np.array(expected_values, dtype=values_read.dtype)
+        np.testing.assert_array_equal(values_read, expected, err_msg=f"{name}.{field}")
 
 
-def agrees(path: Path) -> None:
+def assert_equals_pymavlink(path: Path) -> None:
     with_stamps = path.suffix == ".tlog"
     heard, unknown = heard_by_pymavlink(path, stamped=with_stamps)
     frames = read_frames(path.name, path.read_bytes())
@@ -131,7 +132,7 @@ def agrees(path: Path) -> None:
     for name, all_heard in heard.items():
         rows = np.array([at[one.start] for one in all_heard], dtype=np.intp)
         assert (frames.message_id[rows] == MESSAGES[name].id).all()
-        same_values(MESSAGES[name], name, frames.table(name, rows), all_heard)
+        assert_same_values(MESSAGES[name], name, frames.table(name, rows), all_heard)
         senders = np.column_stack([frames.system[rows], frames.component[rows]])
         np.testing.assert_array_equal(senders, [one.sender for one in all_heard])
         np.testing.assert_array_equal(frames.sequence[rows], [one.sequence for one in all_heard])
@@ -141,18 +142,18 @@ def agrees(path: Path) -> None:
         count += len(rows)
     assert (frames.received_us is not None) == with_stamps
     assert len(frames) - count == BEYOND_PYMAVLINK.get(path.name, 0)
-    if path.name not in BEYOND_PYMAVLINK:  # else pymavlink takes some of those for unknown ones
+    if path.name not in BEYOND_PYMAVLINK:  # pymavlink counts some of them as unknown frames
         assert frames.unknown_frame_count == unknown
 
 
-def test_the_sample_tlog_is_read_as_pymavlink_reads_it(sample_log):
-    agrees(sample_log.with_suffix(".tlog"))
+def test_read_frames_sample_equals_pymavlink(sample_log):
+    assert_equals_pymavlink(sample_log.with_suffix(".tlog"))
 
 
 @pytest.mark.reallogs
-@pytest.mark.parametrize("path", PARSABLE, ids=lambda path: path.name)
-def test_real_recordings_are_read_as_pymavlink_reads_them(path, tmp_path):
-    """Of long ones beginning and end, as pymavlink takes half a minute for each."""
+@pytest.mark.parametrize("path", REAL_RECORDINGS, ids=lambda path: path.name)
+def test_read_frames_real_recordings_equal_pymavlink(path, tmp_path):
+    """Only beginning and end of long files, because pymavlink needs half a minute for each."""
     if path.stat().st_size > LONG_BYTES and path.name not in BEYOND_PYMAVLINK:
         frames, content = read_frames(path.name, path.read_bytes()), path.read_bytes()
         gap = 8 if path.suffix == ".tlog" else 0
@@ -161,11 +162,11 @@ def test_real_recordings_are_read_as_pymavlink_reads_them(path, tmp_path):
         last = int(starts[np.searchsorted(starts, len(content) - LONG_BYTES // 2)])
         path = tmp_path / path.name
         path.write_bytes(content[:first] + content[last:])
-    agrees(path)
+    assert_equals_pymavlink(path)
 
 
 def example(kind) -> object:
-    """A message with another value in every field and array element."""
+    """Make a message with a different value in every field and array element."""
     fields = {}
     lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
     for number, (key, wire) in enumerate(zip(kind.fieldnames, kind.fieldtypes, strict=True)):
@@ -179,8 +180,8 @@ def example(kind) -> object:
     return message(kind.msgname, **fields)
 
 
-def test_every_message_of_the_dialect_survives_the_way_there_and_back(read):
-    """Layouts are from pymavlink's tables; the bytes are from its packers."""
+def test_table_every_message_is_decoded_as_packed(read):
+    """The layouts are from pymavlink's tables, the bytes from its packers."""
     kinds = [kind for _, kind in sorted(MESSAGES.items())]
     made = [example(kind) for kind in kinds]
     frames = read(stamped(*(frame(one, sequence=i % 256) for i, one in enumerate(made))))
@@ -191,13 +192,13 @@ def test_every_message_of_the_dialect_survives_the_way_there_and_back(read):
             for key, value in ((key, getattr(one, key)) for key in kind.fieldnames)
         }
         heard = [Heard(0, 0, AUTOPILOT, 0, fields)]
-        same_values(kind, kind.msgname, decoded(frames, kind.msgname), heard)
+        assert_same_values(kind, kind.msgname, decoded(frames, kind.msgname), heard)
 
 
 # ---- the wire format --------------------------------------------------------------------------
 
 
-def test_zeros_that_mavlink_2_cuts_off_are_put_back(read):
+def test_table_omitted_trailing_zeros_are_restored(read):
     whole = message("PARAM_VALUE", param_id=b"EKF2_EV_DELAY", param_value=3.5, param_type=9)
     short = message("ATTITUDE", time_boot_ms=7)
     frames = read(stamped(frame(short), frame(whole, sequence=1), frame(ATTITUDE, sequence=2)))
@@ -208,8 +209,8 @@ def test_zeros_that_mavlink_2_cuts_off_are_put_back(read):
     assert decoded(frames, "PARAM_VALUE")["param_id"].tolist() == [b"EKF2_EV_DELAY"]
 
 
-def test_a_payload_longer_than_the_dialect_knows_is_cut(read):
-    """A later dialect adds extension fields at the end."""
+def test_table_longer_payload_is_truncated(read):
+    """A later dialect may add extension fields at the end."""
     payload = bytes(ATTITUDE.unpacker.pack(1000, 0.1, -0.2, 1.5, 0.0, 0.0, 0.0)) + b"\x07" * 20
     longer = raw_frame(30, payload, seed=ATTITUDE.crc_extra)
     frames = read(stamped(frame(ATTITUDE), longer))
@@ -221,7 +222,7 @@ def test_a_payload_longer_than_the_dialect_knows_is_cut(read):
 BEATS = beats(10)
 SIGNED = [frame(heartbeat(), sequence=i, key=bytes(range(32)) if i % 2 else None)
           for i in range(10)]  # fmt: skip
-# Of three dialects that are not known here, one signed, one of MAVLink 1
+# Messages that are not in the dialect; one is signed, one is MAVLink 1
 UNKNOWN = [raw_frame(40_000, bytes(40), seed=1), raw_frame(70_000, b"\x01", seed=1, flags=1),
            raw_frame(207, b"\x01\x02", seed=1, v1=True)]  # fmt: skip
 JUNK = {"zeros": b"\x00" * 50, "starts": b"\xfd" * 50, "old starts": b"\xfe" * 300,
@@ -232,57 +233,58 @@ JUNK = {"zeros": b"\x00" * 50, "starts": b"\xfd" * 50, "old starts": b"\xfe" * 3
 @pytest.mark.parametrize(("parts", "good", "unknown_frame_count", "bad"), [
     pytest.param(SIGNED, range(10), 0, 0, id="signed"),
     pytest.param([*BEATS[:4], *UNKNOWN, *BEATS[4:]], range(10), 3, 0, id="unknown"),
-    pytest.param([*BEATS[:4], spoilt(BEATS[4]), *BEATS[5:]], (0, 1, 2, 3, 5, 6, 7, 8, 9), 0, 1,
-                 id="damaged"),
+    pytest.param([*BEATS[:4], with_wrong_checksum(BEATS[4]), *BEATS[5:]],
+                 (0, 1, 2, 3, 5, 6, 7, 8, 9), 0, 1, id="damaged"),
 ])  # fmt: skip
-def test_frames_are_good_unknown_or_damaged(
+def test_read_frames_counts_unknown_frames_and_bad_bytes(
     read, parts, good, unknown_frame_count, bad, with_stamps
 ):
-    """A signature is no bad byte, an unknown frame costs nothing else."""
+    """Signatures are not bad bytes, and unknown frames do not affect other frames."""
     frames = read(stamped(*parts) if with_stamps else b"".join(parts))
     assert frames.sequence.tolist() == [*good]
     assert frames.unknown_frame_count == unknown_frame_count
     assert frames.bad_bytes == bad * (len(BEATS[4]) + 8 * with_stamps)
 
 
-@pytest.mark.parametrize(("share", "said"), [(0.002, False), (0.005, True)])
-def test_half_a_hundredth_that_is_no_frame_is_damage(tmp_path, share: float, said: bool):
+@pytest.mark.parametrize(("share", "is_stated"), [(0.002, False), (0.005, True)])
+def test_damage_above_limit_of_bad_bytes_is_stated(tmp_path, share: float, is_stated: bool):
     content = Aisle(seconds=40.0).record().raw()
-    junk = b"\x00" * round(share * len(content) + 2 * said * mavlink_frames.LONGEST_FRAME)
+    junk = b"\x00" * round(share * len(content) + 2 * is_stated * mavlink_frames.LONGEST_FRAME)
     at = len(content) // 2
     (tmp_path / "made.tlog").write_bytes(content[:at] + junk + content[at:])
     log = read_log(tmp_path / "made.tlog").log
-    assert any("belong to no whole MAVLink frame" in text for text in log.damage) is said
+    damage = [text for text in log.damage if "not part of a complete MAVLink frame" in text]
+    assert bool(damage) is is_stated
     assert log.bytes - log.bytes_read >= len(junk)
 
 
 @pytest.mark.parametrize("stamped", [True, False])
 @pytest.mark.parametrize("missing", [0, 1, 11, 25, 30])
-def test_a_recording_that_is_cut_off_says_so(tmp_path, stamped: bool, missing: int):
+def test_damage_truncated_recording_is_stated(tmp_path, stamped: bool, missing: int):
     made = Aisle(seconds=20.0).record()
     content = made.tlog() if stamped else made.raw()
     (tmp_path / "made.tlog").write_bytes(content[: len(content) - missing])
     log = read_log(tmp_path / "made.tlog").log
-    wanted = f"the file ends in mid-frame after {log.duration_s:.1f} s"
+    wanted = f"the file ends within a frame after {log.duration_s:.1f} s"
     assert [text.startswith(wanted) for text in log.damage] == [True] * (missing > 0)
 
 
-@pytest.mark.parametrize("behind", [b"\x00" * 50, raw_frame(40_000, b"abcdefg", seed=7)])
-def test_what_follows_the_last_frame_is_not_always_the_next(read, behind: bytes):
-    """Rubbish, and a whole frame of a dialect that is not known here."""
-    assert not read(b"".join(beats(6)) + behind).in_frame
+@pytest.mark.parametrize("rest", [b"\x00" * 50, raw_frame(40_000, b"abcdefg", seed=7)])
+def test_in_frame_other_bytes_at_end_is_false(read, rest: bytes):
+    """Invalid bytes and a complete frame of an unknown dialect are not a truncated frame."""
+    assert not read(b"".join(beats(6)) + rest).in_frame
 
 
 @pytest.mark.parametrize("junk", JUNK.values(), ids=JUNK)
-def test_junk_between_frames_costs_itself(read, junk):
+def test_read_frames_invalid_bytes_between_frames_are_skipped(read, junk):
     parts = beats(6)
     frames = read(b"".join(parts[:3]) + junk + b"".join(parts[3:]))
     assert frames.sequence.tolist() == list(range(6))
     assert frames.bad_bytes == len(junk)
 
 
-def test_a_stamp_that_looks_like_the_beginning_of_a_frame_hides_none(read):
-    """Its last bytes and the true frame behind it are by chance a STATUSTEXT of MAVLink 1."""
+def test_read_frames_receive_time_like_frame_start_is_skipped(read):
+    """Its last bytes and the next frame together form a valid MAVLink 1 STATUSTEXT."""
     head = raw_frame(30, b"\x01\x02\x03", seed=0, sequence=3)[:-2]
     body = bytes([12, 1, 1, 1]) + bytes([0xFD, 28]) + head[2:]
     checksum = mcrf4xx(body + bytes([MESSAGES["STATUSTEXT"].crc_extra]))
@@ -296,8 +298,8 @@ def test_a_stamp_that_looks_like_the_beginning_of_a_frame_hides_none(read):
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
-def test_a_frame_inside_a_payload_is_payload(read, with_stamps):
-    """A tunnel carries whole frames, even ones that end where the outer one's checksum begins."""
+def test_read_frames_frame_inside_payload_is_ignored(read, with_stamps):
+    """TUNNEL contains complete frames, even some that end at the outer frame's checksum."""
     inner = frame(message("VISION_POSITION_ESTIMATE", usec=1, x=1.0), COMPANION)
     payload = list(inner.ljust(128, b"\x01"))
     outer = message("TUNNEL", payload_length=len(inner), payload=payload)
@@ -310,7 +312,7 @@ def test_a_frame_inside_a_payload_is_payload(read, with_stamps):
     assert bytes(carried[: len(inner)]) == inner
 
 
-def test_the_first_and_the_last_frame_may_be_cut(read):
+def test_read_frames_incomplete_first_and_last_are_dropped(read):
     parts = beats(5)
     whole = b"".join(parts)
     for cut in (1, 5, len(parts[0]) - 1):
@@ -325,7 +327,7 @@ def test_the_first_and_the_last_frame_may_be_cut(read):
         assert (np.diff(frames.received_us[1:]) == 1000).all()
 
 
-def test_damaged_stamps_are_interpolated(read):
+def test_read_frames_damaged_receive_times_are_interpolated(read):
     parts = beats(9)
     times = [START_US + 1000 * i for i in range(9)]
     for at, wrong in ((2, 0), (3, 2**64 - 1), (6, START_US + 10**12)):
@@ -337,7 +339,7 @@ def test_damaged_stamps_are_interpolated(read):
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
-def test_one_message_is_a_recording(read, with_stamps):
+def test_read_frames_single_message_is_read(read, with_stamps):
     content = frame(odometry(5_000_000, [1, 2, 3], [0, 0, 0], estimator=8))
     frames = read(stamped(content) if with_stamps else content)
     assert len(frames) == 1
@@ -347,8 +349,8 @@ def test_one_message_is_a_recording(read, with_stamps):
 
 @given(st.lists(st.sampled_from(["v1", "v2", "signed", "unknown", "bad", "junk"]), min_size=1))
 @settings(max_examples=60)
-def test_any_mixture_gives_back_its_good_frames(tmp_path_factory, kinds):
-    """The number of good frames is known; junk here holds no byte that could begin a frame."""
+def test_read_frames_any_mixture_finds_valid_frames(tmp_path_factory, kinds):
+    """The number of valid frames is known; junk contains no byte that could begin a frame."""
     good = 3
     parts = [*beats(3)]
     for i, kind in enumerate(kinds):
@@ -370,7 +372,7 @@ def test_any_mixture_gives_back_its_good_frames(tmp_path_factory, kinds):
     assert frames.unknown_frame_count <= kinds.count("unknown")
 
 
-# ---- what is no MAVLink, and what it costs ------------------------------------------------------
+# ---- other content, and limits of memory and work ----------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "content"), [
@@ -380,7 +382,7 @@ def test_any_mixture_gives_back_its_good_frames(tmp_path_factory, kinds):
     ("headers of long frames", (b"\xfd\xff\x00" + b"\xfd" * 7) * (MANY_BYTES // 10)),
     ("chance", np.random.default_rng(1).bytes(MANY_BYTES)),
 ], ids=lambda value: value if isinstance(value, str) else "")  # fmt: skip
-def test_what_is_no_mavlink_is_refused_in_bounded_memory(tmp_path, name, content):
+def test_read_log_not_mavlink_is_rejected_in_bounded_memory(tmp_path, name, content):
     path = tmp_path / "hostile.tlog"
     path.write_bytes(content)
     flight, peak = flight_and_peak(path)
@@ -388,8 +390,8 @@ def test_what_is_no_mavlink_is_refused_in_bounded_memory(tmp_path, name, content
     assert peak < 4 * len(content) + BLOCK_BYTES, name
 
 
-def test_the_scan_reads_no_byte_more_than_a_frames_length_for_each_start(tmp_path, monkeypatch):
-    """Bytes summed are at most 267 for each byte of the file: a bound without a clock."""
+def test_read_frames_checksum_work_is_bounded(tmp_path, monkeypatch):
+    """The checksum input is at most 267 bytes per byte of the file; independent of run time."""
     summed = 0
 
     def counting(part, *start):
@@ -407,7 +409,7 @@ def test_the_scan_reads_no_byte_more_than_a_frames_length_for_each_start(tmp_pat
 
 
 def short_frames(ids: list[int], *, v1: bool) -> list[bytes]:
-    """Frames with the least payload there is, from random senders."""
+    """Make frames without payload from random senders."""
     seeds = {kind.id: kind.crc_extra for kind in MESSAGES.values()}
     senders = np.random.default_rng(1).integers(0, 256, (18_000, 2)).tolist()
     return [
@@ -417,7 +419,7 @@ def short_frames(ids: list[int], *, v1: bool) -> list[bytes]:
 
 
 def cut_frames(name: str, sender: tuple[int, int]) -> list[bytes]:
-    """MAVLink 2 cuts zeros off: 232 bytes of ODOMETRY are 15 in the file."""
+    """Make frames without trailing zeros: 232 bytes of ODOMETRY are 15 in the file."""
     kind = MESSAGES[name]
     stamps = [(10**6 + 1000 * i).to_bytes(4, "little") for i in range(20_000)]
     return beats(3) + [
@@ -437,10 +439,10 @@ ALL_IDS = sorted(kind.id for kind in MESSAGES.values() if kind.id < 60_000)
     (lambda: cut_frames("VISION_POSITION_ESTIMATE", COMPANION), DECODED_BYTES, TINY_BYTES),
     (lambda: cut_frames("PARAM_VALUE", AUTOPILOT), DECODED_BYTES, TINY_BYTES),
 ], ids=["shortest", "all", "own state", "odometry", "vision", "parameters"])  # fmt: skip
-def test_a_frame_costs_a_bounded_amount(tmp_path, make, each_bytes, more_bytes):
+def test_read_log_memory_per_frame_is_bounded(tmp_path, make, each_bytes, more_bytes):
     parts, path = make(), tmp_path / "hostile.raw"
     path.write_bytes(b"".join(parts[:800]))
-    read_log(path)  # tables that are made once
+    read_log(path)  # fills the caches before the measurement
     path.write_bytes(b"".join(parts))
     flight, peak = flight_and_peak(path)
     assert len(flight.log.senders) <= 32
@@ -448,7 +450,7 @@ def test_a_frame_costs_a_bounded_amount(tmp_path, make, each_bytes, more_bytes):
     assert peak < path.stat().st_size + each_bytes * len(parts) + more_bytes
 
 
-def test_a_recording_that_ends_in_flight_says_so(tmp_path, sample_log):
+def test_read_log_truncated_tlog_ends_in_flight(tmp_path, sample_log):
     content = sample_log.with_suffix(".tlog").read_bytes()
     path = tmp_path / "half.tlog"
     path.write_bytes(content[: len(content) // 2])

@@ -1,4 +1,4 @@
-"""An external position log in whatever dialect: the same samples, or one line of explanation."""
+"""Position files in many dialects: equal samples, or an error of one line."""
 
 import hashlib
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from px4fuse.readers.position_csv import (
 
 AXES = ["x_m", "y_m", "z_m"]
 
-# The one track that every dialect below is written from: 5 Hz with jitter, 0.1 mm, 1 µs
+# Track of all dialects: 5 Hz with jitter, resolution 0.1 mm and 1 µs
 ROWS = 60
 RANDOM = np.random.default_rng(20261121)
 TIME_US = 200_000 * np.arange(ROWS) + RANDOM.integers(-40_000, 40_000, ROWS)
@@ -41,7 +41,7 @@ def fixed(values: np.ndarray, decimals: int) -> list[str]:
 
 
 def exact(ticks: np.ndarray, decimals: int) -> list[str]:
-    """Integers divided by a power of ten, in full."""
+    """Format integers divided by a power of ten without rounding."""
     if not decimals:
         return [str(tick) for tick in ticks]
     return [f"{tick // 10**decimals}.{tick % 10**decimals:0{decimals}d}" for tick in ticks.tolist()]
@@ -78,7 +78,7 @@ def read(tmp_path: Path) -> Callable[..., PositionRecording]:
 
 
 def refused(read: Callable[..., PositionRecording], content: str | bytes, **options) -> str:
-    """The one line with which a file is refused."""
+    """Return the error message (one line) of a rejected file."""
     with pytest.raises(Px4FuseError) as caught:
         read(content, **options)
     assert isinstance(caught.value, LogError)
@@ -94,7 +94,7 @@ def assert_one_line(error: Px4FuseError) -> None:
 def assert_track(
     file: PositionRecording, *, start_us: int = UNIX_US, axes=(0, 1, 2), rows=slice(None)
 ):
-    """The samples are the track that was written."""
+    """Check that the samples equal the written track."""
     assert list(file.samples.columns) == SAMPLE_COLUMNS
     assert file.samples.index.name == "time_s"
     assert (file.samples.dtypes == np.float64).all()
@@ -105,8 +105,8 @@ def assert_track(
     np.testing.assert_allclose(file.samples[AXES].to_numpy(), track, rtol=0, atol=1e-9)
 
 
-def said(file: PositionRecording, *words: str) -> None:
-    """One of the sentences has all of these words."""
+def assert_stated(file: PositionRecording, *words: str) -> None:
+    """Check that one of the sentences contains all of these words."""
     sentences = (*file.detected, *file.notes)
     assert any(all(word in sentence for word in words) for sentence in sentences), sentences
 
@@ -140,7 +140,7 @@ DIALECTS: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_every_dialect_gives_the_same_samples(read, dialect):
+def test_read_position_csv_every_dialect_gives_equal_samples(read, dialect):
     content = DIALECTS[dialect]
     content = content if isinstance(content, bytes) else content.encode()
     file = read(content)
@@ -183,14 +183,14 @@ TIMES: dict[str, tuple[str, list[str], int, str]] = {
 
 
 @pytest.mark.parametrize("case", TIMES)
-def test_units_and_clocks_of_time(read, case):
+def test_read_position_csv_time_unit_and_clock_are_detected(read, case):
     name, texts, start_us, clock = TIMES[case]
     file = read(table({name: texts, "x": X, "y": Y, "z": Z}))
     assert_track(file, start_us=start_us)
     assert file.clock == clock
 
 
-def test_nineteen_digits_keep_their_microseconds(read):
+def test_read_position_csv_ns_timestamps_keep_microseconds(read):
     stamps = [1_795_253_650_123_456_789 + 1000 * i for i in range(5)]
     rows = "".join(f"{stamp},{i},0.5,1.5\n" for i, stamp in enumerate(stamps))
     file = read("t_ns,x,y,z\n" + rows)
@@ -199,7 +199,7 @@ def test_nineteen_digits_keep_their_microseconds(read):
 
 
 @pytest.mark.parametrize("rate", [0.2, 200])
-def test_the_bounds_of_the_rate_are_within_them(read, rate):
+def test_read_position_csv_rate_at_limit_has_no_note(read, rate):
     stamps = [str(round(1e9 * (0.98 * i / rate + 1795253650))) for i in range(ROWS)]
     file = read(table({"t": stamps, "x": X, "y": Y, "z": Z}))
     assert np.diff(file.samples.index) == pytest.approx(0.98 / rate, abs=1e-6)
@@ -207,19 +207,19 @@ def test_the_bounds_of_the_rate_are_within_them(read, rate):
 
 
 @pytest.mark.parametrize("step", ["0.0001", "1e7"])
-def test_a_rate_that_no_unit_explains_is_doubted(read, step):
+def test_read_position_csv_implausible_rate_has_note(read, step):
     texts = [f"{float(step) * i:.6f}" for i in range(ROWS)]
     file = read(table({"time_s": texts, "x": X, "y": Y, "z": Z}))
-    said(file, "is not a rate of a UWB", "--position-time-unit")
+    assert_stated(file, "is not a plausible UWB rate", "--position-time-unit")
     assert file.samples.index[-1] == pytest.approx(float(texts[-1]))
 
 
 @pytest.mark.parametrize("unit", TIME_UNITS)
-def test_time_unit_option_wins(read, unit):
+def test_read_position_csv_time_unit_option_overrides_name(read, unit):
     texts = [str(10 * i) for i in range(ROWS)]
     file = read(table({"time_us": texts, "x": X, "y": Y, "z": Z}), time_unit=unit)
     assert file.samples.index[1] == pytest.approx(10 * TIME_UNITS[unit])
-    said(file, f"{unit} as --position-time-unit says")
+    assert_stated(file, f"{unit} from --position-time-unit")
 
 
 LATER_S = exact(UNIX_US + TIME_US + 30_000, 6)
@@ -230,10 +230,10 @@ LATER_S = exact(UNIX_US + TIME_US + 30_000, 6)
     ({"bag_time": UNIX_S, "header_stamp": [""] * ROWS}, ("(not used: 'header_stamp')",)),
     ({"recv_time": LATER_S, "time": UNIX_S}, ("(not used: 'recv_time')",)),
 ])  # fmt: skip
-def test_measurement_time_wins_over_recording_time(read, columns, words):
+def test_read_position_csv_prefers_measurement_time(read, columns, words):
     file = read(table({**columns, "x": X, "y": Y, "z": Z}))
     assert_track(file)
-    said(file, "time: ", *words)
+    assert_stated(file, "time: ", *words)
 
 
 # -- position --------------------------------------------------------------------------------------
@@ -266,7 +266,7 @@ POSITIONS: dict[str, tuple[dict[str, list[str]], str | None]] = {
 
 @pytest.mark.parametrize("separator", [",", " "])
 @pytest.mark.parametrize("case", POSITIONS)
-def test_names_units_and_frames_of_position(read, case, separator):
+def test_read_position_csv_position_names_units_and_frames(read, case, separator):
     columns, frame = POSITIONS[case]
     file = read(table({"time": UNIX_S, **columns}, separator=separator))
     assert_track(file)
@@ -274,15 +274,15 @@ def test_names_units_and_frames_of_position(read, case, separator):
 
 
 @pytest.mark.parametrize(("case", "words"), [
-    ("mm unsaid", ("mm", "m is not an indoor flight", "--position-unit")),
+    ("mm unsaid", ("mm", "m is too large for an indoor flight", "--position-unit")),
     ("two tracks", ("'raw_x', 'raw_y', 'raw_z' as x, y, z",)),
 ])  # fmt: skip
-def test_says_which_position(read, case, words):
-    said(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
+def test_read_position_csv_states_position_columns(read, case, words):
+    assert_stated(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
 
 
 @pytest.mark.parametrize("unit", LENGTH_UNITS)
-def test_length_unit_option_wins(read, unit):
+def test_read_position_csv_length_unit_option_overrides_name(read, unit):
     columns = {"time": UNIX_S, "x_cm": X, "y_cm": Y, "z": Z, "sigma_cm": fixed(SIGMA_M, 3)}
     samples = read(table(columns), length_unit=unit).samples
     assert samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0] * LENGTH_UNITS[unit])
@@ -291,22 +291,22 @@ def test_length_unit_option_wins(read, unit):
 
 
 @pytest.mark.parametrize(("x", "words"), [
-    ([*X[:7], "4000.0", *X[8:]], "in m (no unit in the names)"),
-    (fixed(np.linspace(0.0, 5e6, ROWS), 1), "assumed, as no unit gives an indoor flight"),
+    ([*X[:7], "4000.0", *X[8:]], "in m (no unit in the column names)"),
+    (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the size of an indoor flight"),
 ])  # fmt: skip
-def test_an_outlier_does_not_decide_the_unit_and_no_spread_is_believed(read, x, words):
+def test_read_position_csv_outlier_does_not_change_unit(read, x, words):
     file = read(table({**PLAIN, "x": x}))
     assert file.samples["x_m"].tolist() == list(map(float, x))
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
-    said(file, "position: ", words)
+    assert_stated(file, "position: ", words)
 
 
 @pytest.mark.parametrize("extra", [{}, {"z": [""] * ROWS}, {"z": ["nan"] * ROWS}])
-def test_no_height(read, extra):
+def test_read_position_csv_without_height_z_is_nan(read, extra):
     file = read(table({"time": UNIX_S, "x": X, "y": Y, **extra}))
     assert file.samples["z_m"].isna().all()
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
-    said(file, "position: ", "without height")
+    assert_stated(file, "position: ", "without height")
 
 
 # -- sigma and quality -----------------------------------------------------------------------------
@@ -322,21 +322,21 @@ SIGMA = fixed(SIGMA_M, 3)
     ({"stdev": SIGMA}, (1, 1, 1)),
     ({"raw_sigma": SIGMA, "filtered_sigma": fixed(9 * SIGMA_M, 3)}, (1, 1, 1)),
 ])  # fmt: skip
-def test_sigma(read, columns, factors):
+def test_read_position_csv_sigma_columns_are_read(read, columns, factors):
     file = read(table({**PLAIN, **columns}))
     assert_track(file)
     sigmas = file.samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()
     np.testing.assert_allclose(sigmas, np.outer(SIGMA_M, factors), rtol=0, atol=1e-9)
-    said(file, "sigma: ", repr(next(iter(columns))))
+    assert_stated(file, "sigma: ", repr(next(iter(columns))))
 
 
-def test_sigma_must_be_above_zero(read):
+def test_read_position_csv_sigma_not_positive_is_nan(read):
     sigma = [*SIGMA]
     sigma[3], sigma[4] = "0", "-1"
     file = read(table({**PLAIN, "sigma": sigma}))
     assert_track(file)
     assert np.flatnonzero(file.samples["sigma_x_m"].isna()).tolist() == [3, 4]
-    said(file, "sigma is not above zero in 2 rows")
+    assert_stated(file, "sigma is zero or negative in 2 rows")
 
 
 # -- rows ------------------------------------------------------------------------------------------
@@ -347,27 +347,28 @@ def test_sigma_must_be_above_zero(read):
     ["nan", "", "null", "-", "-inf", "1e999", "12.3m", "1.2.3", "1_000", "1,5", "soon", ".", "0x1f",
      "١", "infinite"],
 )  # fmt: skip
-def test_rows_without_position_are_dropped(read, missing):
+def test_read_position_csv_rows_without_position_are_dropped(read, missing):
     x, z = [*X], [*Z]
     x[0] = x[20] = z[21] = missing
     file = read(table({**PLAIN, "x": x, "z": z}, separator=";"))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [0, 20, 21]))
-    said(file, "3 rows were dropped", "without a usable time or position")
+    assert_stated(file, "3 rows were dropped", "no valid time or position")
 
 
-def test_cut_rows_between_others_are_dropped(read):
+def test_read_position_csv_short_row_is_dropped(read):
     lines = table(PLAIN).splitlines(keepends=True)
     lines[30] = UNIX_S[29] + ",1.0\n"
     file = read("".join(lines))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [29]))
-    said(file, "1 row was dropped")
+    assert_stated(file, "1 row was dropped")
 
 
-def test_a_last_line_without_an_end_is_dropped(read):
-    """It may be cut anywhere, in its last digits too."""
+def test_read_position_csv_last_line_without_end_is_dropped(read):
+    """The last line may be incomplete, also in its last digits."""
     file = read(table(PLAIN)[:-2])
     assert_track(file, rows=slice(-1))
-    assert file.notes == ("the last line was dropped: it may be cut, as it has no end",)
+    [note] = file.notes
+    assert "the last line was dropped" in note
 
 
 @pytest.mark.parametrize(("shifts_us", "dropped"), [
@@ -376,19 +377,19 @@ def test_a_last_line_without_an_end_is_dropped(read):
     ({10: 3_600_000_000, 40: -60_000_000}, [10, 40]),
     ({0: 10**15}, [0]),
 ])  # fmt: skip
-def test_stamps_that_go_back_are_dropped(read, shifts_us, dropped):
+def test_read_position_csv_backward_timestamps_are_dropped(read, shifts_us, dropped):
     stamps = UNIX_US + TIME_US
     for at, shift in shifts_us.items():
         stamps[at] += shift
     file = read(table({**PLAIN, "time": exact(stamps, 6)}))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), dropped))
-    said(file, f"{len(dropped)} row", "dropped: their time stamps repeat, go back")
+    assert_stated(file, f"{len(dropped)} row", "dropped: timestamps repeat, go back")
 
 
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
-def test_several_tags_are_pointed_out(read, name):
+def test_read_position_csv_several_tags_have_note(read, name):
     file = read(table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN}))
-    said(file, "several tags ('A1', 'B2')")
+    assert_stated(file, "positions of 2 tags (such as 'A1', 'B2')")
 
 
 # -- the options -----------------------------------------------------------------------------------
@@ -397,7 +398,7 @@ ODD = {"clock": UNIX_S, "a": Y, "b": X, "c": Z, "d_": SIGMA}
 
 
 BY_NAME = {"time_ms": UNIX_S, "t": UNIX_S, "up_mm": MM[2], "east_mm": MM[0], "north_mm": MM[1]}
-# names whose own meaning is another: a length as time, a time as a length
+# misleading names: a length for time, a time for a length
 MISNAMED = {"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z, "x": JUNK, "y": JUNK}
 
 
@@ -405,10 +406,10 @@ MISNAMED = {"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z, "x": JUNK, "y": JUNK}
     (ODD, ("clock", "b", "a", "c"), None),
     (ODD, ("CLOCK", "B ", "a", "c", "d_"), None),
     (ODD, ("clock", "3", "a", "4"), None),
-    (BY_NAME, ("t", "north_mm", "east_mm", "up_mm"), "enu"),  # the frame of the names
+    (BY_NAME, ("t", "north_mm", "east_mm", "up_mm"), "enu"),  # frame from the column names
     (MISNAMED, ("1", "2", "3", "4"), None),
 ])  # fmt: skip
-def test_columns_option(read, given, columns, frame):
+def test_read_position_csv_columns_option_selects_columns(read, given, columns, frame):
     file = read(PREAMBLE + table(given), columns=columns)
     assert_track(file)
     assert file.frame == frame
@@ -419,55 +420,55 @@ def test_columns_option(read, given, columns, frame):
 @pytest.mark.parametrize(("options", "words"), [
     ({"time_unit": "min"}, "`time_unit`: 'min' is not one of s, ms, us, ns."),
     ({"length_unit": "ft"}, "`length_unit`: 'ft' is not one of m, cm, mm."),
-    ({"columns": ("time", "x")}, "does not name four or five different columns"),
-    ({"columns": ("time", "x", "x", "z")}, "does not name four or five different columns"),
-    ({"columns": ("time", "x", "y", "")}, "does not name four or five different columns"),
+    ({"columns": ("time", "x")}, "must name four or five different columns"),
+    ({"columns": ("time", "x", "x", "z")}, "must name four or five different columns"),
+    ({"columns": ("time", "x", "y", "")}, "must name four or five different columns"),
     ({"columns": ("1", "2", "3", "9")},
-     "no column '9' found (the columns are 'time', 'x', 'y', 'z'). Name them with"),
+     "no column '9' (its columns are 'time', 'x', 'y', 'z'). Name the columns with"),
     ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
     ({"columns": ("time", "2", "x", "y")}, "names one column twice"),
 ])  # fmt: skip
-def test_bad_options(read, options, words):
+def test_read_position_csv_invalid_options_raise_settings_error(read, options, words):
     with pytest.raises(SettingsError) as caught:
         read(table(PLAIN), **options)
     assert words in str(caught.value)
     assert_one_line(caught.value)
 
 
-def test_a_column_that_is_not_there(read):
+def test_read_position_csv_missing_column_is_named(read):
     line = refused(read, table(PLAIN), columns=("time", "x", "y", "w"))
-    assert "no header with the columns 'time', 'w', 'x', 'y' in its first" in line
+    assert "no header with the columns 'time', 'w', 'x', 'y'" in line
 
 
-# -- what cannot be read ---------------------------------------------------------------------------
+# -- unreadable files ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("content", "words"), [
     (b"", "empty"),
-    (table(PLAIN, separator=";", decimal=","), "usable rows: 0, at least 3 are needed; 60 rows"),
+    (table(PLAIN, separator=";", decimal=","), "0 usable rows; at least 3 are needed; 60 rows"),
     ("time,x,y,z,sigma\n1,2\n3,4\n", "no table of numbers"),
     (b"\x00\x01time,x,y,z\n1,2,3,4\n", "binary"),
     ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),
     (b"1,2\n" * 50_000 + b"\0\n1,2\n", "binary"),
-    (b"Dear all,\nplease find attached\nthe log.\n", "of which the first is 'Dear all,'"),
-    (b"a" * 40 + b"\nb\n", f"of which the first is '{'a' * 40}'"),
-    (b"a" * 41 + b"\nb\n", f"of which the first is '{'a' * 37}...'"),
+    (b"Dear all,\nplease find attached\nthe log.\n", "The first line is 'Dear all,'"),
+    (b"a" * 40 + b"\nb\n", f"The first line is '{'a' * 40}'"),
+    (b"a" * 41 + b"\nb\n", f"The first line is '{'a' * 37}...'"),
     (table(PLAIN, header=False), "Give a CSV file with a header, or name its"),
-    (table({"when": UNIX_S, "x": X, "y": Y}), "the first is 'when,x,y'"),
+    (table({"when": UNIX_S, "x": X, "y": Y}), "The first line is 'when,x,y'"),
     (table({"time": UNIX_S, "x": X, "b": Y}), "no header"),
     (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no header"),
     (table({"t": UNIX_S, "lat": X, "lon": Y}), "no header"),
-    (table(PLAIN, decimal=","), "names 4 columns, but rows have 8. Export it with"),
-    ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but rows have 5"),
-    (table({**PLAIN, "time": ["12.5"] * ROWS}), "usable rows: 1"),
+    (table(PLAIN, decimal=","), "has 4 columns, but the rows have 8. Export it with"),
+    ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but the rows have 5"),
+    (table({**PLAIN, "time": ["12.5"] * ROWS}), "1 usable rows"),
 ])  # fmt: skip
-def test_what_cannot_be_read_is_explained(read, content, words):
+def test_read_position_csv_unreadable_file_raises_log_error(read, content, words):
     line = refused(read, content)
     assert words in line
     assert line.startswith("uwb.csv")
 
 
-def test_too_large(read, monkeypatch):
+def test_read_position_csv_too_large_file_is_rejected(read, monkeypatch):
     monkeypatch.setattr(position_csv, "MAX_FILE_BYTES", 1000)
     assert "more than the limit" in refused(read, table(PLAIN))
 
@@ -476,7 +477,7 @@ def test_too_large(read, monkeypatch):
 
 
 def check_any(read, content: bytes) -> None:
-    """Reading gives sound samples or one line, whatever the bytes are."""
+    """Check that any content gives valid samples or an error of one line."""
     try:
         file = read(content)
     except (LogError, SettingsError) as error:
@@ -495,7 +496,7 @@ def check_any(read, content: bytes) -> None:
     "line",
     [line * 9_000 for line in (b'"', b" ", b"1 ", b"1,", b"(", b"x,", b"a1B", b"_", b"1", b"[ ")],
 )
-def test_work_is_bounded(read, line):
+def test_read_position_csv_repeated_characters_end_in_time(read, line):
     text = table(PLAIN).encode()
     line += b"1\n"
     for content in (line + text, text + line, line * 30 + text, line * 300):
@@ -510,18 +511,18 @@ def test_work_is_bounded(read, line):
 @pytest.mark.parametrize(("pattern", "time", "count"), [
     ("dwm1001__tag__*position.csv", "bag_time", 3), ("vrpn*.csv", "header_stamp", 2),
 ])  # fmt: skip
-def test_recordings_of_uwb(pattern, time, count):
+def test_read_position_csv_real_uwb_equals_file(pattern, time, count):
     paths = sorted(shared("uwb").glob(f"*/{pattern}"))
     assert len(paths) == count
     for path in paths:
         file = read_position_csv(path)
-        # as text first: pandas' own conversion may be off by the last bit
+        # Read as text first, because the conversion of pandas may differ in the last bit
         truth = pd.read_csv(path, dtype=str).astype(np.float64)
         truth = truth[truth[["v0", "v1", "v2"]].notna().all(axis=1)]
         np.testing.assert_array_equal(file.samples.index, truth[time])
         np.testing.assert_array_equal(file.samples[AXES], truth[["v0", "v1", "v2"]])
         assert file.clock == "UNIX"
-        said(file, f"'{time}'", "of recording" if time == "bag_time" else "of measurement")
+        assert_stated(file, f"'{time}'", "of recording" if time == "bag_time" else "of measurement")
         dropped = len(pd.read_csv(path)) - len(truth)
         if dropped:
-            said(file, f"{dropped} rows were dropped")
+            assert_stated(file, f"{dropped} rows were dropped")

@@ -1,4 +1,4 @@
-"""The reader against made logs of every PX4 generation, and against flights with known truth."""
+"""ULog reader: logs in the formats of several PX4 releases, and flights with ground truth."""
 
 import json
 
@@ -34,7 +34,7 @@ from px4fuse.origin import ALIGNED, FROM_INNOVATIONS, GNSS, LOGGED_BY_EKF2, MOTI
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S
 
-HALF_PERIOD_S = 0.005  # of EKF2's update, EKF2_PREDICT_US 10,000
+HALF_PERIOD_S = 0.005  # s; half of the prediction interval, EKF2_PREDICT_US 10,000
 HOUR_US = 3_600_000_000
 FLOAT32 = {"rtol": 1e-6, "atol": 1e-6}
 
@@ -47,8 +47,8 @@ def shift(stamps_us, at, by_us):
     stamps_us[at] = int(stamps_us[at]) + by_us
 
 
-def is_vision(track):
-    """The samples are those that were sent."""
+def assert_equals_external_vision(track):
+    """Check that the samples equal the external vision samples of the log."""
     expected = seconds_of(ev_stamps(10.0))
     sent = position(expected) + ev_error(expected)
     np.testing.assert_allclose(times(track.samples), expected, atol=1e-9)
@@ -57,8 +57,8 @@ def is_vision(track):
     np.testing.assert_allclose(variance, np.tile(EV_VARIANCE, (len(expected), 1)), **FLOAT32)
 
 
-def later(log, by_us):
-    """The same log from a vehicle that was switched on earlier."""
+def delay_boot(log, by_us):
+    """Add a constant (µs) to all timestamps."""
     for made in log.topics:
         for name in ("timestamp", "timestamp_sample"):
             if name in made.fields:
@@ -70,10 +70,10 @@ def later(log, by_us):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_external_vision_is_read(read, generation):
+def test_read_ulog_every_generation_reads_external_vision(read, generation):
     (track, *_) = read(make_log(generation)).positions
     assert (track.name, track.origin) == ("vehicle_visual_odometry", RECEIVED)
-    is_vision(track)
+    assert_equals_external_vision(track)
     assert track.frame == ("unknown" if generation == "v1.9" else "NED")
     assert track.rate_hz == pytest.approx(5.0)
 
@@ -81,13 +81,13 @@ def test_external_vision_is_read(read, generation):
 @pytest.mark.parametrize("generation", GENERATIONS)
 @pytest.mark.parametrize("axis", range(3))
 def test_innovations_are_measurement_minus_state(read, generation, axis):
-    """PX4 logs state minus measurement; the file holds that sign, the flight the other one."""
+    """PX4 logs state minus measurement; the flight has the opposite sign."""
     log = make_log(generation)
     logged = {
         "v1.9": lambda: log["ekf2_innovations"]["vel_pos_innov"][:, 3 + axis],
         "v1.11": lambda: log["estimator_innovations"]["ev_hpos" if axis < 2 else "ev_vpos"],
     }
-    if generation in logged:  # the test's own premise
+    if generation in logged:  # check the sign in the generated log
         first = np.ravel(logged[generation]())[axis if generation == "v1.11" and axis < 2 else 0]
         assert np.sign(first) == -np.sign(ev_error([0.1])[0, axis])
     frame = read(log).ekf2.innovations[AXES[axis]]
@@ -99,7 +99,7 @@ def test_innovations_are_measurement_minus_state(read, generation, axis):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_aid_source_gives_noise_ratio_and_flags_and_older_topics_do_not(read, generation):
+def test_innovations_flags_and_noise_exist_since_v1_14(read, generation):
     ekf2 = read(make_log(generation)).ekf2
     if int(generation.removeprefix("v1.")) < 14:
         older = ekf2.innovations["north"]
@@ -116,13 +116,13 @@ def test_aid_source_gives_noise_ratio_and_flags_and_older_topics_do_not(read, ge
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])
-def test_a_rejection_that_is_not_logged_follows_from_the_gate(read, generation):
-    """Where it is beyond five √S along east alone, the whole horizontal vector is rejected."""
+def test_innovations_unlogged_rejection_follows_from_gate(read, generation):
+    """An innovation above 5 √S along east rejects both horizontal axes."""
     log = make_log(generation)
     topic = "ekf2_innovations" if generation == "v1.9" else "estimator_innovations"
     field = "vel_pos_innov" if generation == "v1.9" else "ev_hpos"
     at = 4 if generation == "v1.9" else 1
-    copies = 1 if generation == "v1.9" else 2  # the newer topic is written twice per fusion here
+    copies = 1 if generation == "v1.9" else 2  # the newer topic has two rows per fusion
     of_sigma = np.repeat([4.99, -4.99, 5.01, -5.01], copies)
     log[topic][field][20 : 20 + 4 * copies, at] = np.sqrt(INNOVATION_VARIANCE[1]) * of_sigma
     innovations = read(log).ekf2.innovations
@@ -132,7 +132,7 @@ def test_a_rejection_that_is_not_logged_follows_from_the_gate(read, generation):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_state_and_imu_are_read(read, generation):
+def test_read_ulog_every_generation_reads_state_and_imu(read, generation):
     flight = read(make_log(generation))
     state = flight.ekf2.state
     np.testing.assert_allclose(times(state), seconds_of(stamps(10.0, 10.0)), atol=1e-9)
@@ -147,8 +147,8 @@ def test_state_and_imu_are_read(read, generation):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_variances_are_picked_by_the_lengths_of_the_arrays(read, generation):
-    """(24, 24), (24, 23) and (25, 24): the arrays hold (i + 1) / 100, so an offset shows."""
+def test_variance_array_lengths_select_layout(read, generation):
+    """Element i of the arrays is (i + 1) / 100, so a wrong offset is detected."""
     variance = read(make_log(generation)).ekf2.variance
     found = variance[Columns.VELOCITY_VARIANCE + Columns.POSITION_VARIANCE]
     first = 3 if generation in ("v1.15", "v1.16") else 4
@@ -156,8 +156,8 @@ def test_variances_are_picked_by_the_lengths_of_the_arrays(read, generation):
     np.testing.assert_allclose(found, np.tile(expected, (len(variance), 1)), rtol=1e-6)
 
 
-def test_the_lengths_of_the_arrays_decide_the_layout_and_nothing_is_guessed(read):
-    """A development version between two releases may carry either layout."""
+def test_variance_unknown_array_length_is_unavailable(read):
+    """The firmware version is ignored; a development version may have either layout."""
     log = make_log("v1.15")
     log.info["ver_sw_release"] = 1 << 24 | 14 << 16
     assert read(log).ekf2.variance["north_m2"].iloc[0] == pytest.approx(0.07, rel=1e-6)
@@ -166,14 +166,14 @@ def test_the_lengths_of_the_arrays_decide_the_layout_and_nothing_is_guessed(read
     fields["covariances"] = fields["covariances"][:, :22]
     variance = read(log).ekf2.variance
     assert isinstance(variance, Unavailable)
-    assert "arrays of estimator_states are of lengths unknown" in variance.reason
+    assert "array lengths of estimator_states are not known" in variance.reason
 
 
 @pytest.mark.parametrize(("generation", "code", "frame"), [
     ("v1.11", 0, "NED"), ("v1.11", 1, "FRD"), ("v1.11", 2, "unknown"), ("v1.11", 3, "FRD"),
     ("v1.16", 0, "unknown"), ("v1.16", 1, "NED"), ("v1.16", 2, "FRD"), ("v1.16", 9, "unknown"),
 ])  # fmt: skip
-def test_frames_of_external_vision(read, generation, code, frame):
+def test_external_vision_frame_code_gives_frame(read, generation, code, frame):
     log = make_log(generation)
     fields = log["vehicle_visual_odometry"]
     name = "pose_frame" if "pose_frame" in fields else "local_frame"
@@ -182,7 +182,7 @@ def test_frames_of_external_vision(read, generation, code, frame):
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan])
-def test_a_variance_that_was_not_given_is_nan(read, value):
+def test_external_vision_variance_zero_or_nan_is_nan(read, value):
     log = make_log("v1.16")
     log["vehicle_visual_odometry"]["position_variance"][:] = value
     assert read(log).positions[0].samples[Columns.POSITION_VARIANCE].isna().all(axis=None)
@@ -191,22 +191,22 @@ def test_a_variance_that_was_not_given_is_nan(read, value):
 # ---- time -----------------------------------------------------------------------------------
 
 
-def test_accelerometer_times_follow_their_offset(read):
+def test_imu_times_include_accelerometer_offset(read):
     log = make_log("v1.16")
     offset = log["sensor_combined"]["accelerometer_timestamp_relative"]
     offset[:] = -2_000
-    offset[7] = 0x7FFFFFFF  # PX4's mark of an invalid accelerometer sample
+    offset[7] = 0x7FFFFFFF  # value of PX4 for an invalid accelerometer sample
     imu = read(log).imu
     expected = np.delete(seconds_of(stamps(10.0, 100.0)), 7) - 0.002
     np.testing.assert_allclose(times(imu), expected, atol=1e-9)
 
 
-def test_clipping_and_a_tumbling_vehicle_are_read_where_they_are_logged(read):
+def test_read_ulog_reads_clipping_and_failure_detector(read):
     log = make_log("v1.16")
     assert (plain := read(log)).tumble_spans == ()
     assert "clipped" not in plain.imu
     bits = np.zeros(len(log["sensor_combined"]["timestamp"]), np.uint8)
-    bits[300:304] = 4  # of the third axis
+    bits[300:304] = 4  # bit of the third axis
     log["sensor_combined"]["accelerometer_clipping"] = bits
     at = stamps(10.0, 2.0)
     seconds = seconds_of(at)
@@ -223,8 +223,8 @@ def test_clipping_and_a_tumbling_vehicle_are_read_where_they_are_logged(read):
     *(("sensor_combined", at, hours * HOUR_US)
       for at in (0, 1, 500, -2, -1) for hours in (3, -3)),
 ])  # fmt: skip
-def test_a_stray_stamp_does_not_change_the_duration(read, name, at, jump_us):
-    log = later(make_log("v1.16"), 4 * HOUR_US)
+def test_duration_ignores_stray_timestamp(read, name, at, jump_us):
+    log = delay_boot(make_log("v1.16"), 4 * HOUR_US)
     shift(log[name]["timestamp"], at, jump_us)
     info = read(log).log
     allowed = 0.03 if name == "sensor_combined" else 1e-6
@@ -232,7 +232,7 @@ def test_a_stray_stamp_does_not_change_the_duration(read, name, at, jump_us):
     assert info.boot_time_s == pytest.approx(4 * 3600 + 5.0, abs=allowed)
 
 
-def test_without_an_imu_the_densest_topic_gives_the_span(read):
+def test_duration_without_imu_uses_densest_topic(read):
     log = make_log("v1.16").drop("sensor_combined")
     shift(log["vehicle_land_detected"]["timestamp"], -1, 3 * HOUR_US)
     flight = read(log)
@@ -244,7 +244,7 @@ def test_without_an_imu_the_densest_topic_gives_the_span(read):
 
 
 def with_two_instances(generation, switches):
-    """A second EKF2 whose variances and innovations are three times those of the first."""
+    """Add a second EKF2 instance with three times the variances and innovations."""
     log = make_log(generation)
     number = int(generation.removeprefix("v1."))
     log.add(*states(10.0, generation, instance=1, scale=3.0))
@@ -258,7 +258,7 @@ def with_two_instances(generation, switches):
     [(0.0, 1), (4.95, 0)],
     [(0.0, 0), (2.05, 1), (3.05, 1), (6.95, 0)],
 ])  # fmt: skip
-def test_rows_come_from_the_instance_that_was_primary(read, generation, switches):
+def test_ekf2_samples_are_from_primary_instance(read, generation, switches):
     ekf2 = read(with_two_instances(generation, switches)).ekf2
     starts = np.array([start for start, _ in switches])
     numbers = np.array([number for _, number in switches])
@@ -280,7 +280,7 @@ def test_rows_come_from_the_instance_that_was_primary(read, generation, switches
     ]
 
 
-def test_a_selector_that_has_not_chosen_yet_is_passed_over(read):
+def test_primary_instance_ignores_unset_selector(read):
     ekf2 = read(with_two_instances("v1.16", [(0.0, 255), (3.05, 1)])).ekf2
     assert ekf2.instances == ((-np.inf, 1),)
     assert ekf2.variance["north_m2"].iloc[-1] == pytest.approx(3.0 * 0.07, rel=1e-6)
@@ -290,7 +290,7 @@ def test_a_selector_that_has_not_chosen_yet_is_passed_over(read):
 
 
 @pytest.mark.parametrize("before", [0, 254, 255])
-def test_resets_are_read_through_the_wrap_of_the_counter(read, before):
+def test_resets_counter_wrap_is_one_reset(read, before):
     """The counters are uint8: the reset after number 255 is number 0."""
     log = make_log("v1.16")
     fields = log["vehicle_local_position"]
@@ -313,7 +313,7 @@ def test_resets_are_read_through_the_wrap_of_the_counter(read, before):
 # ---- innovations ------------------------------------------------------------------------------
 
 
-def test_innovations_without_a_variance_near_in_time_are_left_out(read):
+def test_innovations_without_near_variance_are_dropped(read):
     log = make_log("v1.12")
     late = log["estimator_innovation_variances"]
     kept = seconds_of(late["timestamp_sample"]) < 5.0
@@ -327,7 +327,7 @@ def test_innovations_without_a_variance_near_in_time_are_left_out(read):
     assert any(note.startswith(said) for note in ekf2.notes), ekf2.notes
 
 
-def test_innovations_count_only_while_external_vision_is_fused(read):
+def test_innovations_while_vision_not_fused_are_dropped(read):
     log = make_log("v1.12")
     flags = log["estimator_status_flags"]
     at = seconds_of(flags["timestamp_sample"])
@@ -338,7 +338,7 @@ def test_innovations_count_only_while_external_vision_is_fused(read):
     np.testing.assert_allclose(times(frame), expected, atol=1e-9)
 
 
-def test_aid_source_samples_that_were_not_tried_are_no_innovations(read):
+def test_innovations_not_fused_nor_rejected_are_dropped(read):
     log = make_log("v1.16")
     fields = log["estimator_aid_src_ev_pos"]
     fields["fused"][:10] = False
@@ -349,7 +349,7 @@ def test_aid_source_samples_that_were_not_tried_are_no_innovations(read):
     assert frame["fused"].sum() == len(frame) - 3
 
 
-def test_never_fused_is_said_instead_of_an_empty_series(read):
+def test_innovations_never_fused_axis_is_unavailable(read):
     log = make_log("v1.16")
     log["estimator_status_flags"]["cs_ev_hgt"][:] = False
     flight = read(log)
@@ -365,8 +365,8 @@ def test_never_fused_is_said_instead_of_an_empty_series(read):
 @pytest.mark.parametrize(("parameters", "reason"), [
     ({"EKF2_EN": 0}, "EKF2_EN is 0"), ({"SYS_MC_EST_GROUP": 1}, "SYS_MC_EST_GROUP is 1"),
 ])  # fmt: skip
-def test_another_estimator_is_not_taken_for_ekf2(read, parameters, reason):
-    """The position topics are in the log all the same, published by whatever ran."""
+def test_read_ekf2_other_estimator_is_unavailable(read, parameters, reason):
+    """The position topics are in the log, published by the other estimator."""
     log = make_log("v1.11")
     log.parameters |= parameters
     flight = read(log)
@@ -376,7 +376,7 @@ def test_another_estimator_is_not_taken_for_ekf2(read, parameters, reason):
     assert flight.positions[0].name == "vehicle_visual_odometry"
 
 
-def test_sys_mc_est_group_2_is_ekf2_and_the_gate_is_the_parameters(read):
+def test_read_ekf2_group_2_reads_gate_parameter(read):
     log = make_log("v1.11")
     log.parameters |= {"SYS_MC_EST_GROUP": 2, "EKF2_EVP_GATE": 3.0}
     ekf2 = read(log).ekf2
@@ -385,11 +385,11 @@ def test_sys_mc_est_group_2_is_ekf2_and_the_gate_is_the_parameters(read):
     assert read(log).ekf2.gate == 5.0  # PX4's default
 
 
-# ---- the ladder of position sources -----------------------------------------------------------
+# ---- preference of position sources -----------------------------------------------------------
 
 
-def gps():
-    """A receiver that moves 0.001° of latitude per second from the origin (111.19 m)."""
+def gps_topic():
+    """Make a GPS topic that moves 0.001° of latitude (111.19 m) per second."""
     at = stamps(10.0, 5.0)
     time = seconds_of(at)
     made = topic("vehicle_gps_position", at, {"fix_type": np.full(len(time), 3, np.uint8)})
@@ -408,20 +408,22 @@ PREFERRED = [
 ]
 
 
-def test_sources_stand_in_order_of_preference(read):
+def test_positions_are_in_order_of_preference(read):
     log = make_log("v1.16")
-    log.add(odometry("vehicle_mocap_odometry", 10.0, 16), gps())
+    log.add(odometry("vehicle_mocap_odometry", 10.0, 16), gps_topic())
     log.add(odometry("estimator_visual_odometry_aligned", 10.0, 12))
     flight = read(log)
     assert [(track.name, track.origin) for track in flight.positions] == PREFERRED
-    assert choose_source(flight)[1] == "most direct source: as received by PX4"
+    reason = choose_source(flight)[1]
+    assert "--position-source" not in reason
+    assert "no usable" not in reason
     for name, _ in PREFERRED:
         track, reason = choose_source(flight, name)
         assert track.name == name
         assert "--position-source" in reason
 
 
-def test_asking_for_a_source_that_is_absent_says_what_there_is(read):
+def test_choose_source_missing_source_lists_available(read):
     flight = read(make_log("v1.16"))
     with pytest.raises(MissingDataError, match="vehicle_mocap_odometry") as error:
         choose_source(flight, "vehicle_mocap_odometry")
@@ -430,40 +432,40 @@ def test_asking_for_a_source_that_is_absent_says_what_there_is(read):
         choose_source(flight, "sonar")
 
 
-def test_gps_is_used_only_when_asked_for(read):
+def test_choose_source_unfused_gps_must_be_requested(read):
     log = make_log("v1.16")
     log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
     with pytest.raises(MissingDataError, match="SDLOG_PROFILE to 129"):
         choose_source(read(log))
-    flight = read(log.add(gps()))
-    with pytest.raises(MissingDataError, match="`position_source` vehicle_gps_position"):
+    flight = read(log.add(gps_topic()))
+    with pytest.raises(MissingDataError, match=r"position.source`? vehicle_gps_position"):
         choose_source(flight)
     assert choose_source(flight, "vehicle_gps_position")[0].origin == GNSS
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
-def test_ekf2s_own_delay_is_added_back_to_its_observations(read, delay_ms):
-    """EKF2 files a sample under its stamp less EKF2_EV_DELAY and half its update period."""
+def test_ev_pos_aid_times_exclude_ekf2_delay(read, delay_ms):
+    """EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the timestamp."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     log.parameters["EKF2_EV_DELAY"] = delay_ms
     for name in ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt"):
         log[name]["timestamp_sample"] -= np.uint64((delay_ms * 1e-3 + HALF_PERIOD_S) * 1e6)
     track, _ = choose_source(read(log))
     assert (track.name, track.origin) == ("estimator_aid_src_ev_pos", LOGGED_BY_EKF2)
-    is_vision(track)
+    assert_equals_external_vision(track)
 
 
-def test_heights_of_other_stamps_are_joined_and_what_is_dropped_is_counted(read):
-    """Logged by a rate limiter of its own, a height may be that of the sample before or after."""
+def test_ev_pos_aid_height_too_far_in_time_is_nan_with_note(read):
+    """The logger decimates heights separately, so their times may differ from the positions."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     stamped = log["estimator_aid_src_ev_hgt"]["timestamp_sample"]
     assert len(stamped) == 50
     stamped[10:30] += np.uint64(20_000)
     stamped[30:33] += np.uint64(90_000)
     track, _ = choose_source(flight := read(log))
-    open_rows = np.flatnonzero(track.samples["down_m"].isna())
-    np.testing.assert_array_equal(open_rows, [30, 31, 32])
-    # a float32 observation, as in the sample whose height it is
+    rows_without_height = np.flatnonzero(track.samples["down_m"].isna())
+    np.testing.assert_array_equal(rows_without_height, [30, 31, 32])
+    # observations are float32
     at = seconds_of(ev_stamps(10.0))[10:30]
     height = (position(at) + ev_error(at))[:, 2]
     np.testing.assert_allclose(track.samples["down_m"].to_numpy()[10:30], height, **FLOAT32)
@@ -474,7 +476,7 @@ def test_heights_of_other_stamps_are_joined_and_what_is_dropped_is_counted(read)
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])
-def test_state_plus_innovation_is_the_measurement(read, generation):
+def test_reconstruction_equals_measurement(read, generation):
     log = make_log(generation).drop("vehicle_visual_odometry")
     if generation == "v1.12":
         log.drop("estimator_visual_odometry_aligned")
@@ -488,7 +490,7 @@ def test_state_plus_innovation_is_the_measurement(read, generation):
 # ---- truth ------------------------------------------------------------------------------------
 
 
-def test_simulation_truth_is_read(read):
+def test_read_truth_reads_simulation_ground_truth(read):
     at = stamps(10.0, 20.0)
     here = position(seconds_of(at)) + 0.5
     fields = dict(zip("xyz", here.T, strict=True))
@@ -499,7 +501,7 @@ def test_simulation_truth_is_read(read):
     assert (flight.truth.samples[Columns.VELOCITY] == 0.25).all(axis=None)
 
 
-def test_motion_capture_is_truth_only_where_something_else_feeds_ekf2(read):
+def test_read_truth_motion_capture_needs_other_source(read):
     log = make_log("v1.16").add(odometry("vehicle_mocap_odometry", 10.0, 16))
     assert read(log).truth.name == "vehicle_mocap_odometry"
     log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
@@ -508,7 +510,7 @@ def test_motion_capture_is_truth_only_where_something_else_feeds_ekf2(read):
     assert choose_source(flight)[0].name == "vehicle_mocap_odometry"
 
 
-# ---- where each part came from ----------------------------------------------------------------
+# ---- source of each part ----------------------------------------------------------------------
 
 STREAMS = {
     "v1.9": ["ekf2_innovations", "estimator_status", "estimator_status"],
@@ -518,7 +520,7 @@ STREAMS = {
 
 
 @pytest.mark.parametrize("generation", STREAMS)
-def test_each_part_names_its_topics_clock_and_file(read, generation):
+def test_streams_name_topics_clock_and_file(read, generation):
     streams = read(make_log(generation)).streams
     of_ekf2 = ("ekf2_innovations", "ekf2_fusing", "ekf2_variance")
     assert [streams[part].topics[0] for part in of_ekf2] == STREAMS[generation]
@@ -532,7 +534,7 @@ def test_each_part_names_its_topics_clock_and_file(read, generation):
     assert measured == {"imu"} | (set() if generation == "v1.9" else {"ekf2_state", *of_ekf2})
 
 
-def test_ranges_of_uwb_are_reported_as_unused(read):
+def test_unused_lists_uwb_ranges(read):
     at = stamps(10.0, 4.0)
     ranges = topic("sensor_uwb", at, {"distance": np.ones(len(at))})
     grid = topic("uwb_grid", at[:3], {"num_anchors": np.ones(3, np.uint8)})
@@ -544,8 +546,8 @@ def test_ranges_of_uwb_are_reported_as_unused(read):
 
 
 @pytest.mark.parametrize("unknown_us", [0, 5_000_000, 2**64 - 1])
-def test_the_start_in_utc_is_that_of_the_receivers_fixes(read, unknown_us):
-    made = gps()
+def test_start_unix_is_from_gps_fixes(read, unknown_us):
+    made = gps_topic()
     utc_us = 1_700_000_000_000_000 + np.round(seconds_of(made.fields["timestamp"]) * 1e6)
     made.fields["time_utc_usec"] = utc_us.astype(np.uint64)
     made.fields["time_utc_usec"][:2] = unknown_us
@@ -568,17 +570,17 @@ SIMULATED = [
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", SIMULATED)
-def test_simulated_uwb_is_read_as_it_was_sent(shared_logs, name):
-    """Every sample of the chosen source is one that the simulated UWB sent, at its own time."""
+def test_read_log_simulated_uwb_equals_sent_samples(shared_logs, name):
+    """Each sample of the chosen source equals a sent sample, at its measurement time."""
     flight = read_log(shared_logs / "simulated" / f"{name}.ulg")
     sent = json.loads((shared_logs / "simulated" / f"{name}.json").read_text())
     track, _ = choose_source(flight)
-    kept = name == "v1.16.1_aisle_hwlog"  # the vision topic is not in its profile
+    kept = name == "v1.16.1_aisle_hwlog"  # logging profile without the vision topic
     assert track.name == ("estimator_aid_src_ev_pos" if kept else "vehicle_visual_odometry")
 
     axes = (
         slice(0, 2) if track.origin == LOGGED_BY_EKF2 else slice(0, 3)
-    )  # EKF2 kept no height in these
+    )  # EKF2's observations contain no height in these logs
     sent_z = np.array([sample["z"] for sample in sent["uwb"]])[:, axes]
     sent_s = np.array([sample["t_px4_us"] for sample in sent["uwb"]]) * 1e-6
     read_z = track.samples[Columns.POSITION[axes]].to_numpy()
@@ -594,7 +596,7 @@ def test_simulated_uwb_is_read_as_it_was_sent(shared_logs, name):
     if config["timesync"]:
         synced = np.abs(late - config["stamp_offset_s"]) < 0.01
         first = int(synced.argmax())
-        # before, stamps are arrival times: PX4 maps the clocks after 500 TIMESYNC replies at 10 Hz
+        # Earlier timestamps are arrival times: PX4 needs 500 TIMESYNC replies at 10 Hz
         assert sent_s[match[first]] - sent_s[0] < 55.0
         assert synced[first:].all()
     else:
@@ -606,8 +608,8 @@ def test_simulated_uwb_is_read_as_it_was_sent(shared_logs, name):
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", [name for name in SIMULATED if "1.13" in name])
-def test_truth_is_derived_where_only_the_global_one_is_logged(shared_logs, name):
-    """The UWB's error against the derived truth has the noise that was put in (0.10 m)."""
+def test_read_truth_global_only_is_projected(shared_logs, name):
+    """The UWB error against the projected ground truth has the simulated noise (0.10 m)."""
     flight = read_log(shared_logs / "simulated" / f"{name}.ulg")
     assert flight.truth.name == "vehicle_global_position_groundtruth"
     samples, truth = flight.positions[0].samples, flight.truth.samples
@@ -619,9 +621,9 @@ def test_truth_is_derived_where_only_the_global_one_is_logged(shared_logs, name)
 
 VISION, ALIGNED_VISION = "vehicle_visual_odometry", "estimator_visual_odometry_aligned"
 GPS_POSITION, STATE = "vehicle_gps_position", "ekf2_state_plus_innovation"
-# Duration of the data (s), and what is chosen as the source; None where EKF2 fused no position
+# Duration of the data (s) and chosen source; None if EKF2 fused no position
 REAL = {
-    "PX4_pyulog_sample_log_small": (6.5, None),  # one message stands at 1194 s
+    "PX4_pyulog_sample_log_small": (6.5, None),  # one message has a timestamp of 1194 s
     "PX4_pyulog_sample": (68.9, None),
     "PX4_pyulog_hist_fa8acbdc_sample_unordered": (68.9, None),
     "PX4_pyulog_sample_appended_multiple": (9.6, None),
@@ -629,14 +631,14 @@ REAL = {
     "Auterion_px4-ulog-rs_hist_2f3b79f6_corrupt_unregistered_msg_id": (95.1, GPS_POSITION),
     "PX4_flight-review-rs_battery_brownout": (76.0, STATE),
     "vladimireganov_ROS_PX4_MOCAP_min_snap_01": (35.0, ALIGNED_VISION),
-    "PX4_pyulog_sample_px4_events": (31.1, GPS_POSITION),  # EKF2_EV_CTRL is 15, yet none was sent
+    "PX4_pyulog_sample_px4_events": (31.1, GPS_POSITION),  # EKF2_EV_CTRL 15, but no vision
     "Auterion_px4-ulog-rs_hist_571df892_quadrotor_local": (92.5, None),
 }
 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", REAL)
-def test_real_logs_of_every_generation(shared_logs, name):
+def test_read_log_real_logs_give_duration_and_source(shared_logs, name):
     duration_s, source = REAL[name]
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     assert flight.log.duration_s == pytest.approx(duration_s, abs=0.06)

@@ -1,4 +1,4 @@
-"""What a clock offset needs of the IMU that a recording holds."""
+"""IMU rate that the estimate of a clock offset needs."""
 
 import pytest
 from exchange import replace
@@ -18,8 +18,8 @@ from px4fuse.recording import Stream
     ("sensor_combined", 100.0, None),
     ("sensor_combined", 20.0, "40 Hz"),
 ])  # fmt: skip
-def test_a_clock_offset_needs_the_whole_imu(topic, imu_hz, needed) -> None:
-    """A sample that telemetry picks out of many is no mean over its interval."""
+def test_clock_offset_low_imu_rate_is_unavailable(topic, imu_hz, needed) -> None:
+    """Telemetry samples of a faster IMU are single values, not means over the interval."""
     flight = aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz))
     flight = replace(flight, streams={"imu": Stream((topic,), "boot clock", flight.log.name)})
     _, found = noises_and_clock(compare(flight, axes=("north", "east")))

@@ -1,4 +1,4 @@
-"""Trajectory files in every dialect: the same poses, or one line of explanation."""
+"""Trajectory files in many dialects: equal poses, or an error of one line."""
 
 import hashlib
 from decimal import Decimal
@@ -17,7 +17,7 @@ from px4fuse.readers import trajectory as reader
 from px4fuse.readers.trajectory import read_trajectory, tum_text
 from px4fuse.trajectory.model import Trajectory
 
-# The one track that every dialect below is written from
+# Track of all dialects
 POSES = 50
 NANOSECONDS = 1_403_636_579_763_555_584 + 50_000_000 * np.arange(POSES)
 POSITION_M = np.random.default_rng(20261121).normal(0.0, 3.0, (POSES, 3)).round(6)
@@ -55,15 +55,15 @@ def text(lines: list[str], end: str = "\n") -> str:
     return end.join(lines) + end
 
 
-HEAD = ["# estimated trajectory", "# timestamp tx ty tz qx qy qz qw"]
+COMMENTS = ["# estimated trajectory", "# timestamp tx ty tz qx qy qz qw"]
 COMMAS = rows(",", "ns", "wxyz")
 DIALECTS: dict[str, str | bytes] = {
     "TUM": text(rows()),
-    "comments": text([*HEAD, *rows()[:9], "# a remark", "", *rows()[9:]]),
+    "comments": text([*COMMENTS, *rows()[:9], "# a remark", "", *rows()[9:]]),
     "tabs": text(rows("\t")),
     "double spaces and a last one": text([f"  {row} " for row in rows("  ")]),
     "CRLF": text(rows(), "\r\n"),
-    "BOM": b"\xef\xbb\xbf" + text([*HEAD, *rows()]).encode(),
+    "BOM": b"\xef\xbb\xbf" + text([*COMMENTS, *rows()]).encode(),
     "UTF-16": text(rows()).encode("utf-16"),
     "latin-1 comment": b"# K\xf6ln\n" + text(rows()).encode(),
     "exponents": text(rows(stamps="exponent", number=".18e")),
@@ -87,11 +87,11 @@ def write(folder: Path, content: str | bytes, name: str = "track.txt") -> Path:
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_every_dialect_gives_the_same_poses(dialect: str, tmp_path: Path) -> None:
+def test_read_trajectory_every_dialect_gives_equal_poses(dialect: str, tmp_path: Path) -> None:
     path = write(tmp_path, DIALECTS[dialect])
     got = read_trajectory(path)
     expected = np.array([float(Decimal(t) / 10**9) for t in NANOSECONDS.tolist()])
-    # one unit in the last place of UNIX time
+    # one unit in the last place of UNIX time in float64
     np.testing.assert_allclose(got.time_s, expected, rtol=0, atol=2.4e-7)
     np.testing.assert_array_equal(got.position_m, POSITION_M)
     assert (got.rotation.inv() * ROTATION).magnitude().max() < 1e-8
@@ -104,7 +104,7 @@ def test_every_dialect_gives_the_same_poses(dialect: str, tmp_path: Path) -> Non
     assert is_ns == any("nanoseconds and were divided" in note for note in got.notes)
 
 
-def test_a_clock_of_its_own_and_nanoseconds_since_boot(tmp_path: Path) -> None:
+def test_read_trajectory_other_clock_has_no_unix_offset(tmp_path: Path) -> None:
     values = text(rows()[:4]).replace("14036365", "")
     assert read_trajectory(write(tmp_path, values)).unix_offset_s is None
     lines = [f"{12_000_000_000 + 33_000_000 * i}.000000 {i} 0 0 0 0 0 1" for i in range(9)]
@@ -114,7 +114,7 @@ def test_a_clock_of_its_own_and_nanoseconds_since_boot(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["MH_04_groundtruth.txt", "truth/data.csv", "room_gt.txt", ""])
-def test_ground_truth_says_so(name: str, tmp_path: Path) -> None:
+def test_read_trajectory_ground_truth_name_gives_kind(name: str, tmp_path: Path) -> None:
     path = tmp_path / (name or "track.txt")
     path.parent.mkdir(exist_ok=True)
     path.write_text(("" if name else "# Ground truth trajectory\n") + text(rows()))
@@ -124,7 +124,7 @@ def test_ground_truth_says_so(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("axes", "tilt_deg", "frame"), [
     ("xzy", 15.0, "camera"), ("xzy", 30.0, "unknown"), ("xyz", 0.0, "unknown"),
 ])  # fmt: skip
-def test_the_camera_frame_shows_in_a_level_motion(axes, tilt_deg, frame, tmp_path) -> None:
+def test_read_trajectory_level_motion_gives_camera_frame(axes, tilt_deg, frame, tmp_path) -> None:
     angle = np.linspace(0.0, 6.0, 200)
     level = np.column_stack((9 * np.sin(angle), 6 - 6 * np.cos(angle), 0.1 * np.sin(7 * angle)))
     position = level[:, ["xyz".index(axis) for axis in axes]]
@@ -134,12 +134,12 @@ def test_the_camera_frame_shows_in_a_level_motion(axes, tilt_deg, frame, tmp_pat
     assert (got.kind, got.frame) == ("slam", frame)
 
 
-def test_gaps_key_frames_and_repeated_stamps_are_told(tmp_path: Path) -> None:
+def test_read_trajectory_gaps_and_repeats_have_notes(tmp_path: Path) -> None:
     time = np.arange(1000) * 0.05
     keep = ((time < 10) | (time > 14)) & ((time < 30) | (time > 31))
     made = Trajectory("t", "unknown", time, np.tile(POSITION_M, (20, 1)), Rotation.identity(1000))
     notes = " ".join(read_trajectory(write(tmp_path, tum_text(made[keep]))).notes)
-    gaps = "No poses for 5.1 s in 2 gaps, the longest at 10.0 s after its start, 102 frames"
+    gaps = "No poses for 5.1 s in 2 gaps, the longest at 10.0 s after the start, 102 frames"
     assert gaps in notes
     irregular = made[np.flatnonzero(np.random.default_rng(1).random(1000) < 0.2)]
     assert "key frames" in " ".join(read_trajectory(write(tmp_path, tum_text(irregular))).notes)
@@ -147,20 +147,20 @@ def test_gaps_key_frames_and_repeated_stamps_are_told(tmp_path: Path) -> None:
     lines.insert(500, lines[500])
     again = read_trajectory(write(tmp_path, "\n".join(lines)))
     assert len(again) == 1000
-    assert "Dropped poses with the stamp of the one before: 1." in again.notes
+    assert "Dropped poses with a repeated timestamp: 1." in again.notes
 
 
-def test_a_cut_last_line_is_dropped(tmp_path: Path) -> None:
+def test_read_trajectory_incomplete_last_line_is_dropped(tmp_path: Path) -> None:
     got = read_trajectory(write(tmp_path, text(rows())[:-50]))
     assert len(got) == POSES - 1
-    assert got.notes[-1] == f"Line {POSES}, the last one, was dropped: it is cut."
+    assert got.notes[-1] == f"The last line ({POSES}) was dropped: it is incomplete."
 
 
 TUM_ROWS = rows()
 
 
 def changed(line: int, new: str) -> str:
-    return text([*HEAD, *TUM_ROWS[: line - 3], new, *TUM_ROWS[line - 2 :]])
+    return text([*COMMENTS, *TUM_ROWS[: line - 3], new, *TUM_ROWS[line - 2 :]])
 
 
 def with_field(line: int, column: int, field: str) -> str:
@@ -170,39 +170,45 @@ def with_field(line: int, column: int, field: str) -> str:
 
 
 STAMPS_S = range(1403636579, 1403636588)
-REFUSED: dict[str, tuple[str | bytes, str]] = {
+INVALID_FILES: dict[str, tuple[str | bytes, str]] = {
     "empty": ("", "the file is empty"),
-    "comments": ("# a\n# b\n\n  \n", "poses: 0, at least 3 are needed"),
+    "comments": ("# a\n# b\n\n  \n", "0 poses; at least 3 are needed"),
     "text": ("Dear reader,\nthis is a letter.\n", "its first line is 'Dear reader"),
     "binary": (bytes(range(256)) * 9, "a binary file"),
-    "ULog": (b"ULog\x01\x12\x35\x01" + bytes(99), "Name a part of the log: track.txt:vio"),
+    "ULog": (b"ULog\x01\x12\x35\x01" + bytes(99), "Choose a track of the log: track.txt:vio"),
     "KITTI": ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 5, "12 columns; TUM has 8"),
     "other columns": ("t,x,y,z\n" + "1,2,3,4\n" * 5, "4 columns; TUM has 8"),
-    "other 8 columns": ("time,x,y,z,vx,vy,vz,sigma\n" + "1,2,3,4,5,6,7,8\n" * 5, "w is not known"),
+    "other 8 columns": ("time,x,y,z,vx,vy,vz,sigma\n" + "1,2,3,4,5,6,7,8\n" * 5, "w is unknown"),
     "other names of 8 columns": (
         "time,x,y,z,rx,ry,rz,rw\n" + "".join(f"{n}000000000,1,2,3,0,0,0,1\n" for n in STAMPS_S),
-        "line 2: the place of the quaternion's w is not known",
+        "line 2: the position of the quaternion's w is unknown",
     ),
-    "commas, no header": (text(rows(",")), "the place of the quaternion's w is not known"),
-    "two poses": (text(TUM_ROWS[:2]), "poses: 2, at least 3 are needed"),
+    "commas, no header": (text(rows(",")), "the position of the quaternion's w is unknown"),
+    "two poses": (text(TUM_ROWS[:2]), "2 poses; at least 3 are needed"),
     "text within": (with_field(7, 2, "abc"), "line 7: '1403636579.963555584 "),
     "time that is text": (with_field(7, 0, "abc"), "line 7: column 1 is not a time"),
-    "NaN": (with_field(8, 3, "nan"), "line 8: a value that is not finite"),
-    "infinite": (with_field(8, 5, "-inf"), "line 8: a value that is not finite"),
+    "NaN": (with_field(8, 3, "nan"), "line 8: a value is not finite"),
+    "infinite": (with_field(8, 5, "-inf"), "line 8: a value is not finite"),
     "NaN time": (with_field(9, 0, "nan"), "line 9: column 1 is not a time"),
     "too few columns": (changed(10, "1 2 3"), "line 10: '1 2 3' is not 8 columns of numbers"),
     "too many columns": (changed(11, TUM_ROWS[0] + " 1"), "line 11: '1403636579.763555584 "),
     "zero quaternion": (changed(12, TUM_ROWS[9].split()[0] + " 1 2 3 0 0 0 0"), "line 12: columns"),
     "no quaternion": (text([f"{i} 1 2 3 4 5 6 7" for i in range(9)]), "line 1: columns 5 to 8"),
-    "back in time": (changed(13, TUM_ROWS[2]), "line 13: its time is before that of the line"),
-    "equal stamps": (text([f"{i // 2} 1 2 3 0 0 0 1" for i in range(99)]), "line 2: its time is"),
-    "odd unit": (text([f"{i * 33_000} 1 2 3 0 0 0 1" for i in range(9)]), "not an interval of"),
+    "back in time": (changed(13, TUM_ROWS[2]), "line 13: its timestamp is before that of the line"),
+    "equal timestamps": (
+        text([f"{i // 2} 1 2 3 0 0 0 1" for i in range(99)]),
+        "line 2: its timestamp equals",
+    ),
+    "odd unit": (
+        text([f"{i * 33_000} 1 2 3 0 0 0 1" for i in range(9)]),
+        "is not valid in any unit",
+    ),
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_is_no_trajectory_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    content, words = REFUSED[case]
+@pytest.mark.parametrize("case", INVALID_FILES)
+def test_read_trajectory_invalid_file_is_rejected(case: str, tmp_path: Path) -> None:
+    content, words = INVALID_FILES[case]
     with pytest.raises(TrajectoryError) as caught:
         read_trajectory(write(tmp_path, content))
     message = str(caught.value)
@@ -212,7 +218,7 @@ def test_what_is_no_trajectory_is_refused_in_one_line(case: str, tmp_path: Path)
     assert message.endswith(".")
 
 
-def test_a_file_that_is_too_large_is_refused(tmp_path, monkeypatch) -> None:
+def test_read_trajectory_too_large_file_is_rejected(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(reader, "MAX_FILE_BYTES", 10)
     with pytest.raises(TrajectoryError, match="more than the limit"):
         read_trajectory(write(tmp_path, text(rows())))
@@ -228,7 +234,7 @@ NUMBER = st.floats(-1e6, 1e6)
     position=hnp.arrays(float, (8, 3), elements=NUMBER),
     quaternion=hnp.arrays(float, (8, 4), elements=st.floats(0.1, 1.0)),
 )
-def test_what_is_written_is_read_back_exactly(steps, start, position, quaternion, tmp_path) -> None:
+def test_tum_text_is_read_back_exactly(steps, start, position, quaternion, tmp_path) -> None:
     time_s, rotation = start + np.cumsum(steps), Rotation.from_quat(quaternion)
     made = Trajectory("t", "unknown", time_s, position, rotation)
     once = read_trajectory(write(tmp_path, tum_text(made)))
@@ -238,7 +244,7 @@ def test_what_is_written_is_read_back_exactly(steps, start, position, quaternion
     assert tum_text(once) == tum_text(made)
 
 
-def test_a_log_is_written_with_unix_time_and_positions_alone_are_not(tmp_path: Path) -> None:
+def test_tum_text_writes_unix_time_and_needs_orientation(tmp_path: Path) -> None:
     made = Trajectory("t", "vio", np.arange(5.0), POSITION_M[:5], ROTATION[:5], unix_offset_s=1.5e9)
     assert read_trajectory(write(tmp_path, tum_text(made))).time_s[0] == 1.5e9
     with pytest.raises(TrajectoryError, match="needs orientations"):

@@ -1,4 +1,4 @@
-"""Which time stamps of a log are trusted, and the helper that the other tests write logs with."""
+"""Valid timestamps of a ULog, and the ULog writer of the tests."""
 
 from itertools import combinations, pairwise
 
@@ -11,16 +11,16 @@ from ulog_tools import GENERATIONS, make_log, position, seconds_of, take
 
 from px4fuse.readers.ulog_topics import longest_increasing_run, measurement_time_us, read_topics
 
-small_stamps = st.lists(st.integers(-2, 12), max_size=9)
-any_stamps = st.lists(st.integers(-(2**63), 2**63 - 1), max_size=60)
+few_timestamps = st.lists(st.integers(-2, 12), max_size=9)
+any_timestamps = st.lists(st.integers(-(2**63), 2**63 - 1), max_size=60)
 
 
-def kept(stamps: list[int]) -> list[int]:
+def kept_indices(stamps: list[int]) -> list[int]:
     return longest_increasing_run(np.array(stamps, dtype=np.int64)).tolist()
 
 
-def longest_run(stamps: list[int]) -> int:
-    """Length of the longest strictly increasing run of positive stamps, by trying them all."""
+def longest_run_length(stamps: list[int]) -> int:
+    """Return the length of the longest increasing subsequence, by brute force."""
     positive = [stamp for stamp in stamps if stamp > 0]
     for length in range(len(positive), 0, -1):
         for run in combinations(positive, length):
@@ -29,18 +29,18 @@ def longest_run(stamps: list[int]) -> int:
     return 0
 
 
-@given(any_stamps)
-def test_kept_stamps_are_positive_and_increase(stamps):
-    indices = kept(stamps)
+@given(any_timestamps)
+def test_longest_increasing_run_is_positive_and_increasing(stamps):
+    indices = kept_indices(stamps)
     chosen = [stamps[at] for at in indices]
     assert indices == sorted(set(indices))
     assert all(stamp > 0 for stamp in chosen)
     assert all(a < b for a, b in pairwise(chosen))
 
 
-@given(small_stamps)
-def test_no_longer_run_exists(stamps):
-    assert len(kept(stamps)) == longest_run(stamps)
+@given(few_timestamps)
+def test_longest_increasing_run_has_maximum_length(stamps):
+    assert len(kept_indices(stamps)) == longest_run_length(stamps)
 
 
 def table(published, sampled=None):
@@ -56,7 +56,7 @@ PUBLISHED = [10_000_000, 11_000_000, 12_000_000, 13_000_000]
 @pytest.mark.parametrize(("sampled", "expected"), [
     pytest.param(None, PUBLISHED, id="nothing else is logged"),
     pytest.param([at - 214_000 for at in PUBLISHED], None, id="measurement is preferred"),
-    # a sender whose clock runs ahead is a finding, not a reason to hide its stamps
+    # timestamps of a sender whose clock is ahead are kept, so that a finding reports them
     pytest.param([at + 250_000 for at in PUBLISHED], None, id="ahead of publication"),
     pytest.param([0] * 4, PUBLISHED, id="zero, as the ground truth of v1.13 has it"),
     pytest.param([17 * 10**14 + i for i in range(4)], PUBLISHED, id="UNIX time of a receiver"),
@@ -67,13 +67,13 @@ PUBLISHED = [10_000_000, 11_000_000, 12_000_000, 13_000_000]
         id="one unusable falls back alone",
     ),
 ])  # fmt: skip
-def test_time_of_measurement(sampled, expected):
+def test_measurement_time_us_selects_sample_or_publication(sampled, expected):
     assert measurement_time_us(table(PUBLISHED, sampled)).tolist() == (expected or sampled)
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_written_logs_read_back_as_written(tmp_path, generation):
-    """pyulog, which knows nothing of the writer, must see every number that went in."""
+def test_make_log_is_read_back_by_pyulog(tmp_path, generation):
+    """pyulog, which is independent of the writer, reads every value that was written."""
     log = make_log(generation, 2.0)
     ulog = ULog(str(log.write(tmp_path / "made.ulg")))
     assert not ulog.file_corruption
@@ -89,7 +89,7 @@ def test_written_logs_read_back_as_written(tmp_path, generation):
                 np.testing.assert_array_equal(read[key], column, err_msg=f"{topic.name}.{key}")
 
 
-def test_time_zero_is_the_first_imu_sample(tmp_path):
+def test_read_topics_time_zero_is_first_imu_sample(tmp_path):
     path = make_log("v1.16", 10.0).write(tmp_path / "made.ulg")
     topics = read_topics(path.name, path.read_bytes())
     assert topics.log.boot_time_s == pytest.approx(5.0)
@@ -106,13 +106,13 @@ def test_time_zero_is_the_first_imu_sample(tmp_path):
     (255, "PX4 v1.16.2"), (192, "PX4 v1.16.2-rc"), (128, "PX4 v1.16.2-beta"),
     (64, "PX4 v1.16.2-alpha"), (0, "PX4 v1.16.2-dev"),
 ])  # fmt: skip
-def test_firmware_kinds(kind, text):
+def test_read_topics_formats_firmware_version(kind, text):
     log = make_log("v1.16", 2.0)
     log.info["ver_sw_release"] = 1 << 24 | 16 << 16 | 2 << 8 | kind
     assert read_topics("made.ulg", log.encode()).log.firmware == text
 
 
-def test_dropouts_carry_their_length_and_place():
+def test_read_topics_dropout_has_start_and_duration():
     log = make_log("v1.16", 2.0)
     log.dropouts_ms = (250,)
     last = max(int(topic.fields["timestamp"].max()) for topic in log.topics)
@@ -122,8 +122,8 @@ def test_dropouts_carry_their_length_and_place():
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_a_topic_subscribed_to_twice_is_one_topic(order):
-    """A logger that restarts subscribes again; both halves belong to the same topic."""
+def test_read_topics_two_subscriptions_are_joined(order):
+    """A logger that restarts subscribes again; both parts belong to the same topic."""
     log = make_log("v1.9", 4.0)
     whole = next(t for t in log.topics if t.name == "vehicle_local_position")
     halves = np.array_split(np.arange(len(whole.fields["timestamp"])), 2)

@@ -1,7 +1,7 @@
-"""Write small ULog files with chosen topics, in the layouts of several PX4 generations.
+"""Write small ULog files with chosen topics, in the formats of several PX4 releases.
 
-The made flight moves on a straight line, level and at constant speed, so everything in it has a
-closed form: :func:`position` is EKF2's state and :func:`ev_error` what external vision adds to it.
+The flight is straight, level and at constant speed, so all values have a closed form:
+:func:`position` is EKF2's state and :func:`ev_error` is external vision minus that state.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ START_US = 5_000_000
 PUBLICATION_LAG_US = 60_000
 GRAVITY = 9.80665
 GENERATIONS = ("v1.9", "v1.11", "v1.12", "v1.14", "v1.15", "v1.16")
-# states and covariances in each generation's array of EKF2 states
+# (states, covariances): lengths of the arrays of EKF2 states by release
 LENGTHS = {"v1.15": (24, 23), "v1.16": (25, 24)}
 INNOVATION_VARIANCE = np.array([0.05, 0.06, 0.07])
 EV_VARIANCE = np.array([0.01, 0.02, 0.03])
@@ -33,7 +33,7 @@ AXES = ("north", "east", "down")
 
 @dataclass
 class Log:
-    """What goes into a ULog file."""
+    """Content of a ULog file."""
 
     topics: list[Topic]
     parameters: dict[str, int | float] = field(default_factory=dict)
@@ -41,14 +41,14 @@ class Log:
     dropouts_ms: tuple[int, ...] = ()
 
     def __getitem__(self, name: str) -> dict[str, NDArray]:
-        """Fields of the first topic of that name."""
+        """Return the fields of the first topic with this name."""
         return next(topic.fields for topic in self.topics if topic.name == name)
 
     def names(self) -> set[str]:
         return {topic.name for topic in self.topics}
 
     def drop(self, *names: str) -> Log:
-        """Take topics out; the names must exist."""
+        """Remove topics; the names must exist."""
         assert set(names) <= self.names()
         self.topics = [topic for topic in self.topics if topic.name not in names]
         return self
@@ -66,12 +66,12 @@ class Log:
         return path
 
     def encode(self) -> bytes:
-        """The file; a topic that stands twice in the list is subscribed to twice."""
+        """Return the file content; a repeated topic gets two subscriptions."""
         return encode(self.topics, self.parameters, self.info, START_US, self.dropouts_ms)
 
 
 def load(path: Path) -> Log:
-    """A ULog file as topics that can be edited (nested and padding fields are left out)."""
+    """Read a ULog file as topics that can be edited, without nested and padding fields."""
     ulog = ULog(str(path))
     topics = []
     for data in ulog.data_list:
@@ -97,18 +97,18 @@ def load(path: Path) -> Log:
 
 
 def position(time_s: ArrayLike) -> Array:
-    """EKF2's position (north, east, down) in the made flight; ``time_s`` from the first data."""
+    """Return EKF2's position (north, east, down, m); ``time_s`` is since the first sample."""
     return np.array([1.0, 2.0, -1.5]) + np.outer(time_s, VELOCITY)
 
 
 def ev_error(time_s: ArrayLike) -> Array:
-    """What external vision measures beyond EKF2's position: the innovation, by its definition."""
+    """Return external vision minus EKF2's position (m), which is the innovation."""
     t = np.asarray(time_s, dtype=np.float64)
     return np.stack([0.1 * np.sin(1.3 * t), 0.08 * np.cos(0.7 * t), 0.05 * np.sin(2 * t)], axis=1)
 
 
 def stamps(seconds: float, rate_hz: float, first_s: float = 0.0) -> NDArray[np.uint64]:
-    """Boot times in µs, at a fixed rate."""
+    """Return boot times (µs) at a fixed rate."""
     count = round((seconds - first_s) * rate_hz)
     return (START_US + np.round((first_s + np.arange(count) / rate_hz) * 1e6)).astype(np.uint64)
 
@@ -125,9 +125,9 @@ def topic(
     sampled: bool = False,
     instance: int = 0,
 ) -> Topic:
-    """A topic of float32 fields, unless an array says otherwise.
+    """Make a topic; float64 values become float32 fields.
 
-    ``sampled`` topics carry the time of measurement in ``timestamp_sample`` and are published
+    ``sampled`` topics have the measurement time in ``timestamp_sample`` and are published
     :data:`PUBLICATION_LAG_US` later.
     """
     lag = np.uint64(PUBLICATION_LAG_US if sampled else 0)
@@ -141,7 +141,7 @@ def topic(
 
 
 def make_log(generation: str = "v1.16", seconds: float = 10.0, imu_hz: float = 100.0) -> Log:
-    """The made flight as PX4 of that generation logs it, with external vision fused at 5 Hz."""
+    """Make the log of the flight by a PX4 release, with external vision fused at 5 Hz."""
     assert generation in GENERATIONS
     number = int(generation.removeprefix("v1."))
     imu = stamps(seconds, imu_hz)
@@ -180,7 +180,7 @@ def make_log(generation: str = "v1.16", seconds: float = 10.0, imu_hz: float = 1
 
 
 def gnss_log(generation: str) -> Log:
-    """A log in which EKF2 fuses GNSS position at 5 Hz, and external vision never."""
+    """Make a log in which EKF2 fuses GNSS position at 5 Hz and no external vision."""
     log, number = make_log(generation, seconds=20.0), int(generation.removeprefix("v1."))
     vision = ("visual", "aid_src_ev", "innovation", "status_flags")
     log.drop(*(name for name in log.names() if any(part in name for part in vision)))
@@ -240,12 +240,12 @@ def local_position(seconds: float, *, sampled: bool) -> Topic:
 
 
 def ev_stamps(seconds: float) -> NDArray[np.uint64]:
-    """Times of external vision: 5 Hz from 0.1 s."""
+    """Return the times (µs) of external vision: 5 Hz from 0.1 s."""
     return stamps(seconds, 5.0, 0.1)
 
 
 def odometry(name: str, seconds: float, number: int) -> Topic:
-    """External vision as v1.9 (x, y, z and a covariance triangle) or v1.14 (arrays) logs it."""
+    """Make an external vision topic in the format before v1.14 (x, y, z) or since (arrays)."""
     measured = ev_stamps(seconds)
     time = seconds_of(measured)
     measurement = position(time) + ev_error(time)
@@ -256,7 +256,7 @@ def odometry(name: str, seconds: float, number: int) -> Topic:
             "pose_frame": np.ones(len(time), np.uint8),
         }
     else:
-        covariance = np.full((len(time), 21), 99.0)  # what is not on the diagonal must not be read
+        covariance = np.full((len(time), 21), 99.0)  # off-diagonal values must not be read
         covariance[:, [0, 6, 11]] = EV_VARIANCE
         fields = dict(zip("xyz", measurement.T, strict=True)) | {"pose_covariance": covariance}
         if number >= 11:
@@ -265,12 +265,12 @@ def odometry(name: str, seconds: float, number: int) -> Topic:
 
 
 def covariances(count: int) -> Array:
-    """Distinguishable variances: element i is (i + 1) / 100."""
+    """Return distinct variances: element i is (i + 1) / 100."""
     return 0.01 * (1 + np.arange(count))
 
 
 def states(seconds: float, generation: str, instance: int = 0, scale: float = 1.0) -> list[Topic]:
-    """EKF2's state vector and its fusion flags."""
+    """Make topics with EKF2's state vector and fusion flags."""
     number = int(generation.removeprefix("v1."))
     measured = stamps(seconds, 2.0)
     count = len(measured)
@@ -291,7 +291,7 @@ def states(seconds: float, generation: str, instance: int = 0, scale: float = 1.
 
 
 def innovations(seconds: float, number: int, instance: int = 0, scale: float = 1.0) -> list[Topic]:
-    """EKF2's innovations of external vision, with PX4's sign: state minus measurement."""
+    """Make EKF2's external vision innovations with PX4's sign: state minus measurement."""
     measured = ev_stamps(seconds)
     time = seconds_of(measured)
     logged = -ev_error(time) * scale
@@ -306,7 +306,7 @@ def innovations(seconds: float, number: int, instance: int = 0, scale: float = 1
             "vel_pos_innov_var": np.hstack([empty, variance]),
         }
         return [topic("ekf2_innovations", measured, fields, instance=instance)]
-    # logged twice as often as fused: each value stands twice
+    # logged at twice the fusion rate, so each value is repeated
     twice = np.repeat(np.arange(len(time)), 2)
     measured = np.repeat(measured, 2) + np.tile(np.array([0, 100_000], np.uint64), len(time))
     largest = np.stack([ratio[:, :2].max(axis=1), np.zeros(len(time)), ratio[:, 2]], axis=1)
@@ -355,13 +355,13 @@ def _aid_sources(
 
 
 def selector(switches: Sequence[tuple[float, int]]) -> Topic:
-    """estimator_selector_status: the primary instance from each time (s) on."""
+    """Make estimator_selector_status from (start time in s, primary instance) pairs."""
     at = np.array([START_US + round(time * 1e6) for time, _ in switches], np.uint64)
     numbers = np.array([number for _, number in switches], np.uint8)
     return topic("estimator_selector_status", at, {"primary_instance": numbers})
 
 
 def take(topic: Topic, rows: Iterable[int]) -> Topic:
-    """The same topic with only these rows, in this order."""
+    """Return the topic with only these rows, in this order."""
     rows = np.asarray(list(rows), dtype=np.intp)
     return replace(topic, fields={name: values[rows] for name, values in topic.fields.items()})

@@ -1,12 +1,11 @@
-"""Damaged input for whatever reads files: what comes of it is a result or px4fuse's own error.
+"""Damaged input for all file readers: each must give a result or a px4fuse error.
 
-``python tests/studies/fuzz.py --inputs 1000000 --seed 1`` tries so many in all, shared out by what
-each target costs, and prints cases, how many were read and refused, and what escaped: any other
-exception, a warning, or more than :data:`SLOW_S`. ``--commands 400`` takes so many files through
-whole commands instead, and logs through all of ``compare`` but the drawing. An escape is printed
-with the number that makes it again.
+``python tests/studies/fuzz.py --inputs 1000000 --seed 1`` distributes this number of inputs over
+the targets and prints how many were read, rejected and failed. Failures are other exceptions,
+warnings and more than :data:`SLOW_S` of CPU time; they are printed with the number that reproduces
+them. ``--commands 400`` runs whole commands instead, for logs ``compare`` without drawing.
 
-A part of it runs in the suite: ``tests/test_fuzz.py``.
+``tests/test_fuzz.py`` runs a part of the study.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ from px4fuse.verification.intake import read_report  # noqa: E402
 REPOSITORY = TESTS.parent
 REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
 SLOW_S, COMMAND_S = 5.0, 15.0
-# Numbers and words that parsers stumble over
+# Numbers and words that parsers may handle incorrectly
 ODD = (
     b"nan", b"-inf", b"1e999", b"-1e-400", b"1.8e308", b"0", b"-0", b"", b"9" * 400, b"0x1p3",
     "١٢".encode(), "−1".encode(), b"1,5", b"1_0", b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"#",
@@ -72,8 +71,8 @@ ODD = (
 )  # fmt: skip
 
 
-def mutated(content: bytes, rng: random.Random, *, words: bool) -> bytes:
-    """A few changes of a file: bits, bytes, pieces that go, come twice or swap, odd words, cuts."""
+def damaged(content: bytes, rng: random.Random, *, words: bool) -> bytes:
+    """Damage a file: change bits, bytes or words, delete, repeat or copy pieces, or truncate."""
     data = bytearray(content)
     for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
         size = len(data)
@@ -98,7 +97,7 @@ def mutated(content: bytes, rng: random.Random, *, words: bool) -> bytes:
                 piece = bytes(data[other : other + length])
                 data[at : at + length] = piece
             case _:
-                # in place of a word, so that what stands around it is still right
+                # replace one word, so that the text around it stays valid
                 ends = [i for i, byte in enumerate(data) if byte in b" ,;\t\n=:\"'"]
                 if len(ends) > 1:
                     first = rng.randrange(len(ends) - 1)
@@ -108,25 +107,25 @@ def mutated(content: bytes, rng: random.Random, *, words: bool) -> bytes:
 
 @dataclass(frozen=True)
 class Target:
-    """One thing that reads files.
+    """File reader or command under test.
 
     Attributes
     ----------
     name : str
     seeds : callable
-        Files that it reads, as bytes.
+        Returns valid files as bytes.
     read : callable
-        Takes the path of a file with the bytes.
+        Reads the file at a path.
     end : str
-        Of the file's name.
+        Suffix of the file name.
     words : bool
-        Whether the format is text.
+        True if the format is text.
     in_suite : int
-        Inputs that the suite tries.
+        Number of inputs in the test suite.
     weight : float
-        Share of a study's inputs: what is cheap is tried more often.
+        Relative number of inputs in a study; larger for fast readers.
     slow_s : float
-        CPU time that no input may take.
+        Limit of the CPU time per input.
     """
 
     name: str
@@ -141,11 +140,11 @@ class Target:
 
 @dataclass
 class Outcome:
-    """What came of a target's inputs."""
+    """Results of the inputs of one target."""
 
     read: int = 0
-    refused: int = 0
-    escaped: list[str] = field(default_factory=list)
+    rejected: int = 0
+    faults: list[str] = field(default_factory=list)
 
 
 @cache
@@ -161,7 +160,7 @@ def _recordings() -> list[bytes]:
 
 
 def _reports() -> list[bytes]:
-    """The shipped report, and one of its results on an empty page."""
+    """Return the example report, and its results attached to an empty page."""
     report = REPORT
     return [report.read_bytes(), page_of(None, report.with_suffix(".json").read_text())]
 
@@ -236,7 +235,7 @@ TARGETS = (
 
 
 def _command(*words: str) -> Callable[[Path], object]:
-    """A whole command in this process, with its output beside the input."""
+    """Return a reader that runs a command in this process."""
 
     def read(path: Path) -> object:
         out = path.parent / "out"
@@ -271,7 +270,7 @@ def _flights() -> list[bytes]:
 
 
 def _compared(path: Path) -> object:
-    """All of ``compare`` but the drawing: findings and results of a log."""
+    """Run ``compare`` without drawing: findings and results of a log."""
     request = ComparisonRequest(log=str(path))
     return to_json(outcome_results(request, run_or_evaluate_aids(request)))
 
@@ -296,8 +295,8 @@ COMMANDS = (
 )  # fmt: skip
 
 
-def attempt(target: Target, content: bytes, path: Path, outcome: Outcome, label: str) -> None:
-    """Read one input, and count what came of it."""
+def read_input(target: Target, content: bytes, path: Path, outcome: Outcome, label: str) -> None:
+    """Read one input and record its result."""
     path.write_bytes(content)
     begin = time.process_time()
     printed = io.StringIO()
@@ -307,35 +306,35 @@ def attempt(target: Target, content: bytes, path: Path, outcome: Outcome, label:
             target.read(path)
         outcome.read += 1
     except Px4FuseError as error:
-        outcome.refused += 1
+        outcome.rejected += 1
         if "\n" in str(error):
-            outcome.escaped.append(f"{label}: more than one line: {error!r}")
-    except Exception as error:  # noqa: BLE001 - whatever it is, it escaped
+            outcome.faults.append(f"{label}: more than one line: {error!r}")
+    except Exception as error:  # noqa: BLE001 - every other exception is a fault
         places = traceback.extract_tb(error.__traceback__)
         at = ([one for one in places if "px4fuse/" in one.filename] or places)[-1]
-        outcome.escaped.append(
+        outcome.faults.append(
             f"{label}: {type(error).__name__}: {str(error)[:120]} "
             f"({Path(at.filename).name}:{at.lineno} {at.name})"
         )
     if printed.getvalue():
-        outcome.escaped.append(f"{label}: it printed {printed.getvalue()[:80]!r}")
+        outcome.faults.append(f"{label}: it printed {printed.getvalue()[:80]!r}")
     if (took := time.process_time() - begin) > target.slow_s:
-        outcome.escaped.append(f"{label}: took {took:.1f} s of CPU")
+        outcome.faults.append(f"{label}: took {took:.1f} s of CPU")
 
 
-def tried(target: Target, count: int, seed: int, folder: Path) -> Outcome:
-    """What comes of so many inputs of a target; the same for the same seed."""
+def run_target(target: Target, count: int, seed: int, folder: Path) -> Outcome:
+    """Run a number of inputs of a target; the same seed gives the same inputs."""
     outcome, seeds = Outcome(), target.seeds()
     for number in range(count):
         rng = random.Random(f"{target.name} {seed} {number}")
-        content = mutated(rng.choice(seeds), rng, words=target.words)
+        content = damaged(rng.choice(seeds), rng, words=target.words)
         path = folder / f"input{target.end}"
-        attempt(target, content, path, outcome, f"{target.name} {seed} {number}")
+        read_input(target, content, path, outcome, f"{target.name} {seed} {number}")
     return outcome
 
 
 def main() -> None:
-    """Try, and print a table."""
+    """Run the study and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=int, default=1_000_000)
     parser.add_argument("--commands", type=int, default=0)
@@ -345,17 +344,17 @@ def main() -> None:
     targets = [one for one in (COMMANDS if given.commands else TARGETS) if given.only in one.name]
     weights = sum(one.weight for one in targets)
     inputs = given.commands or given.inputs
-    print(f"{'target':20}{'inputs':>10}{'read':>10}{'refused':>10}{'escaped':>10}{'s':>8}")
+    print(f"{'target':20}{'inputs':>10}{'read':>10}{'rejected':>10}{'faults':>10}{'s':>8}")
     with tempfile.TemporaryDirectory() as folder:
         for target in targets:
             count = round(inputs * target.weight / weights)
             begin = time.monotonic()
-            outcome = tried(target, count, given.seed, Path(folder))
+            outcome = run_target(target, count, given.seed, Path(folder))
             took = time.monotonic() - begin
-            numbers = (count, outcome.read, outcome.refused, len(outcome.escaped))
+            numbers = (count, outcome.read, outcome.rejected, len(outcome.faults))
             print(f"{target.name:20}{''.join(f'{n:10}' for n in numbers)}{took:8.0f}", flush=True)
-            kinds = Counter(escape.split(": ", 1)[1] for escape in outcome.escaped)
-            first = {e.split(": ", 1)[1]: e for e in reversed(outcome.escaped)}
+            kinds = Counter(escape.split(": ", 1)[1] for escape in outcome.faults)
+            first = {e.split(": ", 1)[1]: e for e in reversed(outcome.faults)}
             for kind, times in kinds.most_common(20):
                 print(f"    {times} times, first {first[kind]}", flush=True)
 

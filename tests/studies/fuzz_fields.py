@@ -1,11 +1,10 @@
-"""Logs with changed values, times, topics, parameters and rates, through whole commands.
+"""Logs with changed values, times, topics, parameters and rates as input of whole commands.
 
-``python tests/studies/fuzz_fields.py --count 500 --seed 1`` makes so many logs from 20 s of the
-sample flights, of a simulated flight on GNSS and of a MAVLink recording. Each goes through all of
-:data:`COMMANDS` in this process, or through so many that are drawn (``--commands``). A table by
-kind of change gives logs, commands that ended in results, commands that ended in one line, and
-faults: an exception, a warning, more than :data:`SLOW_S`, or an impossible statement in the JSON or
-the text (:func:`impossible`).
+``python tests/studies/fuzz_fields.py --count 500 --seed 1`` makes this number of logs from 20 s of
+the sample flights, of a simulated GNSS flight and of a MAVLink recording. Each log is the input of
+all :data:`COMMANDS`, or of a random selection (``--commands``). A table by kind of change lists
+logs, commands with results, commands with an error of one line, and faults: an exception, a
+warning, more than :data:`SLOW_S`, or an impossible number in the output (:func:`impossible`).
 """
 
 from __future__ import annotations
@@ -78,8 +77,8 @@ Edit = Callable[[Log, random.Random], str]
 # ---------------------------------------------------------------- logs
 
 
-def cut(log: Log, start_s: float, seconds: float = SECONDS) -> Log:
-    """Keep a part of a log, by the boot clock; of the IMU every second sample."""
+def cut_log(log: Log, start_s: float, seconds: float = SECONDS) -> Log:
+    """Keep a time interval of a log, and every second sample of a fast IMU."""
     first = min(
         int(one.fields["timestamp"][0]) for one in log.topics if one.name == "sensor_combined"
     )
@@ -97,7 +96,7 @@ def cut(log: Log, start_s: float, seconds: float = SECONDS) -> Log:
 
 @cache
 def bases() -> dict[str, Log]:
-    """Parts of flights on UWB, on vision, and on GNSS."""
+    """Return parts of flights with UWB, vision and GNSS."""
     samples = REPOSITORY / "sample_logs"
     with tempfile.TemporaryDirectory() as folder:
         outdoor = Path(folder, "outdoor.ulg")
@@ -106,9 +105,9 @@ def bases() -> dict[str, Log]:
         )
         assert done.exit_code == 0, done.output
         return {
-            "UWB": cut(load(samples / "aisle_uwb.ulg"), 60.0),
-            "vision": cut(load(samples / "loop_vio.ulg"), 40.0),
-            "GNSS": cut(load(outdoor), 30.0),
+            "UWB": cut_log(load(samples / "aisle_uwb.ulg"), 60.0),
+            "vision": cut_log(load(samples / "loop_vio.ulg"), 40.0),
+            "GNSS": cut_log(load(outdoor), 30.0),
         }
 
 
@@ -122,7 +121,7 @@ def without_topic(log: Log, rng: random.Random) -> str:
 
 
 def permuted(log: Log, rng: random.Random) -> str:
-    """Number the instances of a topic anew: another one first, or one twice."""
+    """Change the instance number of a topic and add a copy as another instance."""
     at = rng.randrange(len(log.topics))
     one, number = log.topics[at], rng.choice((0, 1, 3))
     log.topics[at] = replace(one, instance=rng.choice((1, 2)))
@@ -178,7 +177,7 @@ def changed_times(log: Log, rng: random.Random) -> str:
 
 
 def changed_parameters(log: Log, rng: random.Random) -> str:
-    """Take a parameter away, or set it to a value out of its range, or to an end of it."""
+    """Remove a parameter, or set it out of range or to a limit of its range."""
     name = rng.choice(sorted({*log.parameters} | {*RANGES}))
     value: float | None = rng.choice(
         (None, np.nan, np.inf, -1.0, 0.0, 1e30, -1e30, 1e6, 1e-30, "low", "high")
@@ -194,7 +193,7 @@ def changed_parameters(log: Log, rng: random.Random) -> str:
 
 
 def changed_rate(log: Log, rng: random.Random) -> str:
-    """Log a topic at another rate, from 0.1 Hz to 1 kHz, by its nearest samples."""
+    """Resample a topic at another rate, from 0.1 Hz to 1 kHz, without interpolation."""
     at, rate = rng.randrange(len(log.topics)), rng.choice((0.1, 0.5, 2.0, 1000.0))
     one = log.topics[at]
     stamp = one.fields["timestamp"].astype(np.float64)
@@ -210,7 +209,7 @@ def changed_rate(log: Log, rng: random.Random) -> str:
 
 
 def sparse_flight(log: Log, rng: random.Random) -> str:
-    """Ten seconds of flight at the start of an hour: late samples of one topic only."""
+    """Move the last sample of one topic one hour later."""
     one = rng.choice(log.topics)
     for name in [n for n in one.fields if n.startswith("timestamp")]:
         one.fields[name][-1] += np.uint64(3_600_000_000)
@@ -226,25 +225,25 @@ KINDS: dict[str, Edit] = {
     "rate": changed_rate,
     "flight in an hour": sparse_flight,
 }
-# A field has the most ways to be wrong
+# Relative frequency of KINDS; fields have the most possible faults
 WEIGHTS = (2, 1, 8, 3, 2, 1, 0.5)
 
 
-def a_ulog(rng: random.Random) -> tuple[str, str, bytes]:
-    """Make a log: kind of change, what was changed, bytes."""
+def make_changed_ulog(rng: random.Random) -> tuple[str, str, bytes]:
+    """Make a changed ULog; return kind of change, description and bytes."""
     of = rng.choice([*bases()])
     kind = rng.choices([*KINDS], WEIGHTS)[0]
     log = copy.deepcopy(bases()[of])
     for one in log.topics:
         assert isinstance(one, Topic)
-    said = KINDS[kind](log, rng)
+    faults_found = KINDS[kind](log, rng)
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return f"ULog, {kind}", f"{of}: {said}", log.encode()
+        return f"ULog, {kind}", f"{of}: {faults_found}", log.encode()
 
 
-def a_tlog(rng: random.Random) -> tuple[str, str, bytes]:
-    """Make a recording: a message left out, a field or its time changed, a rate."""
+def make_changed_tlog(rng: random.Random) -> tuple[str, str, bytes]:
+    """Make a changed MAVLink recording; return kind of change, description and bytes."""
     recorder = mavlink_tools.Aisle(seconds=20.0, seed=rng.randrange(5)).record()
     recorder.hear(mavlink_tools.unix(60.0), mavlink_tools.AUTOPILOT, mavlink_tools.message(
         "PARAM_VALUE", param_type=9, param_id=rng.choice(sorted(RANGES)).encode(),
@@ -273,7 +272,7 @@ def a_tlog(rng: random.Random) -> tuple[str, str, bytes]:
             old = getattr(made, choice)
             new = [value] * len(old) if isinstance(old, list | tuple) else value
             setattr(made, choice, new)
-            with contextlib.suppress(Exception):  # the field's type has no such value
+            with contextlib.suppress(Exception):  # the type of the field cannot have this value
                 mavlink_tools.frame(made)
                 recorder.sent[at] = received, sender, made, link
     return f"tlog, {kind}", f"{name} {detail}", recorder.tlog()
@@ -283,7 +282,7 @@ def a_tlog(rng: random.Random) -> tuple[str, str, bytes]:
 
 
 def impossible(value: Any, path: str = "") -> Iterator[str]:
-    """Name each number of plain results that cannot be."""
+    """Yield a description of each impossible number in results."""
     if isinstance(value, dict):
         for name, part in value.items():
             yield from impossible(part, f"{path}.{name}")
@@ -291,7 +290,7 @@ def impossible(value: Any, path: str = "") -> Iterator[str]:
         for part in value:
             yield from impossible(part, path)
     elif isinstance(value, str):
-        yield from (f"{path}: {said}" for said in impossible_words(value))
+        yield from (f"{path}: {faults_found}" for faults_found in impossible_text(value))
     elif isinstance(value, float | int) and not isinstance(value, bool):
         name = path.rpartition(".")[2]
         if not math.isfinite(value):
@@ -308,8 +307,8 @@ def impossible(value: Any, path: str = "") -> Iterator[str]:
             yield f"{path} {value} is no ratio"
 
 
-def impossible_words(text: str) -> Iterator[str]:
-    """Name what a text states that cannot be: no number, an impossible percentage."""
+def impossible_text(text: str) -> Iterator[str]:
+    """Yield a description of each NaN, None or impossible percentage in a text."""
     for found in re.finditer(r"(?<![\w-])(nan|[+-]?inf|NaN|None|NaT)(?![\w-])", text):
         yield f"says {found[0]}: {text[max(found.start() - 60, 0) : found.end() + 20]!r}"
     for found in re.finditer(r"(?<![\d.,])([-−]?\d[\d.]*(?:e[+-]?\d+)?) ?%", text):
@@ -320,18 +319,18 @@ def impossible_words(text: str) -> Iterator[str]:
 
 @dataclass
 class Outcome:
-    """Results of the logs of one kind."""
+    """Results of the logs with one kind of change."""
 
     logs: int = 0
     results: int = 0
-    refused: int = 0
+    rejected: int = 0
     faults: list[str] = field(default_factory=list)
 
 
 def run_command(
     command: tuple[str, ...], log: Path, out: Path, outcome: Outcome, label: str
 ) -> None:
-    """Run one command on a log, and count its outcome."""
+    """Run one command on a log and count its outcome."""
     words = [word.format(log=log, out=out) for word in command]
     where = f"{label}: {command[0]}"
     begin = time.process_time()
@@ -341,7 +340,7 @@ def run_command(
     took = time.process_time() - begin
     faults = outcome.faults
     if isinstance(done.exception, Px4FuseError):
-        outcome.refused += 1
+        outcome.rejected += 1
         if "\n" in str(done.exception):
             faults.append(f"{where}: more than one line: {done.exception!r}")
     elif done.exception is not None and not isinstance(done.exception, SystemExit):
@@ -351,29 +350,29 @@ def run_command(
         place = f"{Path(at.filename).name}:{at.lineno} {at.name}"
         faults.append(f"{where}: {name}: {str(done.exception)[:120]} ({place})")
     elif done.exit_code == 2:
-        outcome.refused += 1
+        outcome.rejected += 1
         lines = done.output.strip().splitlines()
         if len(lines) != 1 and not (lines and lines[0].startswith("Usage")):
             faults.append(f"{where}: {len(lines)} lines: {done.output[-200:]!r}")
     else:
         outcome.results += 1
     written = [*out.rglob("*.json")]
-    said = [*impossible_words(f"{done.output}\n{done.exception or ''}")]
+    faults_found = [*impossible_text(f"{done.output}\n{done.exception or ''}")]
     for path in written:
-        said += impossible(json.loads(path.read_text()))
-    faults += [f"{where}: {one}" for one in said[:3]]
+        faults_found += impossible(json.loads(path.read_text()))
+    faults += [f"{where}: {one}" for one in faults_found[:3]]
     if took > SLOW_S:
         faults.append(f"{where}: took {took:.0f} s of CPU")
 
 
-def tried(
+def run_logs(
     count: int,
     seed: int,
     seconds: float = float("inf"),
     first: int = 0,
     commands: int = len(COMMANDS),
 ) -> dict[str, Outcome]:
-    """Outcomes by kind of change; the same for the same seed."""
+    """Return outcomes by kind of change; the same seed gives the same logs."""
     outcomes: dict[str, Outcome] = {}
     end = time.monotonic() + seconds
     for number in range(first, first + count):
@@ -381,7 +380,7 @@ def tried(
             break
         rng = random.Random(f"{seed} {number}")
         tlog = rng.random() < 0.2
-        kind, detail, content = (a_tlog if tlog else a_ulog)(rng)
+        kind, detail, content = (make_changed_tlog if tlog else make_changed_ulog)(rng)
         outcome = outcomes.setdefault(kind, Outcome())
         outcome.logs += 1
         with tempfile.TemporaryDirectory() as folder:
@@ -395,7 +394,7 @@ def tried(
 
 
 def main() -> None:
-    """Try, and print a table."""
+    """Run the study and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
@@ -403,15 +402,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--commands", type=int, default=len(COMMANDS), help="drawn for each log")
     given = parser.parse_args()
-    outcomes = tried(given.count, given.seed, given.seconds, given.first, given.commands)
+    outcomes = run_logs(given.count, given.seed, given.seconds, given.first, given.commands)
     print(f"{'change':30}{'logs':>8}{'results':>10}{'one line':>10}{'faults':>10}")
     for kind, one in sorted(outcomes.items()):
-        numbers = (one.results, one.refused, len(one.faults))
+        numbers = (one.results, one.rejected, len(one.faults))
         print(f"{kind:30}{one.logs:8}{''.join(f'{n:10}' for n in numbers)}")
-    faults = [said for one in outcomes.values() for said in one.faults]
-    kinds = Counter(re.sub(r"^.*?\): ", "", said) for said in faults)
+    faults = [fault for one in outcomes.values() for fault in one.faults]
+    kinds = Counter(re.sub(r"^.*?\): ", "", fault) for fault in faults)
     for kind, times in kinds.most_common(60):
-        print(f"{times} times, first {next(said for said in faults if kind in said)}")
+        print(f"{times} times, first {next(fault for fault in faults if kind in fault)}")
 
 
 if __name__ == "__main__":
