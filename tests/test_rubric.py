@@ -70,7 +70,7 @@ BAD = {
     "too many": (NOTES * 101, "length <= 100"),
     "others' log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
     "too large": ("#" * 1_000_001, "more than the limit"),
-    "no text": (b"\xff\xfe\x00", "not a text file"),
+    "no text": (b"\xff\xfe\x00", "not a UTF-8 text file"),
 }
 
 
