@@ -254,7 +254,7 @@ def test_compare_without_position_evaluates_aids(tmp_path: Path) -> None:
     found = read_results(report.with_suffix(".json").read_bytes())
     assert found.log.sha256 in PdfReader(report).pages[-1].extract_text().replace("\n", "")
     refused = run("verify", report, log).exception
-    assert "aids of EKF2" in str(refused)
+    assert "contains only EKF2 aids, no KF results" in str(refused)
 
 
 def test_compare_without_flight_raises_missing_data(tmp_path: Path) -> None:

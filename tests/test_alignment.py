@@ -401,7 +401,7 @@ def test_files_that_cannot_be_of_the_flight_are_refused(flight: Flight) -> None:
         align_position_file(
             flight, replace(file, samples=file.samples.set_axis(pd.Index(stamps))), frame="enu"
         )
-    with pytest.raises(MissingDataError, match="9 positions are too few"):
+    with pytest.raises(MissingDataError, match="contains 9 positions; at least 10 are needed"):
         align_position_file(flight, replace(file, samples=file.samples.iloc[:9]))
 
 

@@ -55,7 +55,7 @@ def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a" * 30_000, "more than the limit"),
+        ("a" * 30_000, "the file has 0.03 MB; the limit is 0.02 MB"),
         ("a." * 400 + "b = 1", "a line has more than 500"),
         ("x = " + "[" * 450, "Correct the form"),
         ("log_sha256 = 'x'", "Correct the form"),
@@ -124,7 +124,7 @@ def test_the_way_of_a_form(tmp_path: Path, sample_log: Path) -> None:
     """``answers`` writes it, ``compare`` reads it into page and results."""
     form, report = tmp_path / "f.toml", tmp_path / "r.pdf"
     done("answers", sample_log, "-o", form)
-    assert "exists already" in refused("answers", sample_log, "-o", form)
+    assert "f.toml exists and was not overwritten" in refused("answers", sample_log, "-o", form)
     text = form.read_text(encoding="utf-8").replace('kind = ""', 'kind = "none"')
     form.write_text(text, encoding="utf-8")
     done("compare", sample_log, "--answers", form, "-o", report)

@@ -350,9 +350,9 @@ class TestCommand:
         before = files(at)
         shown = done("simulate", *given, "--preview").output
         assert files(at) == before
-        assert "Nothing was written" in shown
+        assert "nothing was written" in shown
         done("simulate", *given)
-        assert "0 written, 2 were there already" in done("simulate", *given).output
+        assert "0 written, 2 existed already" in done("simulate", *given).output
         assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
         key = read_key(at / "f_answers.json")
         lines = shown.splitlines()
@@ -364,7 +364,7 @@ class TestCommand:
         # the key's secret serves where none is given
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = done("simulate", *given).output
-        assert "kept in the answers" in kept
+        assert "stored in the answers" in kept
         assert read_key(at / "g_answers.json").secret not in kept
         again = done("simulate", *given, "--preview").output
         for answer in read_key(at / "g_answers.json").answers:

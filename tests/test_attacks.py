@@ -187,7 +187,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
         "numbers differ", "",
     ),
     "another version": (
-        put("0.1.1", "provenance", "px4fuse"), "cannot verify", "Run it with px4fuse 0.1.1.",
+        put("0.1.1", "provenance", "px4fuse"), "cannot verify", "Verify it with px4fuse 0.1.1.",
     ),
     "another schema": (
         put("9.9", "schema", "version"), "cannot verify", "Run it with the px4fuse",

@@ -74,7 +74,7 @@ def read_and_make_axes(path: Path) -> Flight | None:
     [
         (b"", "empty"),
         *(
-            (content, "not a")
+            (content, "neither a PX4 ULog nor a MAVLink recording")
             for content in (
                 b"\0", b"ULog", ULOG_MAGIC[:-1], b"%PDF-1.4 and so on", b"\xa3\x95\x80DataFlash",
                 "a text file, naïve\n".encode(), bytes(4096),

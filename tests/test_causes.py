@@ -8,7 +8,7 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.findings import NAMES, Finding, causes
 from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, group_by_cause
-from px4fuse.report.words import verdict_notes
+from px4fuse.report.words import format_verdict, verdict_notes
 
 
 def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
@@ -74,6 +74,8 @@ def test_group_by_cause_lists_consequences_after_cause(given: Any, told: Any) ->
 def test_verdict_notes_small_factor_and_not_white_are_listed(sample: Analysis) -> None:
     small, white = verdict_notes(sample)
     assert "KF aisle (1.09×)" in small
+    verdict = format_verdict(sample.axes["aisle"].filters["kf"])
+    assert verdict == "underconfident, σ 1.09× too large"
     assert "ours down p < 0.001" in white
 
 

@@ -235,7 +235,7 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
             "1 cannot have more than 20 points of 'total'",
         )),
         (("1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,"), (15.0, 3.0), (
-            "1 has 'A' from another row already", "01 has 'total' from another row already",
+            "1 has two rows for 'A'", "01 has two rows for 'total'",
         )),
     ], ids=["more points than there are", "a second row on the same"],
 )  # fmt: skip

@@ -160,7 +160,7 @@ def test_alignments_without_motion_are_refused() -> None:
         with pytest.raises(TrajectoryError, match=r"yaw cannot be estimated.*`alignment` none"):
             fit_alignment(x, y, "yaw")
     for x, y in ((np.ones((9, 3)), up[:9]), (still, still[::-1].copy() + up)):
-        with pytest.raises(TrajectoryError, match="sim3 cannot be found"):
+        with pytest.raises(TrajectoryError, match="sim3 cannot be estimated"):
             fit_alignment(x, y, "sim3")
     with pytest.raises(TrajectoryError, match="Only 2 poses"):
         fit_alignment(up[:2], up[:2], "none")
@@ -384,7 +384,7 @@ def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
     for said, estimate, reference, how in (
         ("motions match best with +0.120 s added", late, flown, {}),
         ("is ground truth and log:vio is not", truth, vio, {}),
-        ("one pose in 0.4 s", vio, slam[np.arange(0, len(truth), 8)], {"max_gap_s": 1.0}),
+        ("a pose every 0.4 s", vio, slam[np.arange(0, len(truth), 8)], {"max_gap_s": 1.0}),
         ("Only 33%", vio, truth[:400], {}),
         ("covers only 33%", vio[:400], truth, {}),
         ("0.667 times it would fit best", large, truth, {"alignment": "se3"}),

@@ -66,7 +66,11 @@ def test_parse_g2o_without_vertices_initialises_poses() -> None:
 
 
 EDGE = f"EDGE_SE2 0 1 1 0 0 {UNIT_2}"
-NOT_READ, NO_TABLE, NO_VERTEX = "lines are not supported", "columns of numbers", "the vertex number"
+NOT_READ, NO_TABLE, NO_VERTEX = (
+    "lines are not supported",
+    "columns of numbers",
+    "the vertex number is not an integer of at",
+)
 INVALID_TEXTS = {
     "no edges": ("VERTEX_SE2 0 0 0 0\n", "no edges"),
     "empty": ("", "no edges"),
@@ -100,8 +104,8 @@ INVALID_TEXTS = {
     ),
     "too small": (PLANE.replace(UNIT_2, "1e-51 0 0 1 0 1"), "line 3: the information matrix has"),
     "smallest": (PLANE.replace(UNIT_2, "1 0 0 5e-324 0 1"), "line 3: the information matrix has"),
-    "far vertex": (PLANE.replace("1 1 0 0\n", "1 1e30 0 0\n"), "line 2: a value is above 1e+09"),
-    "far edge": (SPACE.replace("QUAT 0 1 1", "QUAT 0 1 -1e9"), "line 3: a value is above 1e+09"),
+    "far vertex": (PLANE.replace("1 1 0 0\n", "1 1e30 0 0\n"), "line 2: a value is outside ±1e+09"),
+    "far edge": (SPACE.replace("QUAT 0 1 1", "QUAT 0 1 -1e9"), "line 3: a value is outside ±1e+09"),
     "too large": (PLANE.replace(UNIT_2, "1 0 0 1 0 1e51"), "line 3: the information matrix has an"),
 }
 

@@ -137,7 +137,7 @@ def test_inventory_missing_topic_disables_analyses(tmp_path, topic_, part, lost)
     inventory = inventory_of(make_log().drop(topic_), tmp_path)
     assert topic_ in source(inventory, part).unavailable
     assert {can.name for can in inventory.abilities if not can.possible} - {"error"} == lost
-    assert all(f"no topic {topic_}" in ability(inventory, name).reason for name in lost)
+    assert all(f"{topic_} is not logged" in ability(inventory, name).reason for name in lost)
     assert remedies(inventory).count("Record with SDLOG_PROFILE bit 0 (default).") == 1
 
 
@@ -308,7 +308,11 @@ def test_info_shared_logs_are_described_or_refused(shared_logs, monkeypatch, cap
             choose_source(inventory.flight)
         except Px4FuseError:
             assert not ability(inventory, "compare").possible, path.name
-            remedy = "VISION_POSITION" if path.suffix == ".ulg" else "system's own file"
+            remedy = (
+                "VISION_POSITION"
+                if path.suffix == ".ulg"
+                else "position file of the positioning system"
+            )
             assert any(remedy in a.remedy for a in inventory.advice), path.name
 
 

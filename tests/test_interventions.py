@@ -85,8 +85,8 @@ def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of
     assert found.is_enough
     # the summary names the re-run of this filter
     told = story(analysis, find(analysis))[0]
-    ekf2, kf_case = told.split("; our filter")
-    assert "replayed: " in (kf_case if owner == "kf" else ekf2)
+    ekf2, kf_case = told.split("Along the aisle KF ")
+    assert "Re-run with " in (kf_case if owner == "kf" else ekf2)
 
 
 def test_kf_changes_remove_bias_from_acceleration() -> None:
@@ -103,7 +103,8 @@ def test_ekf2_changes_vibration_raises_noise_to_px4_limit() -> None:
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
     assert found.explains > 0.5
-    assert "since EKF2_ACC_NOISE is 0.35 instead of 1 m/s²" in story(analysis, find(analysis))[0]
+    told = "Re-run with EKF2_ACC_NOISE 1 m/s² instead of 0.35 m/s²: mean NIS "
+    assert told in story(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
 
 
@@ -115,8 +116,9 @@ def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
     again, before = cause(analysis, "ekf2", "nees"), cause(bare, "ekf2", "nees")
     assert again.change == pytest.approx(before.change, abs=0.01)
     assert again.after == pytest.approx(before.after, rel=0.05)
-    told = f"EKF2 was .* since the stamps are {offset_s:.2g} s early"
-    assert re.search(told, story(analysis, find(analysis))[0])
+    told = f"EKF2 has .* Re-run with timestamps corrected \\({offset_s:.2g} s early\\)"
+    ekf2 = story(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
+    assert re.search(told, ekf2)
 
 
 @pytest.mark.parametrize(
@@ -167,10 +169,8 @@ def test_cause_has_difference_before_and_after() -> None:
     assert row.change == cause(kf_case, "kf").change
     assert row.explains == pytest.approx(1.0 - (row.after / row.before) ** 2)
     assert row.explains > 0.8
-    assert (
-        "Put right in our filter, that brings both from 24 cm to"
-        in story(kf_case, find(kf_case))[1]
-    )
+    reduction = "Re-run of KF with this correction: difference KF - EKF2 0.24 → "
+    assert reduction in story(kf_case, find(kf_case))[1]
     # corrected EKF2 differs from KF as much as EKF2 in the same flight without the mistake
     ekf2_case = flown("ekf2-gate=1", passes=6)
     right = compare(simulate_flight(Scenario(seed=5)), RIGHT)
@@ -178,7 +178,8 @@ def test_cause_has_difference_before_and_after() -> None:
     assert (row.before, row.after) == pytest.approx(
         (rms_difference(ekf2_case), rms_difference(right)), rel=0.1
     )
-    assert "Put right in EKF2, that brings both from" in story(ekf2_case, find(ekf2_case))[1]
+    reduction = "Re-run of EKF2 with this correction: difference KF - EKF2 "
+    assert reduction in story(ekf2_case, find(ekf2_case))[1]
 
 
 def test_outliers_are_excluded_at_shifted_timestamps() -> None:

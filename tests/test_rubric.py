@@ -69,8 +69,8 @@ BAD = {
     "two alike": (NOTES + NOTES, "the title 'T' is used by another item"),
     "too many": (NOTES * 101, "length <= 100"),
     "others' log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
-    "too large": ("#" * 1_000_001, "more than the limit"),
-    "no text": (b"\xff\xfe\x00", "not a text file"),
+    "too large": ("#" * 1_000_001, "the limit is"),
+    "no text": (b"\xff\xfe\x00", "not a UTF-8 text file"),
 }
 
 

@@ -233,8 +233,7 @@ def test_links_do_not_lead_out_of_the_folder(tmp_path):
     found, notes = find_submissions([tmp_path / "in"])
     assert [each.name for each in found] == ["a.pdf"]
     assert notes == (
-        "in: 6 links out of the folder, special files or folders that cannot be read were not "
-        "followed.",
+        "in: 6 links out of the folder, special files or unreadable folders were ignored.",
     )
 
 
@@ -344,7 +343,7 @@ def test_entries_that_are_not_read_say_why(tmp_path):
     assert "is not supported" in reason(by_name["packed.pdf"])
     assert reason(by_name["locked.pdf"]) == "locked.pdf: the zip entry is encrypted."
     assert read(by_name["same.pdf"]) == b"last"
-    assert notes[0].startswith("x.zip: 1 entries have the name of another one")
+    assert notes[0].startswith("x.zip: 1 entries have duplicate names")
     by_name["same.pdf"].file.unlink()
     assert reason(by_name["same.pdf"]).endswith("(No such file or directory).")
 

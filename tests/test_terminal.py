@@ -220,7 +220,7 @@ def test_default_report_of_other_log_or_student_is_kept(made) -> None:
     before = Path("reports/aisle_uwb.pdf").read_bytes()
     other = replace(made, log=replace(made.log, sha256="0" * 64))
     for results_, student in ((other, "Ana"), (made, "Ben"), (made, "")):
-        with pytest.raises(OutputError, match=r"aisle_uwb\.pdf: exists .* Name the report with -o"):
+        with pytest.raises(OutputError, match=r"aisle_uwb\.pdf exists .* Choose another name with -o"):
             reported(results_, student=student)
     assert Path("reports/aisle_uwb.pdf").read_bytes() == before
 
@@ -230,7 +230,7 @@ def test_default_name_of_another_file_is_refused(made, name) -> None:
     mine = Path("reports") / name
     mine.parent.mkdir()
     mine.write_text("mine")
-    with pytest.raises(OutputError, match=f"{name}: exists and is not a report"):
+    with pytest.raises(OutputError, match=f"{name} exists and is not a report"):
         reported(made)
     assert mine.read_text() == "mine"
 
@@ -241,7 +241,7 @@ def test_same_name_in_two_folders_keeps_first_report(desk, sample_log) -> None:
     shutil.copy(sample_log, desk / "b" / "l.ulg")
     done("compare", "l.ulg")
     before = Path("reports/l.pdf").read_bytes()
-    assert "Name the report with -o" in refused("compare", "b/l.ulg")
+    assert "Choose another name with -o" in refused("compare", "b/l.ulg")
     assert Path("reports/l.pdf").read_bytes() == before
     done("compare", "l.ulg")
 

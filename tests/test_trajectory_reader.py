@@ -220,7 +220,7 @@ def test_read_trajectory_invalid_file_is_rejected(case: str, tmp_path: Path) -> 
 
 def test_read_trajectory_too_large_file_is_rejected(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(reader, "MAX_FILE_BYTES", 10)
-    with pytest.raises(TrajectoryError, match="more than the limit"):
+    with pytest.raises(TrajectoryError, match="the limit is"):
         read_trajectory(write(tmp_path, text(rows())))
 
 

@@ -373,4 +373,4 @@ def test_write_pipe_without_reader_ends_after_timeout(
     os.mkfifo(tmp_path / "pipe")
     pipe = tmp_path / "pipe"
     assert "the pipe has no reader" in refused("info", sample_log, "--json", pipe)
-    assert "no regular file, and no folder" in refused("grade", pipe, "-o", tmp_path / "out")
+    assert "is not a file or folder" in refused("grade", pipe, "-o", tmp_path / "out")

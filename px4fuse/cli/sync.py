@@ -39,7 +39,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
         remedy = (
             clock_result.remedy
             if isinstance(clock_result, Unavailable)
-            else advice["Next"].capitalize()
+            else advice["Action"]
         )
         raise MissingDataError(
             f"{name}: the time offset cannot be estimated from this flight: {clock_result.reason}",

@@ -163,13 +163,13 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
     vertex_count, count = _TAGS[tag]
     words, numbers = rows.parse(1 + vertex_count, count)
     is_no_number = np.array([_VERTEX.fullmatch(word) is None for word in words[:, 1:].flat])
-    what = "the vertex number is not an integer"
+    what = "the vertex number is not an integer of at most 18 digits"
     rows.raise_where(is_no_number.reshape(-1, vertex_count), what, "Give an integer.")
     remedy = "Correct or remove the line."
     rows.raise_where(~np.isfinite(numbers), "a number is not finite", remedy)
     # The first three numbers are the position (m) or, in SE2, x, y (m) and the angle (rad)
     far = np.abs(numbers[:, :3]) >= MAX_VALUE
-    rows.raise_where(far, f"a value is above {MAX_VALUE:.0e}", remedy)
+    rows.raise_where(far, f"a value is outside ±{MAX_VALUE:.0e}", remedy)
     return words[:, 1:].astype(np.int64), numbers
 
 

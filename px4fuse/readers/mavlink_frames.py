@@ -179,7 +179,7 @@ def read_frames(name: str, content: bytes) -> Frames:
     good_bytes = int(np.sum(end - start))
     if good_bytes < MIN_GOOD_SHARE * len(content) or not len(start):
         raise LogError(
-            f"{name} is neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
+            f"{name}: neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
             f"with a valid checksum in {len(content)} bytes).",
             "Give the .ulg from the vehicle, or a .tlog or raw MAVLink stream.",
         )

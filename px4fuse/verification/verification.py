@@ -36,7 +36,9 @@ FOREIGN_REQUEST = "the recorded command was not written by px4fuse"
 # s; ten minutes of flight have 60,000 such steps, which take half a minute
 MIN_DT_S = 0.01
 ORIGINAL = "Ask for the PDF that px4fuse wrote."
-LIMIT = "verification confirms that the numbers follow from the log, not the author"
+LIMIT = (
+    "Verification confirms that the numbers follow from the log. It does not confirm the author."
+)
 NO_LOG = "no log was given, so no number could be re-computed"
 # Tolerance between processors: sums over a flight differ in the last few of 16 digits, differences
 # of such sums in the last 8. Four kernels of OpenBLAS differ by at most 3e-8 (six flights)
