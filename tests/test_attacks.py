@@ -190,7 +190,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
         put("0.1.1", "provenance", "px4fuse"), "cannot verify", "Verify it with px4fuse 0.1.1.",
     ),
     "another schema": (
-        put("9.9", "schema", "version"), "cannot verify", "Run it with the px4fuse",
+        put("9.9", "schema", "version"), "cannot verify", "use the px4fuse version that wrote it",
     ),
     "libraries left out": (put({}, "provenance", "libraries"), "cannot verify", "Ask how"),
     "an unknown log": (put("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),

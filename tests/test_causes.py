@@ -76,7 +76,8 @@ def test_verdict_notes_small_factor_and_not_white_are_listed(sample: Analysis) -
     assert "KF aisle (1.09×)" in small
     verdict = format_verdict(sample.axes["aisle"].filters["kf"])
     assert verdict == "underconfident, σ 1.09× too large"
-    assert "ours down p < 0.001" in white
+    assert "Ljung-Box test, p < 0.001" in white
+    assert "KF down, lag-1 autocorrelation" in white
 
 
 def test_verdict_notes_consistent_white_axis_is_empty(sample: Analysis) -> None:

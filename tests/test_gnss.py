@@ -106,7 +106,7 @@ def test_read_gnss_fixes_have_ekf2_position_and_time(generation, tmp_path):
     exact_m = 0.012 if generation in ("v1.9", "v1.12") else 1e-4  # m, resolution of 1e-7 degrees
     measured = track.samples[Columns.POSITION].to_numpy()
     np.testing.assert_allclose(measured, position(times), atol=exact_m)
-    assert track.clock == "autopilot boot clock, less 110 ms (EKF2_GPS_DELAY)"
+    assert track.clock == "autopilot boot clock minus 110 ms (EKF2_GPS_DELAY)"
     # EKF2 uses eph for each axis
     np.testing.assert_allclose(track.samples["east_m2"], 0.16, rtol=1e-6)
     np.testing.assert_allclose(track.samples["down_m2"], 0.49, rtol=1e-6)
@@ -254,7 +254,7 @@ def test_prepare_down_unfused_barometer_needs_option(tmp_path):
     requested = prepare(flight, axes=("down",), height="barometer")
     assert requested.source.barometer is not None
     bare = flight_of(outdoors(), tmp_path)
-    with pytest.raises(MissingDataError, match="no height by a barometer"):
+    with pytest.raises(MissingDataError, match="no barometer height in the log"):
         prepare(bare, height="barometer")
     vision = simulate_flight(make_scenario("aisle", seed=1))
     with pytest.raises(SettingsError, match="`height` is for GNSS"):

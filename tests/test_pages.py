@@ -800,5 +800,5 @@ def test_intake_aes_encrypted_report_is_called_encrypted() -> None:
                          StmF=name("StdCF"), StrF=name("StdCF"), **keys)  # fmt: skip
     writer._encrypt_entry.update(entries)  # type: ignore[union-attr]
     made = saved(writer)
-    with pytest.raises(ResultsError, match=r"r\.pdf: encrypted\. Hand in"):
+    with pytest.raises(ResultsError, match=r"r\.pdf: the PDF is encrypted\. Hand in"):
         read_report(made, "r.pdf")

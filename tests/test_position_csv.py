@@ -470,7 +470,7 @@ def test_read_position_csv_unreadable_file_raises_log_error(read, content, words
 
 def test_read_position_csv_too_large_file_is_rejected(read, monkeypatch):
     monkeypatch.setattr(position_csv, "MAX_FILE_BYTES", 1000)
-    assert "more than the limit" in refused(read, table(PLAIN))
+    assert "MB; the limit is" in refused(read, table(PLAIN))
 
 
 # -- any bytes -------------------------------------------------------------------------------------

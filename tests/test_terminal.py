@@ -220,7 +220,9 @@ def test_default_report_of_other_log_or_student_is_kept(made) -> None:
     before = Path("reports/aisle_uwb.pdf").read_bytes()
     other = replace(made, log=replace(made.log, sha256="0" * 64))
     for results_, student in ((other, "Ana"), (made, "Ben"), (made, "")):
-        with pytest.raises(OutputError, match=r"aisle_uwb\.pdf exists .* Choose another name with -o"):
+        with pytest.raises(
+            OutputError, match=r"aisle_uwb\.pdf exists .* Choose another name with -o"
+        ):
             reported(results_, student=student)
     assert Path("reports/aisle_uwb.pdf").read_bytes() == before
 
