@@ -73,11 +73,12 @@ def read_and_make_axes(path: Path) -> Flight | None:
     ("content", "words"),
     [
         (b"", "empty"),
+        (b"%PDF-1.4 and so on", "a PDF, not a flight log"),
+        (b"\xa3\x95\x80DataFlash", "an ArduPilot DataFlash log, not a PX4 ULog"),
         *(
             (content, "neither a PX4 ULog nor a MAVLink recording")
             for content in (
-                b"\0", b"ULog", ULOG_MAGIC[:-1], b"%PDF-1.4 and so on", b"\xa3\x95\x80DataFlash",
-                "a text file, naïve\n".encode(), bytes(4096),
+                b"\0", b"ULog", ULOG_MAGIC[:-1], "a text file, naïve\n".encode(), bytes(4096),
             )
         ),
         *(

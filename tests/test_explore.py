@@ -347,7 +347,7 @@ def test_explore_without_log_uses_sample_flight(
     here.mkdir()
     (here / sample_log.name).write_bytes(sample_log.read_bytes())
     output = done("explore", "--start", "20", "--end", "40").stderr
-    assert "No log was given: this is the sample flight, aisle_uwb.ulg." in output
+    assert "No log was given: the sample log aisle_uwb.ulg is used." in output
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
 
 

@@ -257,7 +257,7 @@ def test_prepare_down_unfused_barometer_needs_option(tmp_path):
     with pytest.raises(MissingDataError, match="no barometer height in the log"):
         prepare(bare, height="barometer")
     vision = simulate_flight(make_scenario("aisle", seed=1))
-    with pytest.raises(SettingsError, match="`height` is for GNSS"):
+    with pytest.raises(SettingsError, match="`height` needs a GNSS position"):
         prepare(vision, height="gnss")
 
 

@@ -36,11 +36,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     advice = clock_advice(compared, clock_result)
     if isinstance(clock_result, Unavailable) or not clock_result.determinable:
         name = compared.flight.log.name
-        remedy = (
-            clock_result.remedy
-            if isinstance(clock_result, Unavailable)
-            else advice["Action"]
-        )
+        remedy = clock_result.remedy if isinstance(clock_result, Unavailable) else advice["Action"]
         raise MissingDataError(
             f"{name}: the time offset cannot be estimated from this flight: {clock_result.reason}",
             remedy,
