@@ -390,7 +390,7 @@ def test_a_changed_page(aisle: Base, page: int, name: str) -> None:
 
 
 DOCUMENT: dict[str, tuple[Forge, str, str]] = {
-    "a page away": (lambda w: w.remove_page(7), "page differs", "page 8: it is missing"),
+    "a page away": (lambda w: w.remove_page(7), "page differs", "page 8: missing"),
     "another title": (titled(Title="my report"), "page differs", "document: /Title is"),
     "a form": (root("/AcroForm", dictionary(Fields=array())), "cannot verify", "form fields that"),
     "an annotation": (
