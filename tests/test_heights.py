@@ -399,7 +399,7 @@ def test_what_if_results_contain_each_height_sensor(models: dict[str, Model]) ->
     assert results["replayed"]["heights"].keys() == {"baro_hgt", "gnss_hgt"}
     shown = {row[0]: row[1:] for row in rows(found)}
     assert shown["GNSS height: mean NIS"][-1] == "n/a"
-    row = next(row for label, row in shown.items() if label.startswith("height: "))
+    row = next(row for label, row in shown.items() if label.startswith("height RMSE"))
     assert row == [
         f"{results[which]['height_rmse_to_truth_m']:.3f}"
         for which in ("logged", "replayed", "whatif")
