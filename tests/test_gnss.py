@@ -389,7 +389,7 @@ def test_compare_real_gnss_flights_match_known_numbers(name, shared_logs):
     if name in FROM_INNOVATIONS:
         track = track_of(analysis.flight)
         assert "2.0" in track.notes[0]
-        count, exact_m = re.findall(r"^(\d+) positions.*to within ([\d.]+) m", track.notes[1])[0]
+        count, exact_m = re.findall(r"^(\d+) GNSS fixes.*RMS error ([\d.]+) m", track.notes[1])[0]
         assert int(count) > FROM_INNOVATIONS[name]
         assert float(exact_m) < 0.1
         assert track.rate_hz > 2.9
@@ -564,12 +564,12 @@ def test_read_gnss_missing_fixes_are_from_aid_source(tmp_path):
     for name, values in every.items():
         every[name] = values[left]
     found = track_of(flight_of(log, tmp_path))
-    assert "3 positions of GNSS" in " ".join(found.notes)
+    assert "3 GNSS fixes that were not logged are read from" in " ".join(found.notes)
     whole = whole.drop(index=whole.index[60])
     np.testing.assert_allclose(found.samples.index, whole.index, atol=1e-6)
     np.testing.assert_allclose(found.samples[Columns.POSITION], whole[Columns.POSITION], atol=0.05)
     np.testing.assert_allclose(found.velocity.loc[found.samples.index[50], "east_m_s"], 2.0)
-    assert "3 of their heights" in " ".join(found.notes)
+    assert "(3 with interpolated height" in " ".join(found.notes)
     # EKF2's observation contains heights, plus a bias if GNSS is not the reference
     for reference, bias_m, interpolated in ((1.0, 0.0, 0), (0.0, 0.3, 3)):
         log.parameters["EKF2_HGT_REF"] = reference
