@@ -578,7 +578,7 @@ def test_read_gnss_missing_fixes_are_from_aid_source(tmp_path):
             "observation": bias_m - heights_m, "innovation": np.zeros(len(heights_m)),
         }, sampled=True))  # fmt: skip
         found = track_of(flight_of(log, tmp_path))
-        assert f"{interpolated} of their heights" in " ".join(found.notes)
+        assert f"{interpolated} with interpolated height" in " ".join(found.notes)
         off_m = np.abs(found.samples["down_m"].to_numpy() - whole["down_m"].to_numpy())
         assert (off_m[[20, 50, 51]] > 1e-3).sum() == interpolated
 
