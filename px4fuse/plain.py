@@ -98,16 +98,3 @@ def format_length(metres: float) -> str:
         if metres < limit:
             return f"{metres * scale:.0f} {unit}"
     return f"{metres:.{1 if metres < 9.95 else 0}f} m"
-
-
-def format_excess(factor: float) -> str:
-    """Format by how much a quantity is too large, from its ratio (1 or more) to the right value.
-
-    >>> [format_excess(f) for f in (1.18, 1.96, 2.4, 24.3)]
-    ['18 %', '96 %', '2.4 times', '24 times']
-    """
-    return (
-        f"{factor - 1.0:.0%}".replace("%", " %")
-        if factor < 2.0
-        else (f"{format_factor(factor)} times")
-    )
