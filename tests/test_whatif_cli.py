@@ -155,7 +155,7 @@ class TestFlownFlights:
             ("gps/v1.13.3_gps_profile1", "below the rate that EKF2 fused"),
             ("real/mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3",
              "30% of the IMU samples are missing"),
-            ("real/vladimireganov_ROS_PX4_MOCAP_square2", "fewer than EKF2 may have fused"),
+            ("real/vladimireganov_ROS_PX4_MOCAP_square2", "EKF2 may have fused more samples"),
         ],
     )  # fmt: skip
     def test_replay_without_agreement_is_refused(

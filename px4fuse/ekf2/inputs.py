@@ -557,8 +557,8 @@ def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
             if interval < 0.9 * COPY_INTERVAL_S[track.name] and interval <= 0.25:
                 return track
             why.append(
-                f"{track.name} contains one sample per {interval:.2g} s, fewer than EKF2 may have "
-                "fused"
+                f"{track.name} has a sample interval of {interval:.2g} s; EKF2 may have fused "
+                "more samples"
             )
     return Unavailable(
         "EKF2 replay",

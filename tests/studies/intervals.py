@@ -21,7 +21,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.filter.clock import MAX_CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
-from px4fuse.findings.source_clock import OFFSET_S
+from px4fuse.findings.source_clock import MIN_OFFSET_S
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 
@@ -46,7 +46,7 @@ def measured(job: Job) -> tuple[float, ...] | None:
     if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
         return None
     low, high = clock.interval_s
-    false = abs(clock.offset_s) > max(clock.three_sigma_s, OFFSET_S)
+    false = abs(clock.offset_s) > max(clock.three_sigma_s, MIN_OFFSET_S)
     return (
         (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
         covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),
