@@ -101,6 +101,6 @@ def innovations(analysis: Comparison) -> Found:
             f"The log contains {logged} EKF2 innovations for {count} measurements; "
             f"{format_percent(1.0 - logged / count)} are missing. Rejections between logged "
             "samples are not visible.",
-            f"No action: no profile of PX4's logger records {topic} at a higher rate.",
+            f"Nothing to set: no profile of PX4's logger records {topic} at a higher rate.",
             {"logged": logged, "measurements": count},
         )
