@@ -36,9 +36,18 @@ HEAD, FOOT, MARGIN = 0.045, 0.965, 12
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture, the command whose report has it, the page that begins so, and how much of it.
+    """Picture of a part of a report page, or of the web page of ``explore``.
 
-    Without a page it is the picture that the command itself writes.
+    Attributes
+    ----------
+    name : str
+        File name without ``.png``.
+    command : str
+        Arguments of px4fuse.
+    page : str
+        Text that only the wanted page of the report contains; not used for ``explore``.
+    until : float
+        Lower edge of the part, as a fraction of the page height.
     """
 
     name: str
@@ -48,13 +57,17 @@ class Picture:
 
 
 PICTURES = (
-    Picture("aisle_uwb", AISLE, "Two-state Kalman filter against EKF2", 0.5),
+    Picture("aisle_uwb", AISLE, "EKF2 check: comparison with a two-state", 0.5),
     Picture("explore", "explore sample_logs/aisle_uwb.ulg"),
-    Picture("lab_1", AISLE, "The flight along the aisle", 0.585),
+    Picture("lab_1", AISLE, "Position and velocity along the aisle", 0.585),
     Picture("lab_2", f"{AISLE} --sigma-a 0.001", "Innovations and variances"),
-    Picture("lab_3", AISLE, "Why EKF2 differs", 0.71),
+    Picture("lab_3", AISLE, "Difference between KF and EKF2", 0.71),
     Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure"),
-    Picture("lab_5", "evaluate sample_logs/loop_vio.ulg:vio sample_logs/loop_slam.tum"),
+    Picture(
+        "lab_5",
+        "evaluate sample_logs/loop_vio.ulg:vio sample_logs/loop_slam.tum",
+        "Trajectory error",
+    ),
 )
 
 
@@ -65,11 +78,6 @@ def made(picture: Picture, folder: Path) -> Image.Image:
     words = shlex.split(picture.command)
     if words[0] == "explore":
         return screenshot(words, folder)
-    if not picture.page:
-        target = folder / f"{stem}.png"
-        run([*words, "-o", str(report), "--picture", str(target)])
-        with Image.open(target) as drawn:
-            return smaller(drawn)
     if not report.exists():
         run([*words, "-o", str(report)])
     with pypdfium2.PdfDocument(report) as document:
