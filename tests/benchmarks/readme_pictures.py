@@ -29,6 +29,7 @@ from browser import BROWSERS  # noqa: E402 - it stands among the tests
 WINDOW = "1360,1010"
 REPORTS = REPOSITORY / "reports" / "example"
 AISLE = "compare sample_logs/aisle_uwb.ulg"
+EVALUATE = "evaluate sample_logs/loop_vio.ulg:vio sample_logs/loop_slam.tum"
 DPI, COLOURS, MAX_BYTES = 96, 64, 100_000
 # Head and foot of a page, as shares of its height, are left out; a margin (pixels) stays
 HEAD, FOOT, MARGIN = 0.045, 0.965, 12
@@ -63,11 +64,7 @@ PICTURES = (
     Picture("lab_2", f"{AISLE} --sigma-a 0.001", "Innovations and variances"),
     Picture("lab_3", AISLE, "Difference between KF and EKF2", 0.71),
     Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure"),
-    Picture(
-        "lab_5",
-        "evaluate sample_logs/loop_vio.ulg:vio sample_logs/loop_slam.tum",
-        "Trajectory error",
-    ),
+    Picture("lab_5", EVALUATE, "Trajectory error"),
 )
 
 
