@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import pikepdf
 import pytest
 from cli_tools import done
 from conftest import REPORT, SAMPLES
@@ -684,7 +685,6 @@ def test_compare_pages_resaved_report_is_equal(pdf: bytes, kind: str) -> None:
 
 @pytest.mark.parametrize("how", ["plain", "objects", "linearize", "qdf", "normalize"])
 def test_compare_pages_qpdf_resaved_is_equal(pdf: bytes, how: str) -> None:
-    pikepdf = pytest.importorskip("pikepdf", reason="pikepdf is not installed")
     options: dict[str, dict[str, Any]] = {
         "plain": {}, "linearize": {"linearize": True}, "qdf": {"qdf": True},
         "objects": {"object_stream_mode": pikepdf.ObjectStreamMode.generate},

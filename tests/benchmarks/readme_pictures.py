@@ -2,7 +2,7 @@
 
     python tests/benchmarks/readme_pictures.py
 
-It takes a minute, needs Chromium and ``pip install pypdfium2``, and writes
+It takes a minute, needs Chromium, and writes
 ``reports/example/*.png``: the part of a page named below, on a palette, below 100 kB each.
 """
 
