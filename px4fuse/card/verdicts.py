@@ -1,0 +1,117 @@
+"""Ratios of actual to reported uncertainty, and the verdicts on them.
+
+Both ratios of a filter are of the same samples everywhere: √(mean NIS) over the innovations of the
+segment, and √(mean NEES) at the times of EKF2's published position. One definition, one band for
+each reference.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from px4fuse.arrays import Array
+from px4fuse.card.model import BANDS, FilterName, Reference, Verdict, VerdictWord
+from px4fuse.comparison.comparison import normalised_errors
+from px4fuse.comparison.model import AxisComparison, FilterSummary
+from px4fuse.filter.consistency import MIN_INNOVATIONS
+from px4fuse.flight import Unavailable
+
+# Errors are correlated over seconds, so the bootstrap draws blocks of this length (s)
+BLOCK_S = 10.0
+DRAWS = 2000
+# Blocks needed for an interval; with fewer it is far too narrow
+MIN_BLOCKS = 4
+
+
+def verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
+    """Return the four verdicts along one axis: KF and EKF2, each against source and truth."""
+    return tuple(
+        verdict
+        for owner in ("kf", "ekf2")
+        for verdict in (_against_source(result, owner), _against_truth(result, owner))
+    )
+
+
+def word_of(
+    ratio: float, against: Reference, interval: tuple[float, float] | None = None
+) -> VerdictWord:
+    """Return the verdict on a ratio: consistent inside its band, or if its interval contains 1."""
+    low, high = BANDS[against]
+    if low <= ratio <= high or (interval is not None and interval[0] <= 1.0 <= interval[1]):
+        return "consistent"
+    return "overconfident" if ratio > 1.0 else "underconfident"
+
+
+def _against_source(result: AxisComparison, owner: FilterName) -> Verdict:
+    statement = result.filters[owner]
+    if not isinstance(statement, FilterSummary):
+        return _not_evaluated(owner, "source", statement)
+    if statement.count < MIN_INNOVATIONS:
+        few = f"{statement.count} innovations, at least {MIN_INNOVATIONS} are needed"
+        return Verdict(filter=owner, against="source", word="not evaluated", reason=few)
+    # the mean NIS of a consistent filter is in the band, so its 95 % interval is mean over band
+    low, high = statement.nis_band
+    ratio = statement.nis_mean**0.5
+    interval = (statement.nis_mean / high) ** 0.5, (statement.nis_mean / low) ** 0.5
+    return Verdict(
+        filter=owner,
+        against="source",
+        ratio=ratio,
+        interval=interval,
+        word=word_of(ratio, "source", interval),
+        samples=statement.count,
+    )
+
+
+def _against_truth(result: AxisComparison, owner: FilterName) -> Verdict:
+    truth = result.filters[owner].truth
+    if isinstance(truth, Unavailable):
+        return _not_evaluated(owner, "truth", truth)
+    errors = normalised_errors(result, owner)
+    if isinstance(errors, Unavailable):
+        return _not_evaluated(owner, "truth", errors)
+    time_s, normalised = errors
+    ratio = float(np.sqrt(np.mean(np.square(normalised))))
+    interval = block_bootstrap_rms(time_s, normalised)
+    return Verdict(
+        filter=owner,
+        against="truth",
+        ratio=ratio,
+        interval=interval,
+        word=word_of(ratio, "truth", interval),
+        samples=len(normalised),
+    )
+
+
+def _not_evaluated(owner: FilterName, against: Reference, missing: Unavailable) -> Verdict:
+    return Verdict(filter=owner, against=against, word="not evaluated", reason=missing.reason)
+
+
+def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | None:
+    """Return the 95 % interval of an RMS by the moving-block bootstrap, or None if too short.
+
+    Künsch (1989), Annals of Statistics 17(3). Blocks have :data:`BLOCK_S` seconds; the seed is
+    fixed, so that a report can be made again.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (n,)
+        Increasing.
+    values : ndarray, shape (n,)
+    """
+    blocks = int((time_s[-1] - time_s[0]) / BLOCK_S) if len(time_s) > 1 else 0
+    if blocks < MIN_BLOCKS:
+        return None
+    starts = np.arange(np.searchsorted(time_s, time_s[-1] - BLOCK_S, side="right"))
+    ends = np.searchsorted(time_s, time_s[starts] + BLOCK_S)
+    sums = np.concatenate(([0.0], np.cumsum(np.square(values))))
+    drawn = np.random.default_rng(0).integers(len(starts), size=(DRAWS, blocks))
+    total = (sums[ends] - sums[starts])[drawn].sum(axis=1)
+    count = (ends - starts)[drawn].sum(axis=1)
+    low, high = np.percentile(np.sqrt(total / count), (2.5, 97.5))
+    return float(low), float(high)
+
+
+def distance_from_band(verdicts: Iterable[Verdict]) -> float:
+    """Return the sum of |ln ratio| of all evaluated verdicts; 0 for perfect filters."""
+    return sum(abs(float(np.log(each.ratio))) for each in verdicts if each.ratio is not None)

@@ -1,0 +1,313 @@
+"""Diagnosis card as text: lines of at most 100 columns, for terminals, pipes and files.
+
+Commands and the headline never wrap; other texts wrap with a hanging indent.
+"""
+
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from px4fuse.card.model import (
+    AXIS_TICKS,
+    BANDS,
+    Action,
+    AidRow,
+    Card,
+    Cause,
+    Reference,
+    Rerun,
+    Verdict,
+)
+from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
+
+WIDTH = 100
+AXIS_WIDTH = 37
+# Columns before the axis, and before the texts beside a label
+AXIS_INDENT, TEXT_INDENT = 56, 11
+# A longer command stands on a line of its own
+MAX_COMMAND_LENGTH = 74
+# Ticks that have room for a label
+LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
+MARKS = {"source": "●", "truth": "◆"}
+QUANTITIES = {"source": "source: innovation ÷ √S", "truth": "ground truth: error ÷ σ"}
+FILTER_NAMES = {"kf": "KF", "ekf2": "EKF2"}
+# Labels of a headline, and styles of rich
+SEVERITY_LABELS = {"clean": "ok", "note": "note"}
+STYLES = {"error": "bold red", "warning": "bold yellow", "note": "cyan", "clean": "bold green"}
+# Replacements for terminals whose encoding lacks a character
+ASCII = {
+    "░": ":",
+    "●": "o",
+    "◆": "x",
+    "◀": "<",
+    "▶": ">",
+    "─": "-",
+    "√": "sqrt ",
+    "σ": "sigma",
+    "→": "->",
+    "÷": "/",
+    "−": "-",
+    "–": "-",
+    "²": "2",
+    "³": "3",
+    "°": " deg",
+    "±": "+-",
+    "×": "x",
+    "ν": "nu",
+    "…": "...",
+}
+CONSOLE = "Console: MAVLink Console of QGroundControl."
+
+
+class Line(NamedTuple):
+    """Line of a card with its style of rich."""
+
+    text: str
+    style: str = ""
+
+
+def card_lines(card: Card) -> Iterator[Line]:
+    """Yield the lines of a card in their order, wrapped at :data:`WIDTH`."""
+    if card.severity == "refused":
+        yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
+        for label, text in card.facts.items():
+            yield from _labelled(label, text)
+        return
+    yield from _identity(card)
+    yield from _headline(card)
+    for cause in card.causes:
+        if cause is not card.causes[0]:
+            title = f"{cause.severity}[{cause.id}]: {cause.title}"
+            yield Line(title, STYLES[cause.severity])
+        yield from _cause(cause)
+    if card.more_causes:
+        yield Line(f"and {card.more_causes} more: -v")
+    yield from _verdict_axis(card)
+    yield from _aid_axis(card.aids)
+    for text in (card.reconcile, card.difference):
+        yield from _wrapped(text, "  ", "  ")
+    if card.notes:
+        yield Line("")
+    for note in card.notes:
+        text = " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
+        yield from _wrapped(text, "", "  ")
+
+
+def closing_lines(card: Card) -> Iterator[Line]:
+    """Yield the lines after the written files: where to read more, and what *console* means."""
+    has_console = any(action.where == "console" for action in _all_actions(card))
+    sentences = ["More: -v."] if card.severity != "refused" else []
+    sentences += [CONSOLE] if has_console else []
+    sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
+    yield from _wrapped(" ".join(sentences), "", "")
+
+
+def to_ascii(text: str) -> str:
+    """Replace the characters of :data:`ASCII`, for terminals that cannot print them.
+
+    >>> to_ascii("error ÷ σ 7.2 → 1.2")
+    'error / sigma 7.2 -> 1.2'
+    """
+    return "".join(ASCII.get(character, character) for character in text)
+
+
+def axis_text(ratio: float | None, against: Reference) -> str:
+    """Draw one ratio on the logarithmic axis with the band of consistent ratios.
+
+    >>> axis_text(0.93, "source")
+    '────────────────░●░░░────────────────'
+    >>> axis_text(128.0, "truth")
+    '───────────────░░░░░░░──────────────▶'
+    """
+    low, high = (_column(end) for end in BANDS[against])
+    characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
+    if ratio is not None:
+        column = _column(ratio)
+        inside = 0 <= column < AXIS_WIDTH
+        mark = MARKS[against] if inside else "▶" if column > 0 else "◀"
+        characters[min(max(column, 0), AXIS_WIDTH - 1)] = mark
+    return "".join(characters)
+
+
+def _column(ratio: float) -> int:
+    return round(axis_fraction(ratio) * (AXIS_WIDTH - 1))
+
+
+def _identity(card: Card) -> Iterator[Line]:
+    identity = card.identity
+    flight = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
+    student = ", ".join(filter(None, (identity.student, identity.student_id)))
+    yield Line(f"{identity.file}  {flight}{f'  {student}' if student else ''}")
+    changed = (*identity.changed, *identity.parameters)
+    if changed:
+        yield from _wrapped(f"changed: {'; '.join(changed)}", "  ", "           ")
+    yield Line("")
+
+
+def _headline(card: Card) -> Iterator[Line]:
+    label = SEVERITY_LABELS.get(card.severity, card.severity)
+    name = f"{label}[{card.id}]" if card.id else label
+    yield Line(f"{name}: {card.headline}", STYLES[card.severity])
+    yield from _labelled("effect", card.effect_text)
+    for place, text in enumerate(card.do_this):
+        yield from _labelled("" if place else "do this", text)
+
+
+def _cause(cause: Cause) -> Iterator[Line]:
+    yield from _labelled("cause", cause.why)
+    yield from _labelled("when", _format_spans(cause))
+    rows = [
+        ("EITHER " if not place else "OR ", action)
+        for place, alternative in enumerate(cause.alternatives)
+        for action in alternative
+    ]
+    rows += [("", action) for action in cause.actions]
+    labels = [f"{head}{_target(action)}" for head, action in rows]
+    width = max(map(len, labels), default=0) + 2
+    for label, (_, action) in zip(labels, rows, strict=True):
+        yield from _action(label, width, action)
+    yield from _rerun_table(cause.reruns)
+    yield from _wrapped(cause.after, "  ", "  ")
+
+
+def _target(action: Action) -> str:
+    return f"{action.target} ({action.where})" if action.where else action.target
+
+
+def _action(label: str, width: int, action: Action) -> Iterator[Line]:
+    indent = " " * (2 + width)
+    first = f"  {label:{width}}"
+    if action.sentence:
+        yield from _wrapped(action.sentence, first, indent)
+        first = indent
+    if any(len(command) > MAX_COMMAND_LENGTH for command in action.commands):
+        if first.strip():
+            yield Line(first.rstrip())
+        first = indent = "    "
+    for command in action.commands:
+        yield Line(f"{first}{command}", "bold")
+        first = indent
+
+
+def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
+    if not reruns:
+        return
+    columns = [
+        ("re-run of this log", [rerun.label for rerun in reruns]),
+        (
+            "position RMSE",
+            [_change(rerun.position_rmse_m, format_metres, " m") for rerun in reruns],
+        ),
+        ("● innovation ÷ √S", [_change(rerun.source_ratio, format_ratio) for rerun in reruns]),
+        ("◆ error ÷ σ", [_change(rerun.truth_ratio, format_ratio) for rerun in reruns]),
+        ("rejected", [_change(rerun.rejected_fraction, _percent, " %") for rerun in reruns]),
+        ("improves", [rerun.improves for rerun in reruns]),
+    ]
+    columns = [(head, cells) for head, cells in columns if any(cells)]
+    widths = [max(map(len, (head, *cells))) for head, cells in columns]
+    for row in zip(*([head, *cells] for head, cells in columns), strict=True):
+        cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
+        yield Line(f"  {'  '.join(cells)}".rstrip())
+    starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
+    if starts:
+        yield Line(f"  EKF2 (replay): predicted from this log, from {min(starts):.0f} s on.")
+
+
+def _change(
+    pair: tuple[float, float] | None, format_value: Callable[[float], str], unit: str = ""
+) -> str:
+    return "" if pair is None else f"{format_value(pair[0])} → {format_value(pair[1])}{unit}"
+
+
+def _percent(fraction: float) -> str:
+    return f"{100.0 * fraction:.0f}"
+
+
+def _verdict_axis(card: Card) -> Iterator[Line]:
+    if not card.verdicts:
+        return
+    along = "" if card.effect is None else f", {card.effect.axis}"
+    yield Line("")
+    heading = "Reported uncertainty: RMS of actual ÷ reported over all samples"
+    yield from _wrapped(f"{heading}{along}", "", "  ")
+    limits = ", ".join(f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in BANDS.items())
+    legend = f"  ░ consistent ({limits})"
+    sides = f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
+    yield Line(f"{'':{AXIS_INDENT}}{sides}")
+    yield Line(f"{legend:{AXIS_INDENT}}{_ticks()}")
+    for verdict in card.verdicts:
+        yield _verdict_line(verdict)
+
+
+def _verdict_line(verdict: Verdict) -> Line:
+    owner = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
+    quantity = f"{MARKS[verdict.against]} {QUANTITIES[verdict.against]}"
+    head = f"  {owner:4} {quantity:25}"
+    if verdict.ratio is None:
+        return Line(f"{head}{'–':>7}  not evaluated: {verdict.reason}")
+    word = f"{verdict.word}{' (explained)' if verdict.is_explained else ''}"
+    text = f"{head}{format_ratio(verdict.ratio):>7}  {word}"
+    is_loud = verdict.word != "consistent" and not verdict.is_explained
+    style = "bold" if is_loud else ""
+    return Line(f"{text:{AXIS_INDENT}}{axis_text(verdict.ratio, verdict.against)}", style)
+
+
+def _ticks() -> str:
+    characters = [" "] * AXIS_WIDTH
+    for tick in LABELLED_TICKS:
+        label = AXIS_TICKS[tick]
+        start = min(max(_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
+        characters[start : start + len(label)] = label
+    return "".join(characters)
+
+
+def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
+    if not aids:
+        return
+    yield Line("")
+    yield from _wrapped(
+        "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than "
+        "needed. For barometer, magnetometer and gravity that is usual and not a fault.",
+        "",
+        "  ",
+    )
+    indent = 31
+    yield Line(f"{'':{indent}}{_ticks()}")
+    previous = ""
+    for row in aids:
+        label = row.label if row.label != previous else ""
+        previous = row.label
+        ratio = "–" if row.ratio is None else format_ratio(row.ratio)
+        head = f"  {label:13}{row.component:6}{ratio:>7}"
+        yield Line(f"{head:{indent}}{axis_text(row.ratio, 'source')}")
+
+
+def _format_spans(cause: Cause) -> str:
+    if not cause.spans_s:
+        return ""
+    first, last = cause.spans_s[0][0], cause.spans_s[-1][1]
+    return f"{first:.1f} s" if last - first < 0.05 else f"{first:.1f} to {last:.1f} s"
+
+
+def _labelled(label: str, text: str) -> Iterator[Line]:
+    indent = " " * TEXT_INDENT
+    yield from _wrapped(text, f"  {label:{TEXT_INDENT - 2}}", indent)
+
+
+def _wrapped(text: str, first: str, indent: str) -> Iterator[Line]:
+    for line in textwrap.wrap(
+        text,
+        WIDTH,
+        initial_indent=first,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    ):
+        yield Line(line)
+
+
+def _all_actions(card: Card) -> Iterator[Action]:
+    for cause in card.causes:
+        yield from cause.actions
+        for alternative in cause.alternatives:
+            yield from alternative
