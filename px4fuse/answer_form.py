@@ -64,7 +64,7 @@ VerdictWord = Literal["", "consistent", "overconfident", "underconfident"]
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
-class ClaimedMistake(Record, frozen=True):
+class StudentMistake(Record, frozen=True):
     """Mistake that a student names in the form.
 
     Attributes
@@ -116,15 +116,15 @@ class Answers(Record, frozen=True, kw_only=True):
     ----------
     log_sha256 : str
         SHA-256 of the log of the form.
-    verdict_ours, verdict_ekf2 : str
+    verdict_kf, verdict_ekf2 : str
         Verdict on the reported σ of KF and EKF2, one of :data:`VERDICTS`.
     quantities : tuple of (float, tuple of float, or None)
         In the order of :func:`draw_questions`; a tuple answers a question about several updates.
     """
 
     log_sha256: Sha256
-    mistakes: Annotated[tuple[ClaimedMistake, ...], Meta(max_length=MOST_MISTAKES)] = ()
-    verdict_ours: VerdictWord = ""
+    mistakes: Annotated[tuple[StudentMistake, ...], Meta(max_length=MOST_MISTAKES)] = ()
+    verdict_kf: VerdictWord = ""
     verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_DID))] = ()
     quantities: Annotated[tuple[QuantityAnswer, ...], Meta(max_length=10)] = ()
@@ -329,7 +329,7 @@ def form_text(log_name: str, log_sha256: str) -> str:
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     """Yield names and values of a completed form, for the report and the class page."""
-    yield "Verdict on KF", answers.verdict_ours or BLANK
+    yield "Verdict on KF", answers.verdict_kf or BLANK
     yield "Verdict on EKF2", answers.verdict_ekf2 or BLANK
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or BLANK
     for claim in answers.mistakes:

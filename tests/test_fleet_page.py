@@ -24,7 +24,7 @@ BREAKOUT = "</script ></noscript\n><script>window.alive=2</script><!-- \u2028 & 
 HOSTILE = (MARKUP, BREAKOUT, "\0\x1b\u202e", "$title", "javascript:alert(1)", "//a.b/c", "; ;")
 TEXTS = (
     "name", "log_sha256", "px4fuse", "settings", "reason", "remedy", "vehicle", "firmware",
-    "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "story", "results", "report",
+    "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "summary", "results", "report",
 )  # fmt: skip
 
 
@@ -47,20 +47,20 @@ def test_page_compared_log_lists_its_missing_results() -> None:
 
 
 def test_logs_of_uses_horizontal_axes() -> None:
-    def kf_factor(rows: pd.DataFrame) -> float:
+    def kf_sigma_ratio(rows: pd.DataFrame) -> float:
         return float(logs_of(rows)[0]["factors"]["kf"])
 
     first = made_up(3).iloc[:3].copy()
     north, east, _ = first["kf_nis_mean"]
-    assert kf_factor(first) == pytest.approx(
+    assert kf_sigma_ratio(first) == pytest.approx(
         (2.0 / (north + east)) ** 0.5
     )  # equal numbers of updates
     # weighted by the number of updates
     first["updates"] *= pd.Series((3, 1, 1))
-    assert kf_factor(first) == pytest.approx((4.0 / (3.0 * north + east)) ** 0.5)
+    assert kf_sigma_ratio(first) == pytest.approx((4.0 / (3.0 * north + east)) ** 0.5)
     aisle = first.iloc[:1].assign(axis="aisle", kf_nis_mean=4.0, position_rmse_m=9.0)
     both = pd.concat([aisle, first])
-    assert kf_factor(both) == pytest.approx(0.5)
+    assert kf_sigma_ratio(both) == pytest.approx(0.5)
     assert logs_of(both)[0]["position_rmse_m"] == 9.0
 
 
@@ -157,8 +157,8 @@ def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
 
 def test_filters_of_fleet_page_combine(page: Browser) -> None:
     table = made_up(240).drop_duplicates("log")
-    page.choose("#filter-3", "finding:ekf2_rejecting")
-    rejecting = table["findings"].fillna("").str.contains("ekf2_rejecting")
+    page.choose("#filter-3", "finding:ekf2_rejects_positions")
+    rejecting = table["findings"].fillna("").str.contains("ekf2_rejects_positions")
     assert page.ask(COUNT) == f"Showing {rejecting.sum()} of 240"
     page.choose("#filter-1", f"vehicle:{VEHICLES[1]}")
     both = rejecting & (table["vehicle"] == VEHICLES[1])

@@ -165,7 +165,7 @@ def test_command_of_finding_removes_finding(desk) -> None:
         {one["id"] for one in json.loads(Path(name).read_text())["findings"]}
         for name in ("a.json", "b.json")
     ]
-    assert "source_clock_offset" in findings[0] - findings[1]
+    assert "source_time_offset" in findings[0] - findings[1]
 
 
 # --- files ---

@@ -10,7 +10,7 @@ from px4fuse.cli import inputs, outputs
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
-Severity = Literal["error", "warning", "info"]
+Severity = Literal["error", "warning", "note"]
 SEVERITIES = get_args(Severity)
 
 

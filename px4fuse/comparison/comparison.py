@@ -122,7 +122,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
             ),
         },
         difference=axis_difference,
-        rejected_share=float(rejected.mean()) if len(rejected) else None,
+        rejected_fraction=float(rejected.mean()) if len(rejected) else None,
         axis=axis,
         replay=kf_run,
         ekf2_state=state,

@@ -28,7 +28,7 @@ LOG_COLUMNS = [
         "status",
         "reason",
         "remedy",
-        "story",
+        "summary",
         "findings",
         "results",
         "report",
@@ -134,7 +134,7 @@ def _details(log: Log) -> tuple[Part, ...]:
             "Missing results", [reason for reason, _ in log["lacking"] if reason], warn=True
         ),
         frame.list_part("Actions", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
-        frame.list_part("Summary", list(filter(None, log.get("story", "").splitlines()))),
+        frame.list_part("Summary", list(filter(None, log.get("summary", "").splitlines()))),
         frame.list_part("Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]),
         frame.table_part("Axes", heads if axes else (), axes, range(1, len(heads))),
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from px4fuse.findings import finding_title
 from px4fuse.fleet.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from px4fuse.fleet.rows import FAILED, FINDING_SEPARATOR
-from px4fuse.report.page import Page, words
+from px4fuse.report.page import Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval
 from px4fuse.text import format_factor, format_number
@@ -42,7 +42,7 @@ def summary(fleet: Fleet) -> Page:
     lines = []
     for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
         cells = []
-        for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
+        for factors in (rows["kf_sigma_ratio"].dropna(), rows["ekf2_sigma_ratio"].dropna()):
             cells += [f"{len(factors)}", format_factor(factors.median()) if len(factors) else "–"]
         lines.append((str(axis), *cells))
     if lines:
@@ -87,12 +87,12 @@ def differences(results: ChangeResults) -> Page:
     least = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(f"Numbers that differ by less than {least} are not listed.", colour=MUTED_COLOUR)
     for finding in results.findings:
-        styled = words(
+        styled = styled_text(
             f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
         )
         page.labelled(f"Only {finding.only_in}", styled)
     for text in results.worse:
-        page.labelled("Worse", words(text, 8.0, RED))
+        page.labelled("Worse", styled_text(text, 8.0, RED))
     if not results.worse:
         page.write("No verdict is worse in B.")
     return page

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 # false alarm rate of a flight's eight tests below 1 %
 MIN_WHITE_P = 0.001
 SIGMA_VERDICTS = {
-    "variance overstated": ("underconfident", "large"),
-    "variance understated": ("overconfident", "small"),
+    "underconfident": ("underconfident", "large"),
+    "overconfident": ("overconfident", "small"),
 }
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
@@ -49,7 +49,7 @@ def format_verdict(statement: Consistency | Unavailable) -> str:
 def format_sigma_verdict(verdict: str, factor: float) -> str:
     """Format a verdict of the results with the factor between reported and actual σ.
 
-    >>> format_sigma_verdict("variance understated", 2.41)
+    >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
     """
     if verdict not in SIGMA_VERDICTS:
@@ -158,7 +158,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
 
 def format_consequences(followers: Sequence[Finding]) -> str:
     """Format findings that follow from the same cause, with their ids."""
-    return "Consequences: " + " ".join(f"{one.headline} [{one.id}]." for one in followers)
+    return "Consequences: " + " ".join(f"{one.title} [{one.id}]." for one in followers)
 
 
 def format_clock_map(clock: ClockMap) -> str:
@@ -205,7 +205,7 @@ def tuning_advice(
     found = tuned.get(name)
     if not isinstance(found, AxisTuning):
         return {}
-    advice, sigma_a, sigma_z = {}, found.filter_sigma_a, found.sigma_z
+    advice, sigma_a, sigma_z = {}, found.sigma_a_two_state, found.sigma_z
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
         advice["Drift"] = (
