@@ -237,9 +237,9 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
 
 
 def update_values(value: Any) -> Any:
-    """Replace the values of forms and answer keys from before schema 4 by the present ones."""
+    """Replace the names and values of forms and answer keys from before schema 4."""
     if isinstance(value, dict):
-        return {key: update_values(part) for key, part in value.items()}
+        return {_FORM.renamed.get(key, key): update_values(part) for key, part in value.items()}
     if isinstance(value, list):
         return [update_values(part) for part in value]
     return _FORM.renamed.get(value, value) if isinstance(value, str) else value

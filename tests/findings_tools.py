@@ -146,7 +146,7 @@ def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> An
         Consistency,
         nis_mean=nis,
         nis_band=(0.8, 1.2),
-        sigma_ratio=nis**-0.5,
+        sigma_ratio=nis**0.5,
         verdict=verdict,
         **{**usual, **parts},
     )
@@ -213,8 +213,8 @@ def late(
     offset_s = applied_s + remaining_s
     halves = tuple(PartOffset(0.0, 1.0, at, 0.1) for at in (offset_s - 0.2, offset_s + 0.2))
     usual = {
-        "interval_s": (offset_s - 0.01, offset_s + 0.02), "is_determinable": True, "change_p_value": None,
-        "parts": halves,
+        "interval_s": (offset_s - 0.01, offset_s + 0.02), "is_determinable": True,
+        "change_p_value": None, "parts": halves,
     }  # fmt: skip
     return made(
         ClockOffset, offset_s=offset_s, applied_s=applied_s, sigma_s=sigma_s, **{**usual, **parts}

@@ -339,7 +339,8 @@ def unexplained(comparison: Comparison) -> Analysis:
     parts = {part.name: getattr(comparison, part.name) for part in fields(Comparison)}
     return Analysis(
         **parts, tuning={}, clock=unavailable("clock offset"),
-        ekf2_model=unavailable("EKF2 replay"), difference_steps={}, loop=unavailable("loop closure"),
+        ekf2_model=unavailable("EKF2 replay"), difference_steps={},
+        loop=unavailable("loop closure"),
         heading=unavailable("heading error"),
     )  # fmt: skip
 

@@ -57,11 +57,11 @@ def made_up(count: int, seed: int = 1) -> pd.DataFrame:
                 row
                 | {
                     "axis": axis, "updates": int(row["duration_s"] * 10),
-                    "kf_nis_mean": nis, "kf_sigma_ratio": 1.0 / nis,
+                    "kf_nis_mean": nis, "kf_sigma_ratio": nis**0.5,
                     "kf_verdict": "overconfident" if nis > 1.3 else "consistent",
-                    "ekf2_nis_mean": theirs, "ekf2_sigma_ratio": 1.0 / theirs,
+                    "ekf2_nis_mean": theirs, "ekf2_sigma_ratio": theirs**0.5,
                     "ekf2_verdict": "underconfident" if theirs < 0.8 else "consistent",
-                    "position_rmse_m": error, "velocity_rmse_m_s": 2.0 * error,
+                    "position_rms_m": error, "velocity_rms_m_s": 2.0 * error,
                     "sigma_z_m": sigma, "sigma_z_low_m": 0.9 * sigma, "sigma_z_high_m": 1.1 * sigma,
                     "sigma_a_m_s2": 0.3, "sigma_a_low_m_s2": 0.2, "sigma_a_high_m_s2": 0.4,
                     "clock_offset_s": offset, "clock_offset_low_s": offset - 0.006,

@@ -74,7 +74,7 @@ def test_aid_verdict_sigma_ratio_has_tolerance(sigma, verdict) -> None:
     aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
-    assert aid.axes["north"].sigma_ratio == pytest.approx(0.5 / sigma, rel=0.04)
+    assert aid.axes["north"].sigma_ratio == pytest.approx(sigma / 0.5, rel=0.04)
     assert len(TIMES) - 5 < aid.axes["east"].samples <= len(TIMES)
     assert aid.axes["north"].s_sqrt_median == pytest.approx(0.5)
 

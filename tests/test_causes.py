@@ -50,7 +50,8 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
          [("source_outliers", "error", None), (UNDERSTATED, "warning", "source_outliers"),
           (REJECTING, "warning", UNDERSTATED)]),
         # jump and scale are consequences of changed noise; a jump's consequence follows the jump
-        ([*map(one, ("source_noise_varies", "source_position_jump", "source_scale_error", "ekf2_resets"))],
+        ([*map(one, ("source_noise_varies", "source_position_jump", "source_scale_error",
+                     "ekf2_resets"))],
          [("source_noise_varies", "warning", None),
           ("source_position_jump", "warning", "source_noise_varies"),
           ("ekf2_resets", "warning", "source_position_jump"),
@@ -58,7 +59,8 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
         # the severity of a KF variance does not raise that of advice
         ([one("sigma_z_too_large", "note"),
           one("kf_underconfident", "error", cause="measurement noise")],
-         [("sigma_z_too_large", "note", None), ("kf_underconfident", "error", "sigma_z_too_large")]),
+         [("sigma_z_too_large", "note", None),
+          ("kf_underconfident", "error", "sigma_z_too_large")]),
         # findings about the recording come before noises
         ([one("no_motion"), one("sigma_a_too_large", "error"), one("ekf2_resets", "note"),
           one("source_gap"), one("source_time_offset_changes", "error")],

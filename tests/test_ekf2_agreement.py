@@ -111,9 +111,9 @@ def test_agreement_verdict_applies_limits(axis, logged, replayed_share, good, ex
 def test_logged_rejections_decide_verdict(axis, good):
     """The replay with logged rejections overrides the other verdict, good or bad."""
     own_gate = Agreement(
-        north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50, rejected_fraction_logged=0.2,
-        rejected_fraction_replayed=0.2, decisions_same=0.9, published_rms_difference_m=0.0,
-        good=not good, reason="so far",
+        north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50,
+        rejected_fraction_logged=0.2, rejected_fraction_replayed=0.2,
+        decisions_same=0.9, published_rms_difference_m=0.0, good=not good, reason="so far",
     )  # fmt: skip
     logged_gate = replace(own_gate, north=agreeing(), east=axis, decisions_same=1.0,
                        rejected_fraction_replayed=0.3)  # fmt: skip

@@ -717,7 +717,8 @@ def test_bias_reports_interval_tilt_and_ekf2_estimate() -> None:
 @pytest.mark.parametrize(
     ("clock", "expected"),
     [(clock_map(distinct=2, jitter_s=0.010), ["source_timestamps_constant"]),
-     (clock_map("receive time", 2, 0.011), ["source_timestamps_constant", "source_timestamp_jitter"]),
+     (clock_map("receive time", 2, 0.011),
+      ["source_timestamps_constant", "source_timestamp_jitter"]),
      (clock_map(jitter_s=0.5), []), (clock_map("arrival time"), ["companion_not_synchronised"])],
 )  # fmt: skip
 def test_source_stamps_recording_reports_clock_faults(clock: Any, expected: list[str]) -> None:

@@ -148,9 +148,9 @@ FAULTS = [
           settings={"sigma_a_m_s2": 1e-4}),
     # EKF2
     Fault("accelerometer_bias", "warning", {"bias_m_s2": about(0.3, 0.01)}, change=with_ekf2_bias),
-    Fault("ekf2_underconfident", "error", {"sigma_ratio": about(7.1, 0.15), **TUNED_FIELDS},
+    Fault("ekf2_underconfident", "error", {"sigma_ratio": about(0.14, 0.15), **TUNED_FIELDS},
           ekf2(nis=0.02, noise_m=0.7)),
-    Fault("ekf2_underconfident", "warning", {"sigma_ratio": about(1.6, 0.15)},
+    Fault("ekf2_underconfident", "warning", {"sigma_ratio": about(0.62, 0.15)},
           ekf2(nis=0.4, noise_m=0.15)),
     Fault("ekf2_overconfident", "error", {"nis_mean": about(22, 0.2), **TUNED_FIELDS},
           ekf2(nis=22.0, noise_m=0.02)),
@@ -161,7 +161,8 @@ FAULTS = [
           ekf2(fusing=((0.0, 0.0), (90.0, 1.0)))),
     Fault("ekf2_fusion_interrupted", "warning", {"fused_fraction": about(0.90, 0.01)},
           ekf2(fusing=((0.0, 1.0), (60.0, 0.0), (72.0, 1.0)))),
-    Fault("ekf2_rejects_positions", "error", {"rejected_fraction": about(0.5, 0.2), "axis": "north"},
+    Fault("ekf2_rejects_positions", "error",
+          {"rejected_fraction": about(0.5, 0.2), "axis": "north"},
           ekf2(rejected_fraction=0.5)),
     Fault("ekf2_rejects_positions", "warning", {"rejected_fraction": about(0.05, 0.4)},
           ekf2(rejected_fraction=0.05)),
@@ -178,7 +179,8 @@ FAULTS = [
     # the position source
     Fault("source_not_logged", "warning", {"rate_hz": about(4.0), "sdlog_profile": 1},
           {"uwb": Uwb(name=ALIGNED_TOPIC, origin=ALIGNED, rate_hz=4.0), "parameters": NO_VISION}),
-    Fault("source_rate_limited_by_logger", "warning", {"rate_hz": about(2.0), "logger_limit_hz": 2.0},
+    Fault("source_rate_limited_by_logger", "warning",
+          {"rate_hz": about(2.0), "logger_limit_hz": 2.0},
           {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=LOGGED_BY_EKF2, rate_hz=2.0)}),
     Fault("source_frame_frd", "warning",
           flight={"uwb": Uwb(frame="FRD"), **ekf2(fusing_yaw=0.0)}),
@@ -213,15 +215,16 @@ FAULTS = [
 ]  # fmt: skip
 # Findings tested in other files, with the estimates that they need
 TESTED_ELSEWHERE = {
-    "accelerometer_bias", "aid_innovation_bias", "aid_innovation_shift", "aid_not_fused", "aid_overconfident",
-    "ekf2_ev_delay_wrong", "ekf2_gate_too_small",
-    "ekf2_heading_error", "false_loop_closure",
-    "loop_closure_inconsistent", "loop_drift_too_small", "loop_landing_assumed", "loop_on_absolute_positions",
-    "sigma_a_too_large", "sigma_a_too_small", "sigma_z_too_large", "sigma_z_too_small", "source_noise_unequal_axes",
-    "source_time_offset_changes", "source_noise_time_correlated", "source_noise_varies", "source_samples_repeated",
-    "source_time_offset", "source_frame_misaligned", "source_position_jump", "source_outliers",
-    "source_scale_error", "source_low_pass_filtered", "source_timestamps_are_arrival_times", "source_downsampled",
-    "source_reported_variance_wrong",
+    "accelerometer_bias", "aid_innovation_bias", "aid_innovation_shift", "aid_not_fused",
+    "aid_overconfident", "ekf2_ev_delay_wrong", "ekf2_gate_too_small", "ekf2_heading_error",
+    "false_loop_closure", "loop_closure_inconsistent", "loop_drift_too_small",
+    "loop_landing_assumed", "loop_on_absolute_positions", "sigma_a_too_large",
+    "sigma_a_too_small", "sigma_z_too_large", "sigma_z_too_small", "source_downsampled",
+    "source_frame_misaligned", "source_low_pass_filtered", "source_noise_time_correlated",
+    "source_noise_unequal_axes", "source_noise_varies", "source_outliers",
+    "source_position_jump", "source_reported_variance_wrong", "source_samples_repeated",
+    "source_scale_error", "source_time_offset", "source_time_offset_changes",
+    "source_timestamps_are_arrival_times",
 }  # fmt: skip
 # Second finding of severity error that the mistake causes
 ALSO_ERROR = {

@@ -593,7 +593,8 @@ def test_summary_noise_shape_finding_replaces_setting_as_cause() -> None:
     causes = (tried("kf", {"sigma_z_m": 3.0}, "aisle"),)
     one = flight_of(with_truth(9.0), causes=causes)
     for name, level, is_named in (
-        ("source_noise_time_correlated", "warning", False), ("source_noise_time_correlated", "note", True),
+        ("source_noise_time_correlated", "warning", False),
+        ("source_noise_time_correlated", "note", True),
         ("source_outliers", "warning", True),
     ):  # fmt: skip
         found = Finding(name, level, "So.", "Do.", title="It is so")  # type: ignore[arg-type]

@@ -91,7 +91,8 @@ def test_find_white_noise_returns_nothing() -> None:
     [
         (SLOW, "source_noise_time_correlated", "error",  # the severity of its consequences
          {"tau_s": (0.5, 0.35), "slow_m": (0.1, 0.03), "white_m": (0.0, 0.04)}),
-        (MIXED, "source_noise_time_correlated", "warning", {"slow_m": (0.07, 0.03), "white_m": (0.07, 0.02)}),
+        (MIXED, "source_noise_time_correlated", "warning",
+         {"slow_m": (0.07, 0.03), "white_m": (0.07, 0.02)}),
         (HELD, "source_samples_repeated", "warning", {"share": (0.15, 0.03)}),
         (OFTEN_HELD, "source_samples_repeated", "error", {"share": (0.6, 0.05)}),
         (UNEQUAL, "source_noise_unequal_axes", "error",

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.answer_form import GATE_UPDATES, FormQuestion, draw_questions, update_values
+from px4fuse.answer_form import GATE_UPDATES, FormQuestion, draw_questions
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
@@ -75,7 +75,7 @@ class FormTruth(Record, frozen=True):
 
     mistakes: tuple[TrueMistake, ...]
     sigma_z_m: float
-    ours: VerdictTruth
+    kf: VerdictTruth
     ekf2: VerdictTruth
     ekf2_did: tuple[str, ...]
     ekf2_did_also: tuple[str, ...]
@@ -135,9 +135,9 @@ def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
     filter_summary = comparison.main.filters[which]
     if not isinstance(filter_summary, FilterSummary):
         return VerdictTruth("")
-    verdict = update_values(filter_summary.verdict.removeprefix("variance "))
-    is_consistent = verdict == "consistent"
-    return VerdictTruth(verdict, None if is_consistent else filter_summary.sigma_error_factor)
+    is_consistent = filter_summary.verdict == "consistent"
+    factor = None if is_consistent else filter_summary.sigma_error_factor
+    return VerdictTruth(filter_summary.verdict, factor)
 
 
 def _ekf2_behaviour(

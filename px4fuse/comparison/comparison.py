@@ -173,10 +173,10 @@ def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailabl
         )
     return Difference(
         count=len(position),
-        position_rmse_m=_rmse(position),
+        position_rms_m=_rmse(position),
         position_mean_m=float(np.mean(position)),
         position_maximum_m=float(np.max(np.abs(position))),
-        velocity_rmse_m_s=_rmse(velocity),
+        velocity_rms_m_s=_rmse(velocity),
         velocity_mean_m_s=float(np.mean(velocity)),
         velocity_maximum_m_s=float(np.max(np.abs(velocity))),
     )

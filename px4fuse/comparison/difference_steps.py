@@ -120,7 +120,8 @@ def add_sentences(
     sentences = [f"{cause} {_moment_text(first)}"]
     if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * explanation.position_mean_square_m2:
         sentences.append(
-            f"Second: {second.name} ({_format_share(second, explanation)}). {reasons[second.name]}. "
+            f"Second: {second.name} ({_format_share(second, explanation)}). "
+            f"{reasons[second.name]}. "
             f"{_moment_text(second)}"
         )
     sentences += [_velocity_sentence(explanation), *_truth_sentences(explanation)]

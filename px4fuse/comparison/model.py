@@ -78,10 +78,10 @@ class Difference(Record, frozen=True, kw_only=True):
     """KF - EKF2 at EKF2's sample times."""
 
     count: Count
-    position_rmse_m: NotNegative
+    position_rms_m: NotNegative
     position_mean_m: float
     position_maximum_m: NotNegative
-    velocity_rmse_m_s: NotNegative
+    velocity_rms_m_s: NotNegative
     velocity_mean_m_s: float
     velocity_maximum_m_s: NotNegative
 

@@ -168,7 +168,8 @@ def format_whatif_effect(before: Summary, after: Summary) -> str:
     texts = []
     if max(before.rejected_fraction, after.rejected_fraction) >= REJECTED_SHOWN:
         texts.append(
-            f"rejected {100 * before.rejected_fraction:.0f} % → {100 * after.rejected_fraction:.0f} %"
+            f"rejected {100 * before.rejected_fraction:.0f} % → "
+            f"{100 * after.rejected_fraction:.0f} %"
         )
     texts.append(f"mean NIS {_format_nis(before.nis_mean)} → {_format_nis(after.nis_mean)}")
     flown_rmse, changed_rmse = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m

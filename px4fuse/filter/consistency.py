@@ -12,7 +12,7 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 from px4fuse.arrays import Array
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
 
-# "overstated": underconfident, σ too large; "understated": overconfident, σ too small
+# underconfident: the reported σ is too large; overconfident: too small
 Verdict = Literal["consistent", "underconfident", "overconfident"]
 
 # With fewer innovations the 95 % band of the mean NIS is wider than 0.3 to 2.1
@@ -36,7 +36,7 @@ class NisVerdict(Record, frozen=True, kw_only=True):
     nis_band : (float, float)
         Two-sided 95 % chi-square band of the mean NIS, for white innovations.
     sigma_ratio : float
-        Ratio of reported to actual σ, 1/√nis_mean: above 1, √S is too large.
+        Ratio of actual to reported σ, √nis_mean: above 1, the filter is overconfident.
     verdict : str
     """
 
@@ -122,7 +122,7 @@ def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
         "count": len(nis),
         "nis_mean": mean,
         "nis_band": band,
-        "sigma_ratio": float(np.sqrt(1.0 / mean)),
+        "sigma_ratio": float(np.sqrt(mean)),
         "verdict": classify_mean_nis(mean, band),
     }
 

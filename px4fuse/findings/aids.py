@@ -44,8 +44,8 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
         cause = _sensor_cause(switch, source) or (CHANGE if changed else "")
         yield warning(
             "aid_not_fused",
-            f"EKF2 fused no sample of {labels} for {longest.longest_gap_duration_s:.0f} s, although "
-            f"fusion was enabled. The limit is {NOT_FUSED_LIMIT_S:g} s; "
+            f"EKF2 fused no sample of {labels} for {longest.longest_gap_duration_s:.0f} s, "
+            f"although fusion was enabled. The limit is {NOT_FUSED_LIMIT_S:g} s; "
             f"{format_percent(longest.rejected_fraction, 1)} of the samples were rejected. EKF2 "
             "relied on its other aids and the IMU, so its error grew.",
             "Check the sensor in that time (reception, range, light), and whether EKF2 rejected "
@@ -81,8 +81,8 @@ def find_in(aids: Mapping[str, AidResult], source: str = "") -> Found:
                 "aid_overconfident",
                 f"EKF2 is overconfident about {label}: σ is {format_factor(aid.nis_mean**0.5)} "
                 f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1); "
-                f"{format_percent(aid.rejected_fraction, 1)} of the samples were rejected. The errors "
-                f"of this aid exceed R{_format_noise(aid)}, or another aid contradicts it.",
+                f"{format_percent(aid.rejected_fraction, 1)} of the samples were rejected. The "
+                f"errors of this aid exceed R{_format_noise(aid)}, or another aid contradicts it.",
                 "First check outliers, delay and mounting of the sensor, and the other aids. If "
                 f"the sensor is noisier than assumed, {action}.",
                 {

@@ -56,8 +56,8 @@ RECORDING = frozenset(
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Sort findings in the order of correction, consequences behind their cause.
 
-    By severity, then in the order of :data:`TITLES`; findings about the recording come before errors
-    of noises. A cause is at least as severe as its consequences.
+    By severity, then in the order of :data:`TITLES`; findings about the recording come before
+    errors of noises. A cause is at least as severe as its consequences.
     """
     places = list(TITLES)
     groups = sorted(by_root(findings), key=lambda group: places.index(group[0].id))

@@ -29,11 +29,14 @@ class CatalogueEntry(Record, frozen=True):
         Position source, time, IMU, tuning, EKF2, loops or logging.
     meaning : str
         Explanation for a reader who meets the finding for the first time.
+    formerly : str
+        Id before schema 4; empty if it is the same.
     """
 
     title: str
     group: str
     meaning: str
+    formerly: str = ""
 
 
 # By id; findings of equal rank are listed in this order
@@ -42,6 +45,10 @@ CATALOGUE: Mapping[str, CatalogueEntry] = table(
 )
 GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
+# Present id by the id before schema 4
+RENAMED_IDS: Mapping[str, str] = {
+    entry.formerly: name for name, entry in CATALOGUE.items() if entry.formerly
+}
 
 
 class Example(Record, frozen=True):
@@ -89,7 +96,7 @@ class Finding(Record, frozen=True, omit_defaults=False):
     evidence : dict
         Numbers behind the finding, with units in their names.
     title : str
-        First sentence of the message, without full stop.
+        First sentence of the message, without full stop: the fault with its numbers.
     caused_by : str or None
         Id of the finding that it follows from: the nearest one before it with that id.
     spans_s : tuple of (float, float)

@@ -159,7 +159,7 @@ def deviating_settings(analysis: Analysis) -> Found:
         interval = f"; 95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit}" if noise.high else ""
         setting_finding = finding(
             severity,
-            f"{name[:7]}_{side}",
+            f"{name[:7]}_too_{side}",
             f"{name[:7].upper()} {chosen[name]:g} {unit} is {'at least ' if is_bound else ''}"
             f"{format_factor(size)} times too {side}. The maximum-likelihood estimate is "
             f"{'at most ' if is_bound else ''}{value:.3g} {unit} ({axis_tuning.name}"
@@ -243,7 +243,7 @@ def variances(analysis: Analysis) -> Found:
                 results = [analysis.axes[name] for name in axes if name in analysis.axes]
                 pairs = [(result, result.filters[owner]) for result in results]
                 off = [(result, each) for result, each in pairs if is_inconsistent(each)]
-                members = [pair for pair in off if (pair[1].sigma_ratio > 1.0) == over]
+                members = [pair for pair in off if (pair[1].sigma_ratio < 1.0) == over]
                 if members:
                     found = _variance_finding(analysis, owner, group, members)
                     yield structs.replace(found, caused_by=first)
@@ -255,12 +255,12 @@ def _variance_finding(
 ) -> Finding:
     """Make one finding for a group of axes, with the axis whose mean NIS is furthest from 1."""
     result, statement = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
-    over, factor = statement.sigma_ratio > 1.0, statement.sigma_error_factor
+    over, factor = statement.sigma_ratio < 1.0, statement.sigma_error_factor
     severity: Severity = "error" if factor >= SIGMA_RATIO_ERROR else "warning"
     if _is_default(analysis, owner, result):
         severity = one_level_lower(severity)
     tuned = tuning_of_axis(analysis.tuning, result.axis.name)
-    stated = "overstated" if over else "understated"
+    confidence = "underconfident" if over else "overconfident"
     if over and analysis.source.origin.may_drift:
         severity, remedy_text, cause = "note", KEEP_NOISES_DRIFT, ELSEWHERE
     elif over and analysis.source.origin.is_gnss:
@@ -297,8 +297,8 @@ def _variance_finding(
         gate_effect = f" The gate of EKF2 may then {accepted}."
     return finding(
         severity,
-        f"{owner}_variance_{stated}",
-        f"{name} is {'under' if over else 'over'}confident along {result.axis.called}: σ is "
+        f"{owner}_{confidence}",
+        f"{name} is {confidence} along {result.axis.called}: σ is "
         f"{format_factor(factor)} times too {'large' if over else 'small'}. The mean NIS is "
         f"{format_number(statement.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} axes)."
         f"{gate_effect}",
@@ -402,7 +402,7 @@ def _remedy_without_replay(
     ratio = noise_m / used_m
     if not (
         ratio < 1.0 / NOISE_RATIO_TOLERANCE
-        if statement.sigma_ratio > 1.0
+        if statement.sigma_ratio < 1.0
         else ratio > NOISE_RATIO_TOLERANCE
     ):
         return (

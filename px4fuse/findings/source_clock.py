@@ -38,9 +38,9 @@ def offset(analysis: Analysis, clock: ClockOffset) -> Found:
         yield error(
             "source_time_offset_changes",
             f"The time offset of {source.name} changes from {first.offset_s:+.2f} s at the "
-            f"beginning to {last.offset_s:+.2f} s at the end (p {clock.change_p_value:.1g}). No single "
-            "--clock-offset corrects it. PX4 uses arrival times until 500 TIMESYNC answers have "
-            "come.",
+            f"beginning to {last.offset_s:+.2f} s at the end (p {clock.change_p_value:.1g}). No "
+            "single --clock-offset corrects it. PX4 uses arrival times until 500 TIMESYNC answers "
+            "have come.",
             "Let the clocks synchronise for one minute before take-off. Analyse one side of the "
             "change (--start, --end).",
             {**evidence, "change_p_value": clock.change_p_value},

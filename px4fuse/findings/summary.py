@@ -164,13 +164,9 @@ def _filter_sentence(analysis: Analysis, owner: FilterName) -> str:
     elif statement.verdict == "consistent":
         verdict = "is consistent"
     else:
-        confidence, size = (
-            ("underconfident", "large")
-            if statement.sigma_ratio > 1.0
-            else ("overconfident", "small")
-        )
+        size = "large" if statement.verdict == "underconfident" else "small"
         factor = format_factor(statement.sigma_error_factor)
-        verdict = f"is {confidence}: σ is {factor} times too {size}"
+        verdict = f"is {statement.verdict}: σ is {factor} times too {size}"
     if not isinstance(statement.truth, AgainstTruth):
         return f"By its innovations along {along} {name} {verdict}."
     rmse = format_metres(statement.truth.position_rmse_m)

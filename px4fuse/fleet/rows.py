@@ -50,9 +50,9 @@ def at(results: object, path: str) -> Any:
 def axis_rows(results: ComparisonResults) -> list[Row]:
     """Return the rows of one log, one per axis; columns without a value are absent.
 
-    A factor is reported σ over actual σ, as ``sigma_ratio`` in the results: above 1 the filter is
-    underconfident. SIGMA_Z and SIGMA_A are the maximum-likelihood estimates, for north and east
-    together. The clock offset is present if it is determinable.
+    A σ ratio is actual σ over reported σ: above 1 the filter is overconfident. SIGMA_Z and
+    SIGMA_A are the maximum-likelihood estimates, for north and east together. The clock
+    offset is present if it is determinable.
     """
     common = log_columns(results.log) | finding_columns(results.findings, results.aids)
     common["summary"] = "\n".join(results.summary)

@@ -260,7 +260,7 @@ def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
 def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
     """Return the mean share for both verdicts and the behaviour of EKF2."""
     shares = [_ekf2_behaviour_share(answers, truth)]
-    for answer, known in ((answers.verdict_kf, truth.ours), (answers.verdict_ekf2, truth.ekf2)):
+    for answer, known in ((answers.verdict_kf, truth.kf), (answers.verdict_ekf2, truth.ekf2)):
         is_right = answer and answer == known.verdict
         # "consistent" is half right for a small factor
         is_nearly_right = (

@@ -162,9 +162,9 @@ class LoopResult(Record, frozen=True, kw_only=True):
     """Loop: path, landing place, closure errors and corrections, for the results.
 
     ``closure_error_m``: distance between measured and true end; ``closure_percent``: the same in
-    per cent of the path length; ``is_absolute_track``: the track follows a positioning system and does not
-    drift. Correction ``by_distance_plain`` changes positions only (Example 2 of the lesson);
-    ``by_distance`` also headings, if their error is known.
+    per cent of the path length; ``is_absolute_track``: the track follows a positioning system and
+    does not drift. Correction ``by_distance_plain`` changes positions only (Example 2 of the
+    lesson); ``by_distance`` also headings, if their error is known.
     """
 
     track: str

@@ -136,8 +136,6 @@ def format_aid_verdict(aid: AidResult) -> str:
     """Format the verdict on an aid, with the factor between reported and actual σ."""
     if aid.verdict == "not_fused":
         return f"not fused for {aid.longest_gap_duration_s:.1f} s"
-    if not aid.verdict.startswith("variance"):
-        return aid.verdict
     return format_sigma_verdict(aid.verdict, max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5)
 
 

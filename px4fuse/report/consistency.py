@@ -239,8 +239,8 @@ def _nis_sentence(series: list[Series]) -> str:
 
 def _shape_sentence(series: list[Series]) -> str:
     return "\n".join(
-        f"{one.name}: {one.statement.fraction_outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), mean "
-        f"{one.statement.innovation_mean_m:+z.3f} m ({format_p_value(one.statement.bias_p)})."
+        f"{one.name}: {one.statement.fraction_outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), "
+        f"mean {one.statement.innovation_mean_m:+z.3f} m ({format_p_value(one.statement.bias_p)})."
         for one in series
     )
 

@@ -120,17 +120,17 @@ def _draw_axis(
         page.write(sentence, size=8.5, above=1.0)
     names = [step.name for step in explanation.steps]
     columns = halves(NAMED_FRACTION, gap=COLUMN_GAP)
-    for column, left, (quantity, unit, power) in zip(
-        columns,
-        (LABEL_WIDTH, 4.0),
-        (("position", "m", "m2"), ("velocity", "m/s", "m2_s2")),
-        strict=True,
+    quantities = (
+        ("position", "m", "m2", explanation.unexplained_mean_square_m2),
+        ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
+    )
+    for column, left, (quantity, unit, power, unexplained) in zip(
+        columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
         total = getattr(explanation, f"{quantity}_mean_square_{power}")
         steps = np.array(
             [getattr(step, f"{quantity}_mean_square_{power}") for step in explanation.steps]
         )
-        unexplained = getattr(explanation, f"{quantity}_left_mean_square_{power}")
         title, height = (
             f"{quantity} difference, {np.sqrt(total):.3f} {unit} RMS",
             ROW_HEIGHT * (len(names) + 2),

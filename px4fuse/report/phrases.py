@@ -23,10 +23,8 @@ if TYPE_CHECKING:
 # p value of the Ljung-Box test below which innovations are reported as not white. It keeps the
 # false alarm rate of a flight's eight tests below 1 %
 MIN_WHITE_P = 0.001
-SIGMA_VERDICTS = {
-    "underconfident": ("underconfident", "large"),
-    "overconfident": ("overconfident", "small"),
-}
+# Error of the reported σ, by verdict
+SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
@@ -54,8 +52,7 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     """
     if verdict not in SIGMA_VERDICTS:
         return verdict
-    confidence, size = SIGMA_VERDICTS[verdict]
-    return f"{confidence}, σ {format_factor(factor)}× too {size}"
+    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_VERDICTS[verdict]}"
 
 
 def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:

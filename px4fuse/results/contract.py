@@ -1,7 +1,7 @@
 """Contract of the results: one JSON object per command, its schema, and how it is written.
 
-px4fuse reads all results with its own major version of the schema; a new field increases the minor
-version.
+px4fuse reads all results with its own major version of the schema; fields of a newer minor version
+are ignored.
 """
 
 import json
@@ -284,8 +284,8 @@ class EvaluationResults(Score, frozen=True, kw_only=True):
 class WhatIfResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
-    All statistics are over the spans ``evaluated_s``. ``asked`` is True if the changes of ``whatif``
-    are the maximum-likelihood estimates; ``sweep`` contains one summary per value.
+    All statistics are over the spans ``evaluated_s``. ``asked`` is True if the changes of
+    ``whatif`` are the maximum-likelihood estimates; ``sweep`` contains one summary per value.
     """
 
     schema: Schema

@@ -78,7 +78,8 @@ def tried(pair: Pair) -> tuple[Pair, str, tuple[float, ...]]:
     assert not isinstance(errors_m[0], Unavailable)
     assert not isinstance(errors_m[1], Unavailable)
     numbers = (
-        predicted.nis_mean, real.nis_mean, predicted.rejected_fraction, real.rejected_fraction, *errors_m
+        predicted.nis_mean, real.nis_mean, predicted.rejected_fraction, real.rejected_fraction,
+        *errors_m
     )  # fmt: skip
     if not predicted.is_predictable:
         return pair, "chaotic", numbers

@@ -67,7 +67,7 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
     blank = Answers(
         log_sha256=SHA256,
         mistakes=(StudentMistake("none"),),
-        verdict_kf=common([one.ours.verdict for one in truths]),  # type: ignore[arg-type]
+        verdict_kf=common([one.kf.verdict for one in truths]),  # type: ignore[arg-type]
         verdict_ekf2=common([one.ekf2.verdict for one in truths]),  # type: ignore[arg-type]
         ekf2_did=(common([said for one in truths for said in one.ekf2_did]),),
     )
@@ -105,7 +105,7 @@ def right(one: FormTruth) -> Answers:
     return Answers(
         log_sha256=SHA256,
         mistakes=tuple(claims) or (StudentMistake("none"),),
-        verdict_kf=one.ours.verdict,  # type: ignore[arg-type]
+        verdict_kf=one.kf.verdict,  # type: ignore[arg-type]
         verdict_ekf2=one.ekf2.verdict,  # type: ignore[arg-type]
         ekf2_did=one.ekf2_did,
         quantities=one.quantities,

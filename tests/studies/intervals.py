@@ -51,7 +51,8 @@ def measured(job: Job) -> tuple[float, ...] | None:
         (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
         covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),
         clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.is_determinable,
-        clock.is_determinable and false, clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P,
+        clock.is_determinable and false,
+        clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P,
     )  # fmt: skip
 
 
