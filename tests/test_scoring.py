@@ -74,7 +74,7 @@ RMSE = "axes.north.filters.kf.truth.position_rmse_m"
 BLIND = changed(axes__north__filters__kf__truth=NONE)
 NORTH = changed(axes={"north": EXAMPLE["axes"]["north"]}, tuning={}, horizontal={})
 SIGMA_Z = "tuning__horizontal__sigma_z_m"
-UNCLEAR = changed(clock__determinable=False, clock__reason="no acceleration.")
+UNCLEAR = changed(clock__is_determinable=False, clock__reason="no acceleration.")
 JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_time_offset_changes")]}
 UNDERSTATED = {"horizontal__kf__verdict": "overconfident", "horizontal__kf__nis_mean": 3.0}
 AFTER = "loop__corrections__by_distance"
@@ -122,9 +122,9 @@ CHECKED = [
     ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
     ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
-    ("loop", changed(LOOP, loop__absolute=True), {}, 0.0, "does not drift"),
+    ("loop", changed(LOOP, loop__is_absolute_track=True), {}, 0.0, "does not drift"),
     ("loop", REJECTED, {}, 0.25, "no closure was accepted"),
-    ("loop", changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE), {}, 0.0,
+    ("loop", changed(LOOP, loop__closure_error_m=..., loop__true_end=NONE), {}, 0.0,
      "too few of them"),
     ("number", changed(axes__north__updates__count=50), {"path": "axes.*.updates.count",
      "at_least": 100, "zero_at": 0}, 0.5, "axes.north"),
@@ -311,7 +311,7 @@ class TestWhatStudentsRead:
         wrong = [finding(name, "error") for name in TITLES]
         spoilt = [
             changed(findings=wrong, student__notes="It is a flight of 5 s.", tuning={}, clock=NONE),
-            changed(LOOP, findings=wrong, loop__closure_error_m=..., loop__known_end=NONE,
+            changed(LOOP, findings=wrong, loop__closure_error_m=..., loop__true_end=NONE,
                     loop__closures=[]),
             filled(["nlos", "dropout"], student__id="s01", findings=wrong),
         ]  # fmt: skip
@@ -337,7 +337,7 @@ class TestWhatStudentsRead:
         ({"log__hardware": HARDWARE}, ("simulate",)),
         ({"settings__sigma_z_m": 100.0}, ("SIGMA_Z 100 is far from",)),
         ({"settings__sigma_a_m_s2": 0.001}, ("SIGMA_A 0.001 is far from",)),
-        ({"source__passage": "kept by EKF2"}, ("kept by EKF2",)),
+        ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
 def test_what_stands_out_in_one_report(values, said):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
 from px4fuse.comparison.model import UnjudgedFilter as Unjudged
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 MIN_WHITE_P = 0.001
 # Error of the reported σ, by verdict
 SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
+RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
@@ -95,9 +96,9 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     has_truth = isinstance(analysis.flight.truth, Truth)
 
     def rms_cells(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
-        statistics: list[Any] = [result.difference if name == "KF" else None] if has_ekf2 else []
-        statistics += [one.truth] if has_truth else []
-        return [_format_rms(statistic, field) for statistic in statistics for field in RMSE_FIELDS]
+        difference = result.difference if name == "KF" else None
+        cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
+        return cells + [_format_rms(one.truth, field) for field in RMSE_FIELDS if has_truth]
 
     head = [*VERDICT_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []

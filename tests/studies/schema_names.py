@@ -107,17 +107,21 @@ def convert(value: Any, path: str = "") -> Any:
     return RENAMED_IDS.get(value, value) if isinstance(value, str) else value
 
 
-def convert_text(line: str) -> str:
-    """Replace the finding ids in a line of text."""
-    return re.sub(r"\b[a-z][a-z0-9_]+\b", lambda id_: RENAMED_IDS.get(id_[0], id_[0]), line)
+def words(lines: list[str]) -> list[str]:
+    """Split lines into words with the new names, without folders: longer ids move line ends."""
+    new = {**RENAMED_IDS, "info": "note", "info:": "note:"}
+    text = [re.sub(r"/\S*/", "", word) for word in " ".join(lines).split()]
+    return [re.sub(r"[a-z][a-z0-9_]*:?", lambda name: new.get(name[0], name[0]), w) for w in text]
 
 
 def convert_record(record: dict[str, Any]) -> dict[str, Any]:
     """Convert the record of one case of a frozen state, without the drawing of its pages."""
-    for output in ("terminal", "errors"):
-        record[output] = [convert_text(line) for line in record[output]]
-    pages = [{"text": [convert_text(line) for line in page["text"]]} for page in record["pages"]]
-    return record | {"results": convert(record["results"]), "pages": pages}
+    return record | {
+        "terminal": words(record["terminal"]),
+        "errors": words(record["errors"]),
+        "results": convert(record["results"]),
+        "pages": [words(page["text"]) for page in record["pages"]],
+    }
 
 
 def main() -> int:
@@ -133,15 +137,13 @@ def main() -> int:
         return 0
     before, after = given.paths
     with tempfile.TemporaryDirectory() as where:
-        for folder in (before, after):
-            (target := Path(where, folder.name)).mkdir()
+        targets = Path(where, "before"), Path(where, "after")
+        for folder, target in zip((before, after), targets, strict=True):
+            target.mkdir()
             for path in folder.glob("*.json.gz"):
-                record = json.loads(gzip.decompress(path.read_bytes()))
-                for page in record["pages"]:
-                    page.pop("operations")
-                record = convert_record(record) if folder == before else record
+                record = convert_record(json.loads(gzip.decompress(path.read_bytes())))
                 (target / path.name).write_bytes(gzip.compress(json.dumps(record).encode()))
-        return min(compare(Path(where, before.name), Path(where, after.name), given.shown), 1)
+        return min(compare(*targets, given.shown), 1)
 
 
 if __name__ == "__main__":
