@@ -148,7 +148,9 @@ def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
 # -- the sample flight -----------------------------------------------------------------------------
 
 
-def test_sample_file_is_placed_without_any_option(sample_flight, external, true_offset_s) -> None:
+def test_align_sample_file_without_options_recovers_placement(
+    sample_flight, external, true_offset_s
+) -> None:
     alignment, track = placed(sample_flight, external)
     assert alignment.frame == "enu"
     assert "fits EKF2 position best" in alignment.frame_reason
@@ -177,7 +179,7 @@ def test_sample_file_is_placed_without_any_option(sample_flight, external, true_
     yaw_deg=st.floats(-179.0, 179.0),
     origin_m=st.tuples(*[st.floats(-8.0, 8.0)] * 3),
 )
-def test_any_clock_frame_yaw_and_origin_is_recovered(
+def test_align_any_clock_frame_yaw_and_origin_is_recovered(
     seed, frame, told, offset_s, yaw_deg, origin_m
 ):
     flight = flight_along(seed=seed)
@@ -193,7 +195,7 @@ def test_any_clock_frame_yaw_and_origin_is_recovered(
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_sigmas_of_clock_and_yaw_are_the_scatter_over_many_flights() -> None:
+def test_align_clock_and_yaw_sigma_match_scatter_of_flights() -> None:
     clock, yaw = [], []
     for seed in range(24):
         flight = flight_along(seed=seed, duration_s=60.0)
@@ -206,7 +208,7 @@ def test_sigmas_of_clock_and_yaw_are_the_scatter_over_many_flights() -> None:
 
 
 @pytest.mark.parametrize("frame", sorted(FROM_NED))
-def test_frame_is_told_by_the_fit_unless_the_columns_name_it(flight: Flight, frame: str) -> None:
+def test_align_frame_is_from_columns_or_best_fit(flight: Flight, frame: str) -> None:
     file = recorded(flight, frame=frame)
     alignment, track = placed(flight, file)
     assert alignment.frame == frame
@@ -217,7 +219,7 @@ def test_frame_is_told_by_the_fit_unless_the_columns_name_it(flight: Flight, fra
     assert alignment.frame_reason == "from the column names of the file"
 
 
-def test_an_aisle_at_45_degrees_without_height_does_not_tell_the_frame() -> None:
+def test_align_aisle_at_45_degrees_without_height_needs_frame() -> None:
     flight = flight_along(partial(passes, across_m=0.0), heading_deg=45.0)
     file = recorded(flight, frame="enu")
     file.samples["z_m"] = np.nan
@@ -229,7 +231,7 @@ def test_an_aisle_at_45_degrees_without_height_does_not_tell_the_frame() -> None
     assert track.samples["north_m"].notna().all()
 
 
-def test_variances_turn_with_the_track(flight: Flight) -> None:
+def test_align_rotates_variances_with_track(flight: Flight) -> None:
     file = recorded(flight, frame="enu", yaw_deg=90.0, sigma_m=[0.1, 0.2, 0.3])
     options: dict[str, Any] = {"frame": "enu", "clock_offset_s": OFFSET_S}
     variances = [
@@ -245,7 +247,7 @@ def test_variances_turn_with_the_track(flight: Flight) -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Flight) -> None:
+def test_align_result_contains_track_file_and_reader_notes(flight: Flight) -> None:
     result = align_position_file(flight, recorded(flight))
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
@@ -263,7 +265,7 @@ def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Fli
     (90.0, (0.0, 0.0, 0.0)), (-12.0, (1.0, 2.0, 0.0)), (180.0, (5.0, 0.0, 0.0)),
     (0.0, (2.0, 0.0, 0.0)),
 ])  # fmt: skip
-def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(flight, yaw_deg, origin_m):
+def test_align_misaligned_frame_warns_and_recovers_clock(flight, yaw_deg, origin_m):
     file = recorded(flight, yaw_deg=yaw_deg, origin_m=origin_m)
     alignment, _ = placed(flight, file, frame="enu")
     assert alignment.yaw_deg == 0.0
@@ -279,7 +281,7 @@ def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(flight, yaw_de
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) -> None:
+def test_align_given_clock_offset_is_used_and_checked(flight: Flight) -> None:
     wrong, _ = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings
     assert warning.startswith("The position file does not match the EKF2 position (correlation ")
@@ -291,7 +293,7 @@ def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) 
     assert_same_track(track, flight.positions[0], 0.1)
 
 
-def test_a_height_that_runs_against_ekf2s_and_another_day_are_warned_of(flight: Flight) -> None:
+def test_align_inverted_height_or_other_start_time_warns(flight: Flight) -> None:
     file = recorded(flight)
     file.samples["z_m"] *= -1.0
     other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
@@ -304,7 +306,7 @@ def test_a_height_that_runs_against_ekf2s_and_another_day_are_warned_of(flight: 
 # -- what real files are like ----------------------------------------------------------------------
 
 
-def test_outliers_and_gaps_move_the_clock_little() -> None:
+def test_align_outliers_and_gap_keep_clock_and_yaw() -> None:
     flight = flight_along(uwb=Uwb(outlier_share=0.08, gap_s=(30.0, 48.0)))
     alignment, _ = placed(flight, recorded(flight), frame="enu", yaw_deg="auto")
     assert off_s(alignment) < 0.03
@@ -313,7 +315,7 @@ def test_outliers_and_gaps_move_the_clock_little() -> None:
 
 
 @pytest.mark.parametrize("delta", [(3.0, -2.0, 0.5), (100.0, 40.0, 0.0)])
-def test_a_reset_of_ekf2_does_no_harm(delta: tuple[float, float, float]) -> None:
+def test_align_ekf2_position_reset_keeps_placement(delta: tuple[float, float, float]) -> None:
     flight = flight_along(ekf2=Estimator(resets=(Reset(70.0, "position", delta),)))
     for yaw in (None, "auto"):
         alignment, track = placed(flight, recorded(flight), frame="enu", yaw_deg=yaw)
@@ -329,7 +331,7 @@ QUIET = Imu(sigma_a_m_s2=0.1)
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.5])
-def test_without_ekf2_the_imu_gives_clock_and_yaw(noise: float) -> None:
+def test_align_without_ekf2_uses_imu_for_clock_and_yaw(noise: float) -> None:
     flight = flight_along(imu=Imu(sigma_a_m_s2=noise), ekf2=None)
     file = recorded(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
     alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
@@ -342,7 +344,7 @@ def test_without_ekf2_the_imu_gives_clock_and_yaw(noise: float) -> None:
     assert any("set to 0" in warning for warning in alignment.warnings)
 
 
-def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
+def test_align_without_ekf2_imu_finds_frame_and_misalignment() -> None:
     flight = flight_along(imu=QUIET)
     blind = replace(flight, ekf2=unavailable("EKF2"))
     assert placed(blind, recorded(flight, frame="nwu"))[0].frame == "nwu"
@@ -362,7 +364,7 @@ def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
 BOTH_SPANS = r"the log covers 2416\.25 s to 2536\.25 s of the boot clock, the file 1795253666\.45 s"
 
 
-def test_what_stands_still_is_placed_by_a_given_offset_alone() -> None:
+def test_align_vehicle_at_rest_needs_clock_offset() -> None:
     flight = flight_along(partial(passes, across_m=0.0), length_m=0.0)
     for parts in ({}, {"ekf2": unavailable("EKF2")}):
         said = rf"^uwb\.csv: .*hardly change; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
@@ -375,7 +377,7 @@ def test_what_stands_still_is_placed_by_a_given_offset_alone() -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_no_reference_at_all() -> None:
+def test_align_without_ekf2_and_imu_needs_offset_and_frame() -> None:
     flight = flight_along(imu=None, ekf2=None)
     file = recorded(flight)
     said = f"no EKF2 position; the log has no acceleration.*{BOTH_SPANS}.*"
@@ -389,7 +391,7 @@ def test_no_reference_at_all() -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_files_that_cannot_be_of_the_flight_are_refused(flight: Flight) -> None:
+def test_align_no_overlap_long_or_short_file_is_refused(flight: Flight) -> None:
     """By an offset without overlap, over days, of a few positions."""
     file = recorded(flight)
     for offset in (0.0, OFFSET_S + 121.0, OFFSET_S - 121.0):
@@ -405,7 +407,7 @@ def test_files_that_cannot_be_of_the_flight_are_refused(flight: Flight) -> None:
         align_position_file(flight, replace(file, samples=file.samples.iloc[:9]))
 
 
-def test_a_file_of_another_flight_is_refused(flight: Flight) -> None:
+def test_align_file_of_other_flight_is_refused(flight: Flight) -> None:
     def other(time_s: Array, heading_deg: float, length_m: float) -> Array:
         angle = 2.0 * np.pi * time_s / 55.0
         radius = 3.0 + np.sin(7.0 * angle)
@@ -416,7 +418,7 @@ def test_a_file_of_another_flight_is_refused(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize("yaw", [None, "auto"])
-def test_a_flight_that_repeats_itself_needs_the_offset(yaw: Any) -> None:
+def test_align_periodic_path_needs_clock_offset(yaw: Any) -> None:
     flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
     file = recorded(flight)
     said = r"from this path; offsets that differ by [1-6]0\.\d s fit.*"
@@ -426,7 +428,7 @@ def test_a_flight_that_repeats_itself_needs_the_offset(yaw: Any) -> None:
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
 
 
-def test_a_flight_that_nearly_repeats_itself_is_warned_of() -> None:
+def test_align_almost_periodic_path_warns() -> None:
     def ever_faster(time_s: Array, heading_deg: float, length_m: float) -> Array:
         along = 5.0 * (1.0 - np.cos(2.0 * np.pi * (time_s / 20.0 + time_s**2 / 2e5)))
         return np.stack([along, 0.0 * along, 0.0 * along], axis=1)
@@ -444,7 +446,9 @@ def test_a_flight_that_nearly_repeats_itself_is_warned_of() -> None:
     ({"yaw_deg": "north"}, "`yaw_deg` north is not valid: give degrees or auto."),
     ({"clock_offset_s": float("inf")}, "`clock_offset_s` inf is not a finite number."),
 ])  # fmt: skip
-def test_invalid_options(flight: Flight, options: dict[str, Any], message: str) -> None:
+def test_align_invalid_options_raise_settings_error(
+    flight: Flight, options: dict[str, Any], message: str
+) -> None:
     with pytest.raises(SettingsError) as caught:
         align_position_file(flight, recorded(flight), **options)
     assert str(caught.value) == message
@@ -455,7 +459,7 @@ def test_invalid_options(flight: Flight, options: dict[str, Any], message: str) 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.14.4_aisle_nominal", "v1.16.1_aisle_nlos"])
-def test_simulated_flights(shared_logs: Path, name: str) -> None:
+def test_align_simulated_logs_recovers_clock_and_frame(shared_logs: Path, name: str) -> None:
     log = shared_logs / "simulated" / f"{name}.ulg"
     record = json.loads(log.with_suffix(".json").read_text())
     stamps = np.array([sample["t_unix"] for sample in record["uwb"]])

@@ -31,7 +31,7 @@ def read(tmp_path: Path, text: str):
     return read_answers(path)
 
 
-def test_an_empty_form_says_nothing_and_explains_every_mistake(tmp_path: Path) -> None:
+def test_empty_form_has_no_answers_and_lists_every_mistake(tmp_path: Path) -> None:
     found = read(tmp_path, EMPTY)
     assert found.log_sha256 == SHA256
     assert (found.mistakes, found.quantities) == ((), (None, None, None))
@@ -40,7 +40,7 @@ def test_an_empty_form_says_nothing_and_explains_every_mistake(tmp_path: Path) -
         assert f"#     {name} " in EMPTY
 
 
-def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
+def test_read_answers_returns_filled_in_values(tmp_path: Path) -> None:
     text = EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = -0.367")
     text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
     found = read(tmp_path, text.replace('verdict_ours = ""', 'verdict_ours = "overstated"'))
@@ -74,14 +74,16 @@ def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
         (EMPTY.replace("ekf2_did = []", 'ekf2_did = ["slept"]'), "'slept' is not one of"),
     ],
 )  # fmt: skip
-def test_nonsense_is_one_line_that_says_where(tmp_path: Path, text: str, said: str) -> None:
+def test_read_answers_invalid_form_names_place_in_one_line(
+    tmp_path: Path, text: str, said: str
+) -> None:
     with pytest.raises(SettingsError) as error:
         read(tmp_path, text)
     assert said in str(error.value)
     assert "\n" not in str(error.value).replace("\\n", "")
 
 
-def test_quantities_differ_between_logs_and_are_those_of_a_replay() -> None:
+def test_quantities_depend_on_log_and_match_replay() -> None:
     drawn = {draw_questions(f"{n:064x}") for n in range(200)}
     assert len(drawn) == 200
     kinds = {quantity.kind for each in drawn for quantity in each}
@@ -99,7 +101,7 @@ def test_quantities_differ_between_logs_and_are_those_of_a_replay() -> None:
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
-def test_silence_is_predicted_step_by_step() -> None:
+def test_quantity_truth_source_gap_matches_closed_form() -> None:
     """Against the closed form: P grows by F P Fᵀ + Q for each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(
@@ -120,7 +122,9 @@ def test_silence_is_predicted_step_by_step() -> None:
 
 
 @pytest.mark.usefixtures("analysed_once", "drawn_once")
-def test_the_way_of_a_form(tmp_path: Path, sample_log: Path) -> None:
+def test_compare_answers_option_adds_form_to_page_and_results(
+    tmp_path: Path, sample_log: Path
+) -> None:
     """``answers`` writes it, ``compare`` reads it into page and results."""
     form, report = tmp_path / "f.toml", tmp_path / "r.pdf"
     done("answers", sample_log, "-o", form)

@@ -125,7 +125,7 @@ def honest(flight: Flight, rubric: Rubric) -> GradedReport:
     return flight.graded(report_of(flight.honest.pdf), verdict, rubric)
 
 
-def test_the_honest_report_is_verified_and_names_both(honest: GradedReport) -> None:
+def test_grade_honest_report_is_verified_with_points(honest: GradedReport) -> None:
     assert honest.status == "verified"
     assert honest.pending == ""
     assert honest.flags == ()
@@ -147,7 +147,7 @@ def test_the_honest_report_is_verified_and_names_both(honest: GradedReport) -> N
         "a_" * 90_000,
     ],
 )
-def test_no_sentence_earns_anything(
+def test_grade_notes_without_content_earn_no_points(
     flight: Flight, honest: GradedReport, rubric: Rubric, text: str
 ) -> None:
     graded = flight.with_notes(text, rubric)
@@ -213,7 +213,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_files(
+def test_grade_forged_results_are_not_verified(
     flight: Flight, honest: GradedReport, rubric: Rubric, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, status, pending = FILES[name]
@@ -239,7 +239,9 @@ def test_files(
     assert graded.points <= honest.points + 1e-9
 
 
-def test_pages_that_were_painted_over(flight: Flight, honest: GradedReport, rubric: Rubric) -> None:
+def test_grade_painted_page_is_scored_from_redrawn_report(
+    flight: Flight, honest: GradedReport, rubric: Rubric
+) -> None:
     """The numbers are verified, the page is not, and what is scored is the redrawn report."""
     painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
     pdf = forged(flight.honest.pdf, painted)

@@ -115,7 +115,7 @@ def shape(text: str) -> list[tuple[str, list[str]]]:
     return [(tag, sorted(attributes)) for tag, attributes in Elements(text).found]
 
 
-def test_the_page_holds_what_it_held() -> None:
+def test_class_page_matches_golden_file() -> None:
     text = html_text(CLASS, "Class", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
     lines = [line for line in above if line.strip() and "sha256" not in line]
@@ -124,7 +124,7 @@ def test_the_page_holds_what_it_held() -> None:
 
 
 @given(text=st.text(max_size=60) | st.sampled_from([MARKUP, BREAKOUT, "\0\x1b\ud800", "$title"]))
-def test_text_makes_no_elements(text: str) -> None:
+def test_class_page_any_text_adds_no_html_elements(text: str) -> None:
     def page(word: str) -> str:
         one = row(
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
@@ -140,7 +140,7 @@ def test_text_makes_no_elements(text: str) -> None:
     assert shape(made) == shape(page("x" if text else ""))
 
 
-def test_pending_points_stand_apart_from_those_that_count() -> None:
+def test_class_page_pending_points_are_not_averaged() -> None:
     said = {"Notes": Override(9.0, "Good.")}
     entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0), row("Cy", 12.0, pending="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
@@ -155,7 +155,7 @@ def test_pending_points_stand_apart_from_those_that_count() -> None:
                          ["13 / 20", 13.0, "set by instructor", "", 0.65]]  # fmt: skip
 
 
-def test_what_is_not_finite_too_long_or_too_much() -> None:
+def test_class_page_limits_long_text_and_omits_nan() -> None:
     odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
     text = html_text([odd], "Class", "px4fuse 1")
     assert "nan" not in text.lower().split("<script>")[0]
@@ -195,7 +195,7 @@ def anonymous_class() -> list[Entry]:
     return entries
 
 
-def test_an_anonymous_class_names_nobody() -> None:
+def test_class_page_anonymous_contains_no_names() -> None:
     text = html_text(anonymous_class(), "Class", "px4fuse 1")
     written = unicodedata.normalize("NFC", text + json.dumps(content(text), ensure_ascii=False))
     for name, student_id, file in PEOPLE:
@@ -228,7 +228,7 @@ HEADS = ("Student", "Id", "Status", "Points", "Handed in", "Flags", "Pages", "No
          "mean NIS", MARKUP)  # fmt: skip
 
 
-def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
+def test_class_page_filters_by_text_and_status(page: Browser) -> None:
     count = "document.querySelector('.count').textContent"
     assert page.ask(count) == f"Showing {len(CLASS)} of {len(CLASS)}"
     page.click("#text")
@@ -250,7 +250,7 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     assert page.complaints() == []
 
 
-def test_a_row_unfolds_with_its_report(page: Browser) -> None:
+def test_class_page_row_opens_report_details(page: Browser) -> None:
     assert page.ask("[...document.querySelectorAll('.bar')].every((one) => one.ariaHidden)")
     assert page.ask("document.querySelector('tr:first-child .bar').closest('td').innerText") == (
         "18.5 / 20"
@@ -270,7 +270,7 @@ def test_a_row_unfolds_with_its_report(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_keys_step_through_the_reports(page: Browser) -> None:
+def test_class_page_keys_step_through_reports(page: Browser) -> None:
     opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
     for key, name in (("j", "Zoë"), ("n", "ada"), ("j", "Émile"), ("k", "ada"), ("p", "Zoë")):
         page.press(key, key)
@@ -298,7 +298,7 @@ def test_tenths_count_values_by_lower_edge() -> None:
     ]
 
 
-def test_what_students_wrote_stays_text(page: Browser) -> None:
+def test_class_page_student_markup_is_shown_as_text(page: Browser) -> None:
     page.ask("[...document.querySelectorAll('.unfold')].forEach((button) => button.click())")
     named = [TURNED if one.student == REVERSED else one.display_name for one in CLASS]
     assert page.names() == named
@@ -321,7 +321,7 @@ def test_what_students_wrote_stays_text(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_the_policy_stops_what_would_come_to_life(page: Browser) -> None:
+def test_class_page_policy_blocks_images_and_requests(page: Browser) -> None:
     page.ask(
         "document.body.insertAdjacentHTML('beforeend',"
         ' \'<img src="http://127.0.0.1:9/x.png" onerror="window.alive=3">\')'
@@ -333,7 +333,7 @@ def test_the_policy_stops_what_would_come_to_life(page: Browser) -> None:
     assert any("img-src" in text and "127.0.0.1" in text for text in refusals)
 
 
-def test_printed_every_page_has_the_table_s_head(browser: Browser, tmp_path: Path) -> None:
+def test_class_page_print_repeats_table_header(browser: Browser, tmp_path: Path) -> None:
     file = tmp_path / "class.html"
     many = [row(f"Student {n}", 9.0, flags=("Look here.",)) for n in range(130)]
     file.write_bytes(html_text(many, "Class", "px4fuse 1").encode())
@@ -348,7 +348,7 @@ def test_printed_every_page_has_the_table_s_head(browser: Browser, tmp_path: Pat
     assert "Student 129" in "".join(pages)
 
 
-def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Browser) -> None:
+def test_class_page_points_and_comments_download_as_csv(page: Browser) -> None:
     page.ask("URL.createObjectURL = (one) => { window.table = one.text(); return '#'; }; 0")
     assert not page.ask("document.querySelector('#save').checkVisibility()")
     page.ask("document.querySelector('.list > tbody > tr .unfold').click()")

@@ -55,7 +55,7 @@ THREE = {
 
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
-def test_one_attempt_counts_and_the_others_are_beneath(attempt, points) -> None:
+def test_class_entries_attempt_rule_selects_counting_report(attempt, points) -> None:
     (ada, grace), _ = laid_out(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counting.points == ada.total == points
     assert len(ada.others) == 2
@@ -63,7 +63,7 @@ def test_one_attempt_counts_and_the_others_are_beneath(attempt, points) -> None:
     assert (grace.counting, grace.total, grace.of) == (None, None, 10.0)
 
 
-def test_late_is_what_comes_after_the_due_time_in_its_zone() -> None:
+def test_class_entries_late_report_has_deduction() -> None:
     term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
     (ada, _), _ = laid_out(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
@@ -83,13 +83,13 @@ def test_late_is_what_comes_after_the_due_time_in_its_zone() -> None:
         (due_time("2026-10-24 23:00:00 Europe/Berlin"), "1%/hour", 683 * 3600.0 + 3600.0, 10.0),
     ],
 )
-def test_what_is_taken_off(due, rule, late_s, off) -> None:
+def test_class_entries_deduction_ends_at_zero_points(due, rule, late_s, off) -> None:
     (ada, _), _ = laid_out(THREE, Course(RUBRIC, due=due, late=late_rule(rule)))
     assert (ada.late_s, ada.deduction) == (late_s, off)
     assert ada.total == 0.0
 
 
-def test_a_zip_files_time_orders_attempts_and_costs_nothing() -> None:
+def test_class_entries_zip_time_orders_without_deduction() -> None:
     first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
     files = {second: graded("", 7.0), first: graded("", 9.0)}
@@ -103,7 +103,7 @@ def test_a_zip_files_time_orders_attempts_and_costs_nothing() -> None:
     assert "Canvas marks the file as late" in grace.flags[0]
 
 
-def test_what_is_no_report_counts_only_where_nothing_else_is_there() -> None:
+def test_class_entries_other_pdf_counts_only_without_report() -> None:
     essay = replace(graded("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False))
     files = {blackboard("ada", "19-10-00-00"): graded("", 4.0),
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
@@ -119,7 +119,7 @@ def of_form(points: float, kind: str, **more):
     return replace(graded("", points, student_id="1"), form=form, **more)
 
 
-def test_a_guess_in_each_of_several_files_does_not_pay() -> None:
+def test_class_entries_differing_forms_are_pending() -> None:
     """None of those that came together counts until the instructor says which is meant."""
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
     (ada, _), _ = laid_out(files)
@@ -132,7 +132,7 @@ def test_a_guess_in_each_of_several_files_does_not_pay() -> None:
     assert ada.total == 4.0
 
 
-def test_what_is_pending_displaces_no_report_that_counts() -> None:
+def test_class_entries_pending_report_keeps_counting_report() -> None:
     """As another's report under this student's id, handed in later."""
     files = {"a.pdf": of_form(9.0, "yaw"), "z.pdf": of_form(2.0, "nlos", pending="Ask whose.")}
     packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
@@ -147,14 +147,14 @@ def test_what_is_pending_displaces_no_report_that_counts() -> None:
     assert ada.counting.submission == "a.pdf"
 
 
-def test_a_name_that_imitates_a_platforms_is_flagged() -> None:
+def test_class_entries_imitated_platform_name_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
     (ada, _), _ = laid_out({name: graded("", 4.0)})
     assert ada.handed_in == "2026-11-20 10:00"
     assert ada.flags == ("The file name imitates the names of a platform (found: Blackboard).",)
 
 
-def test_of_two_files_of_one_submission_the_better_one_counts() -> None:
+def test_class_entries_better_file_of_submission_counts() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
@@ -162,7 +162,7 @@ def test_of_two_files_of_one_submission_the_better_one_counts() -> None:
         assert ada.total == 8.0, attempt
 
 
-def test_who_handed_in_is_the_platforms_word_and_a_false_id_is_said() -> None:
+def test_class_entries_platform_id_overrides_report_id() -> None:
     files = {blackboard("grace", "19-10-00-00"): graded("", 8.0, student="Ada", student_id="1")}
     (ada, grace), _ = laid_out(files)
     assert ada.counting is None
@@ -170,7 +170,7 @@ def test_who_handed_in_is_the_platforms_word_and_a_false_id_is_said() -> None:
     assert "is that of 1 (Ada Lovelace)" in grace.flags[0]
 
 
-def test_who_is_not_in_the_roster_has_a_row_that_says_so() -> None:
+def test_class_entries_unlisted_student_has_flagged_row() -> None:
     files = {
         "report.pdf": graded("", 8.0, student="Mallory", student_id="9"),
         "other.pdf": graded("", 3.0, student="lovelace ADA"),
@@ -181,7 +181,7 @@ def test_who_is_not_in_the_roster_has_a_row_that_says_so() -> None:
     assert stranger.flags[0] == "Not in the class list."
 
 
-def test_without_a_roster_everyone_who_is_named_has_one_row() -> None:
+def test_class_entries_without_roster_one_row_per_student() -> None:
     files = {
         "Doe Jane_5_assignsubmission_file_/a.pdf": graded("", 1.0, student="Jane", student_id="42"),
         "Roe Max_6_assignsubmission_file_/a.pdf": graded("", 2.0, student="Jane", student_id="42"),
@@ -208,7 +208,7 @@ TWO_OF_ONE = {"1.pdf": graded("", 4.0, 6.0, student_id="1")}
 TWO = {"1.pdf": graded("", 4.0, 6.0, student_id="1"), "2.pdf": graded("", 1.0, student_id="2")}
 
 
-def test_the_instructors_word_is_the_last(tmp_path) -> None:
+def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
     rows = said(
         tmp_path, "1,a,9.5,A good idea.", '01,,,"Come and', 'see me."', "1,total,8,Agreed.",
         "2,total,3,", "3,total,1,", "1,C,1,", '2,B,2,"x"',
@@ -239,13 +239,13 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
         )),
     ], ids=["more points than there are", "a second row on the same"],
 )  # fmt: skip
-def test_a_row_that_is_not_taken_is_told(rows, points, told, tmp_path) -> None:
+def test_overrides_excess_or_duplicate_row_is_noted(rows, points, told, tmp_path) -> None:
     (ada, _), notes = laid_out(TWO, overrides=said(tmp_path, *rows))
     assert (ada.counting.points, ada.total) == points
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
-def test_what_was_said_comes_back_from_the_class_page(tmp_path) -> None:
+def test_overrides_class_page_download_is_complete(tmp_path) -> None:
     """Also of who handed in nothing: the download replaces the file."""
     rows = said(tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown.")
     entries, notes = laid_out({"1.pdf": TWO["1.pdf"]}, overrides=rows)
@@ -257,7 +257,7 @@ def test_what_was_said_comes_back_from_the_class_page(tmp_path) -> None:
     assert (again, notes) == (rows, ())
 
 
-def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> None:
+def test_overrides_total_makes_pending_points_count(tmp_path) -> None:
     files = {"1.pdf": graded("", 4.0, student_id="1", pending="Run 0.1.1.")}
     (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,A,9,"))
     assert ada.total is None
@@ -265,7 +265,7 @@ def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> N
     assert ada.total == 9.0
 
 
-def test_who_handed_in_nothing_can_be_given_points(tmp_path) -> None:
+def test_overrides_without_submission_give_points(tmp_path) -> None:
     (_, grace), notes = laid_out({}, overrides=said(tmp_path, "2,Total,5,Shown in class."))
     assert (grace.total, notes) == (5.0, ())
     assert "Shown in class." in feedback_text(grace)
@@ -273,7 +273,7 @@ def test_who_handed_in_nothing_can_be_given_points(tmp_path) -> None:
     assert (grace.total, len(notes)) == (None, 1)
 
 
-def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
+def test_read_overrides_semicolons_and_decimal_commas_are_read(tmp_path) -> None:
     rows = said(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
     assert rows == {"1": {"A": Override(7.5)}}
 
@@ -289,7 +289,7 @@ def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
         ("1,A,5,\n1,A,6,", "is given twice"),
     ],
 )
-def test_what_the_instructor_cannot_have_meant_stops_the_run(tmp_path, row, says) -> None:
+def test_read_overrides_invalid_row_raises_error(tmp_path, row, says) -> None:
     with pytest.raises(SettingsError, match=says):
         said(tmp_path, row)
     with pytest.raises(SettingsError, match="no column comment"):
@@ -313,11 +313,11 @@ BERLIN = "2026-11-20T23:59:59+01:00"
         ("2026-11-20 Europe/Berlin", BERLIN),
     ],
 )
-def test_a_due_time_has_its_zone(text, is_) -> None:
+def test_due_time_with_zone_is_parsed(text, is_) -> None:
     assert due_time(text) == datetime.fromisoformat(is_)
 
 
-def test_without_a_zone_it_is_this_computers(monkeypatch) -> None:
+def test_due_time_without_zone_uses_local_zone(monkeypatch) -> None:
     monkeypatch.setenv("TZ", "America/New_York")
     time.tzset()
     try:
@@ -332,14 +332,14 @@ def test_without_a_zone_it_is_this_computers(monkeypatch) -> None:
     [(due_time, "--due", ("", "tomorrow", "20.11.2026", "2026-11-20 23:59 Mars/Base", "Z")),
      (late_rule, "--late", ("", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day"))],
 )  # fmt: skip
-def test_what_is_no_time_and_no_rule_is_one_line(read, said, texts) -> None:
+def test_due_time_and_late_rule_invalid_text_is_one_line(read, said, texts) -> None:
     for text in texts:
         with pytest.raises(SettingsError, match=said) as caught:
             read(text)
         assert "\n" not in str(caught.value)
 
 
-def test_every_started_day_costs_and_never_more_than_all() -> None:
+def test_late_rule_counts_started_days_up_to_limit() -> None:
     for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
         assert late_rule("10%/day").deduction(late_s, 120.0) == off
     # a rule may name its limit and hours
@@ -347,7 +347,7 @@ def test_every_started_day_costs_and_never_more_than_all() -> None:
     assert late_rule("1%/hour up to 5%").deduction(1e6, 100.0) == 5.0
 
 
-def test_platforms_times_without_a_zone_are_in_that_of_the_due_time() -> None:
+def test_in_zone_of_naive_time_uses_zone_of_due_time() -> None:
     due = due_time("2026-11-20 23:59:00 +05:30")
     bare = datetime(2026, 11, 21, 0, 59)
     assert (in_zone_of(bare, due) - due).total_seconds() == 3600.0
@@ -355,7 +355,7 @@ def test_platforms_times_without_a_zone_are_in_that_of_the_due_time() -> None:
     assert in_zone_of(told, due) == due
 
 
-def test_moodles_words_for_a_time() -> None:
+def test_moodle_time_parses_english_dates_only() -> None:
     assert moodle_time("Friday, 20 November 2026, 23:58") == datetime(2026, 11, 20, 23, 58)
     assert moodle_time("Friday, 20 November 2026, 11:58 PM") == datetime(2026, 11, 20, 23, 58)
     assert moodle_time("Freitag, 20. November 2026, 23:58") is None

@@ -58,7 +58,7 @@ def evo_aligned(estimate: str, reference: str, kind: AlignmentKind) -> tuple[Any
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
-def test_ate_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+def test_ate_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     pytest.importorskip("evo")
     from evo.core.metrics import APE, PoseRelation
 
@@ -84,7 +84,7 @@ DELTAS = (Delta(1, "frames"), Delta(10, "frames"), Delta(0.5, "m"), Delta(5.0, "
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
-def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+def test_rpe_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     pytest.importorskip("evo")
     from evo.core.filters import FilterException
     from evo.core.metrics import RPE, PoseRelation
@@ -117,7 +117,7 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
 
 
 @pytest.mark.parametrize(("kind", "unknowns"), [("yaw", 4), ("se3", 6), ("sim3", 7)])
-def test_closed_forms_are_the_minimum(kind: AlignmentKind, unknowns: int) -> None:
+def test_fit_alignment_minimises_squared_distances(kind: AlignmentKind, unknowns: int) -> None:
     random = np.random.default_rng(5)
     x = random.normal(0.0, 2.0, (40, 3))
     y = 1.2 * TURN.apply(x) + SHIFT + random.normal(0.0, 0.5, (40, 3))
@@ -143,7 +143,7 @@ def line(noise_m: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 1e-9, 1e-3, 0.1])
-def test_a_turn_about_the_line_of_motion_is_refused(noise_m: float) -> None:
+def test_fit_alignment_straight_line_allows_yaw_only(noise_m: float) -> None:
     x, y = line(noise_m)
     for kind in ("se3", "sim3"):
         with pytest.raises(TrajectoryError, match=r"along a line.*`alignment` yaw"):
@@ -151,7 +151,7 @@ def test_a_turn_about_the_line_of_motion_is_refused(noise_m: float) -> None:
     assert fit_alignment(x, y, "yaw").rotation.magnitude() < 0.02
 
 
-def test_alignments_without_motion_are_refused() -> None:
+def test_fit_alignment_without_motion_is_refused() -> None:
     random = np.random.default_rng(3)
     still = random.normal(0.0, 0.01, (200, 3))
     up = np.linspace(0.0, 3.0, 200)[:, None] * [0.0, 0.0, 1.0]
@@ -170,7 +170,7 @@ def test_alignments_without_motion_are_refused() -> None:
 # -- association -----------------------------------------------------------------------------------
 
 
-def test_interpolation_is_exact_where_the_motion_is_uniform_and_stops_at_a_gap() -> None:
+def test_associate_interpolates_uniform_motion_not_gaps() -> None:
     time = np.arange(0.0, 10.0, 0.1)
     turns = Rotation.from_rotvec(time[:, None] * [0.1, 0.5, 0.2])
     reference = Trajectory("r", "truth", time, time[:, None] * [1.0, 2.0, 3.0], turns)
@@ -196,7 +196,7 @@ def test_interpolation_is_exact_where_the_motion_is_uniform_and_stops_at_a_gap()
 
 
 @pytest.mark.parametrize("denser", [False, True], ids=["estimate sparser", "estimate denser"])
-def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: bool) -> None:
+def test_associate_nearest_equals_exhaustive_search(denser: bool) -> None:
     """Every pair by trying all, with poses before, after and in a gap of the reference."""
     reference = flight(20.0, 10.0)
     reference = reference[(reference.time_s < 8.0) | (reference.time_s > 12.0)]
@@ -227,7 +227,7 @@ def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: 
 
 
 @pytest.mark.parametrize("method", ["interpolate", "nearest"])
-def test_no_overlap_names_both_spans_and_the_remedy(method: Method) -> None:
+def test_evaluate_no_overlap_names_spans_and_remedy(method: Method) -> None:
     reference = flight()
     estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
     said = r"no poses match.*500.000 to 559.950 s.*0.000 to 59.950 s.*`time_offset_s` auto"
@@ -240,7 +240,7 @@ def test_no_overlap_names_both_spans_and_the_remedy(method: Method) -> None:
 
 
 @pytest.mark.parametrize("kind", ["yaw", "se3", "sim3"])
-def test_a_transformed_copy_has_no_error(kind: AlignmentKind) -> None:
+def test_evaluate_transformed_copy_has_zero_error(kind: AlignmentKind) -> None:
     reference = flight()
     turn = Rotation.from_euler("z", 2.0) if kind == "yaw" else TURN
     copied = moved(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
@@ -254,7 +254,7 @@ def test_a_transformed_copy_has_no_error(kind: AlignmentKind) -> None:
     assert not got.warnings
 
 
-def test_a_tilt_shows_after_yaw_and_hides_after_se3() -> None:
+def test_ate_tilt_remains_after_yaw_alignment_only() -> None:
     reference = flight()
     tilted = moved(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
     got = evaluate(tilted, reference)
@@ -264,7 +264,7 @@ def test_a_tilt_shows_after_yaw_and_hides_after_se3() -> None:
     assert evaluate(tilted, reference, alignment="se3").ate.translation_m.rmse < 1e-9
 
 
-def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
+def test_rpe_scale_error_is_proportional_to_distance() -> None:
     reference = flight(200.0, 50.0)
     got = evaluate(moved(reference, TURN, SHIFT, 1.02, kind="vio"), reference, alignment="se3")
     for one in got.rpe:
@@ -277,7 +277,7 @@ def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
     steps=st.lists(st.sampled_from([0.0, 0.1, 0.25, 1.0, 3.0]), min_size=3, max_size=40),
     value=st.sampled_from([0.1, 0.3, 0.5, 1.0, 2.0]),
 )
-def test_pairs_are_those_of_the_definition(steps: list[float], value: float) -> None:
+def test_pairs_equal_their_definition(steps: list[float], value: float) -> None:
     along = np.concatenate(([0.0], np.cumsum(steps)))
     position, time = along[:, None] * [1.0, 0.0, 0.0], np.arange(len(along), dtype=float)
     expected = []
@@ -293,7 +293,7 @@ def test_pairs_are_those_of_the_definition(steps: list[float], value: float) -> 
     np.testing.assert_array_equal(end, start + 2)
 
 
-def test_pairs_are_measured_along_the_reference() -> None:
+def test_relative_error_pairs_follow_reference_distance() -> None:
     """Also where the estimate's path is twice as long."""
     reference = flight(30.0)
     double = moved(reference, TURN, SHIFT, 2.0, kind="vio")
@@ -302,7 +302,7 @@ def test_pairs_are_measured_along_the_reference() -> None:
     np.testing.assert_array_equal((other.start, other.end), (same.start, same.end))
 
 
-def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
+def test_evaluate_missing_orientation_or_pairs_give_reason() -> None:
     reference = flight()
     got = evaluate(replace(reference, rotation=None, kind="vio"), reference)
     assert isinstance(got.ate.rotation_deg, Unavailable)
@@ -333,7 +333,7 @@ def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
     (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "unknown system"),
     (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
 ])  # fmt: skip
-def test_the_alignment_follows_from_what_the_two_are(
+def test_choose_alignment_depends_on_kinds_and_frames(
     estimate, reference, name, scale, expected, why
 ):
     y = replace(flight(), kind=reference[0], frame=reference[1])
@@ -343,7 +343,7 @@ def test_the_alignment_follows_from_what_the_two_are(
     assert why in reason
 
 
-def test_an_aisle_is_aligned_by_yaw_where_z_is_vertical() -> None:
+def test_evaluate_aisle_with_vertical_z_is_aligned_by_yaw() -> None:
     x, y = line(0.02)
     aisle = Trajectory("aisle", "truth", np.arange(len(x)) * 0.1, y, None, "NED")
     got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)
@@ -353,7 +353,7 @@ def test_an_aisle_is_aligned_by_yaw_where_z_is_vertical() -> None:
         evaluate(replace(aisle, kind="slam", frame="camera", position_m=x), aisle)
 
 
-def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> None:
+def test_evaluate_camera_removes_mounting_rotation() -> None:
     reference = flight()
     mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
     camera = moved(reference, TURN, SHIFT, kind="slam", frame="camera")
@@ -371,7 +371,7 @@ def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> N
         assert evaluate(same, reference, alignment="se3").body_rotation is None
 
 
-def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
+def test_evaluate_doubtful_arguments_give_warnings() -> None:
     truth = flight()
     vio = moved(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
     slam = replace(vio, kind="slam", name="slam")
@@ -397,7 +397,7 @@ def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.0371, -2.5, 17.0, 1_795_253_724.3])
 @pytest.mark.parametrize("rate_hz", [7.0, 50.0])
-def test_an_offset_between_clocks_is_recovered(offset_s: float, rate_hz: float) -> None:
+def test_time_offset_is_recovered_at_each_rate(offset_s: float, rate_hz: float) -> None:
     reference = flight()
     random = np.random.default_rng(4)
     estimate = moved(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")
@@ -412,7 +412,7 @@ def test_an_offset_between_clocks_is_recovered(offset_s: float, rate_hz: float) 
     assert back.offset_s == pytest.approx(-offset_s, abs=2e-3)
 
 
-def test_the_interval_of_an_offset_holds_it() -> None:
+def test_time_offset_interval_contains_true_offset() -> None:
     reference, held = flight(40.0, 100.0), 0
     random = np.random.default_rng(8)
     for _ in range(25):
@@ -424,7 +424,7 @@ def test_the_interval_of_an_offset_holds_it() -> None:
     assert held >= 22
 
 
-def test_clocks_that_are_set_are_the_start() -> None:
+def test_time_offset_unix_clocks_start_at_their_difference() -> None:
     reference = replace(flight(), unix_offset_s=1.5e9)
     estimate = replace(flight(), unix_offset_s=0.0, time_s=flight().time_s + 1.5e9 - 0.2)
     assert clock_difference(estimate, reference) == -1.5e9
@@ -441,7 +441,7 @@ def test_clocks_that_are_set_are_the_start() -> None:
 
 @pytest.mark.parametrize("kind", ["still", "line", "circle"])
 @pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.05])
-def test_an_offset_without_excitation_is_not_determinable(kind: str, noise_m: float) -> None:
+def test_time_offset_without_excitation_is_undetermined(kind: str, noise_m: float) -> None:
     time = np.arange(0.0, 60.0, 0.05)
     position = {
         "still": np.zeros((len(time), 3)),
@@ -458,7 +458,7 @@ def test_an_offset_without_excitation_is_not_determinable(kind: str, noise_m: fl
     assert "Unchanged timestamps used instead." in used.warnings[0]
 
 
-def test_a_motion_that_repeats_is_ambiguous() -> None:
+def test_time_offset_periodic_motion_is_undetermined() -> None:
     one = flight(20.0)
     lap = np.tile(np.arange(len(one)), 4)
     time = np.arange(len(lap)) * 0.05
@@ -472,7 +472,7 @@ def test_a_motion_that_repeats_is_ambiguous() -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
-def test_published_trajectories_that_were_shifted_are_shifted_back(pair: tuple[str, str]) -> None:
+def test_time_offset_shifted_public_data_is_recovered(pair: tuple[str, str]) -> None:
     estimate, reference = map(published, pair)
     base = estimate_time_offset(estimate, reference).offset_s
     assert abs(base) < 0.06  # their own clocks are not perfect
@@ -486,7 +486,7 @@ def test_published_trajectories_that_were_shifted_are_shifted_back(pair: tuple[s
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.9, 0.97])
-def test_intervals_hold_the_true_rmse(phi: float) -> None:
+def test_rmse_interval_contains_true_rmse(phi: float) -> None:
     random = np.random.default_rng(9)
     flights, n = 200, 2000
     white = random.normal(size=(n + 500, flights, 3)) * np.sqrt(1.0 - phi**2)
@@ -499,7 +499,7 @@ def test_intervals_hold_the_true_rmse(phi: float) -> None:
     assert 0.85 < held <= 1.0
 
 
-def test_the_autocorrelation_time_is_that_of_the_process() -> None:
+def test_autocorrelation_time_equals_ar1_value() -> None:
     white = np.random.default_rng(10).normal(size=200_000)
     for phi in (0.0, 0.5, 0.9):
         values = lfilter([1.0], [1.0, -phi], white)
@@ -507,7 +507,7 @@ def test_the_autocorrelation_time_is_that_of_the_process() -> None:
     assert autocorrelation_time(np.ones(50)) == 1.0
 
 
-def test_too_few_blocks_give_no_interval() -> None:
+def test_rmse_interval_too_few_blocks_is_unavailable() -> None:
     drift = np.linspace(0.0, 1.0, 500)
     got = rmse_interval(drift, "ATE")
     assert isinstance(got, Unavailable)

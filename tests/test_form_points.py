@@ -77,7 +77,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
     return [round(found[name], 2) for name in PART_NAMES]
 
 
-def test_every_mistake_that_a_flight_can_have_can_be_named_seen_and_cured() -> None:
+def test_each_simulated_mistake_has_kind_panel_and_cure() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
@@ -87,7 +87,7 @@ def test_every_mistake_that_a_flight_can_have_can_be_named_seen_and_cured() -> N
         assert set(panels(name)) > {"cover"}
 
 
-def test_all_right_is_everything_and_a_blank_form_nothing() -> None:
+def test_form_points_correct_is_full_and_empty_is_zero() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).named == {"clock-offset": True, "dropout": True}
@@ -122,11 +122,13 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
 
 
 @pytest.mark.parametrize(("answers", "less"), HALF_RIGHT)
-def test_what_is_half_right(answers: Answers, less: dict[str, float]) -> None:
+def test_form_points_partly_correct_has_partial_points(
+    answers: Answers, less: dict[str, float]
+) -> None:
     assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
 
 
-def test_a_clean_flight() -> None:
+def test_form_points_flight_without_mistake_expects_none() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(ClaimedMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).share == 0.4
@@ -138,7 +140,7 @@ def test_a_clean_flight() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_a_cure_that_needs_no_measurement_counts_with_the_size_alone() -> None:
+def test_form_points_open_end_cure_counts_only_with_size() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = ClaimedMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
@@ -148,7 +150,7 @@ def test_a_cure_that_needs_no_measurement_counts_with_the_size_alone() -> None:
     assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
 
 
-def test_a_constant_form_does_not_pay_on_loops() -> None:
+def test_form_points_constant_form_on_loops_is_low() -> None:
     """Of 300 that are drawn, with the closure errors and verdicts that they have.
 
     No update lies outside a gate on most of them: an empty list shows nothing.
@@ -168,7 +170,7 @@ def test_a_constant_form_does_not_pay_on_loops() -> None:
             assert np.mean([form_points(form, one).share for one in truths]) <= 0.35
 
 
-def test_the_size_of_an_open_end_is_what_the_odometry_measures() -> None:
+def test_form_truth_open_end_size_includes_odometry_drift() -> None:
     """The drift in it is nothing that a student could know of."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
@@ -224,7 +226,7 @@ def given(value: Any) -> Any:
 
 
 @pytest.mark.reallogs
-def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
+def test_form_points_agree_with_points_given_by_hand(shared_logs: Path) -> None:
     bank = json.loads((shared_logs.parent / "grading" / "bank.json").read_text(encoding="utf-8"))
     truths = {
         flight["flight"]: form_truth(simulation_of(flight["simulate"]), SHA256)
@@ -242,7 +244,7 @@ def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
     assert spearmanr(ours, theirs).statistic >= 0.95
 
 
-def test_random_forms_earn_little() -> None:
+def test_form_points_random_forms_are_at_most_20_percent() -> None:
     """Of 500 forms filled in at random, on flights with two mistakes, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)

@@ -57,7 +57,7 @@ def handed_in(tmp_path: Path) -> Path:
     return folder
 
 
-def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) -> None:
+def test_grade_table_lists_every_submitted_file(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
     before = {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)}
     outcome = grade(
@@ -103,7 +103,7 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")
-def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) -> None:
+def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     shutil.copy(REPORT, folder / "a.pdf")
@@ -141,7 +141,7 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
 
 
 @pytest.mark.usefixtures("at_once")
-def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
+def test_grade_again_processes_changed_files_only(handed_in, tmp_path) -> None:
     output = tmp_path / "class"
 
     def reused(title: str = "") -> int:
@@ -169,7 +169,7 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("at_once", "drawn_once")
-def test_another_log_at_hand_verifies_again(tmp_path) -> None:
+def test_grade_with_other_logs_verifies_again(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")
     said = []
@@ -186,7 +186,7 @@ def test_another_log_at_hand_verifies_again(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("at_once")
-def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tmp_path) -> None:
+def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in")
     (tmp_path / "logs").mkdir()
@@ -204,7 +204,7 @@ def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tm
 
 
 @pytest.mark.usefixtures("at_once")
-def test_what_the_command_says(tmp_path, monkeypatch) -> None:
+def test_grade_command_shortens_names_and_can_be_continued(tmp_path, monkeypatch) -> None:
     """Names on one line each, and of an interrupted run that it can go on."""
     import px4fuse.grading.grade as module
 
@@ -224,13 +224,13 @@ def test_what_the_command_says(tmp_path, monkeypatch) -> None:
     assert "Run the same command to continue." in str(result.exception)
 
 
-def test_names_of_files_are_safe_and_unique() -> None:
+def test_file_names_are_safe_and_unique() -> None:
     assert file_names(["12345", "12345", "../../etc/passwd", "CON", "", "日本"]) == [
         "12345", "12345-2", "_.._etc_passwd", "_CON", "report", "日本"
     ]  # fmt: skip
 
 
-def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
+def test_grade_command_passes_course_options(tmp_path, monkeypatch) -> None:
     import px4fuse.grading.grade as module
 
     noted = Mock(return_value=GradeOutcome((), (), 0, ()))
@@ -252,7 +252,7 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
     assert (course.late.text, course.include_pending) == ("5%/hour", False)
 
 
-def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:
+def test_grade_write_rubric_writes_default_once(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     done("grade", "--write-rubric", "lab.toml")
     assert read_rubric(Path("lab.toml")) == read_rubric(None)

@@ -89,7 +89,7 @@ def dictionary(**entries: object) -> DictionaryObject:
 # ------------------------------------------------------------------ reports
 
 
-def test_the_real_report():
+def test_read_report_example_returns_its_results():
     report = read_report(REAL, "aisle_uwb.pdf")
     assert to_json(report).encode() == JSON
 
@@ -99,12 +99,12 @@ def test_the_real_report():
      json.loads(JSON)),
     (lambda: small(json.dumps(LOOP).encode()), LOOP),
 ])  # fmt: skip
-def test_other_reports(pdf, results):
+def test_read_report_compressed_or_loop_returns_results(pdf, results):
     report = read_report(pdf(), "a\nb\u202e\x1b" * 10_000)
     assert report == decoded(results)
 
 
-def test_a_report_that_was_saved_again():
+def test_read_report_resaved_returns_same_results():
     writer = PdfWriter(clone_from=io.BytesIO(REAL))
     again = read_report(saved(writer), "r.pdf")
     assert to_json(again).encode() == JSON
@@ -132,11 +132,11 @@ def test_a_report_that_was_saved_again():
     (small(edit=lambda w: w.add_attachment("results.json", b"{}")), "several attachments"),
     (raw(CATALOG, b"<< /Type /Pages /Kids [] /Count 0 >>"), "the PDF has no pages"),
 ], ids=range(12))  # fmt: skip
-def test_what_is_no_report(pdf, said):
+def test_read_report_unsuitable_file_states_reason(pdf, said):
     assert said in reason(pdf)
 
 
-def test_two_streams_under_one_name():
+def test_read_report_ambiguous_attachment_is_rejected():
     embedded = stream(JSON, b"/Type /EmbeddedFile")
     two = with_attachment(embedded, b"/F (results.json) /EF << /F 5 0 R /UF 4 0 R >>")
     assert "several attachments" in reason(two)
@@ -145,7 +145,7 @@ def test_two_streams_under_one_name():
 
 
 @pytest.mark.parametrize("algorithm", ["RC4-128", "RC4-40"])
-def test_encrypted(algorithm):
+def test_read_report_encrypted_is_rejected(algorithm):
     for password in ("", "secret"):
         encrypted = small(edit=lambda writer, p=password: writer.encrypt(p, algorithm=algorithm))
         assert "encrypted" in reason(encrypted)
@@ -156,7 +156,7 @@ def test_encrypted(algorithm):
 
 
 @pytest.mark.parametrize("count", [101, 3000])
-def test_too_many_pages(count):
+def test_read_report_too_many_pages_are_rejected(count):
     kids = b"<< /Type /Pages /Kids [%b] /Count 1 >>" % (b"3 0 R " * 30 * count)
     assert reason(raw(CATALOG, kids, PAGE))
 
@@ -220,7 +220,7 @@ ACTS = {
 
 
 @pytest.mark.parametrize(("said", "edit"), ACTS.items(), ids=ACTS)
-def test_what_acts_is_named(edit, said):
+def test_read_report_with_action_is_rejected(edit, said):
     assert said in reason(small(edit=edit))
     assert "the PDF contains" in reason(small(edit=edit))
 
@@ -232,7 +232,7 @@ def test_what_acts_is_named(edit, said):
     annotation(Subtype=NameObject("/Link"), A=action("URI", URI=TEXT)),
     annotation(Subtype=NameObject("/FreeText")),
 ], ids=range(5))  # fmt: skip
-def test_what_programs_add_that_save_a_report_is_read(edit):
+def test_read_report_harmless_additions_are_ignored(edit):
     """Nothing of it is followed, and the pages are drawn again."""
     report = read_report(small(edit=edit), "r.pdf")
     assert to_json(report).encode() == JSON
@@ -273,7 +273,7 @@ def stream_bomb(kind: bytes) -> bytes:
     (stream_bomb(b"XRef"), "expands to more"),
     (stream_bomb(b"ObjStm"), "expands to more"),
 ], ids=range(8))  # fmt: skip
-def test_bombs_take_little_memory(pdf, said):
+def test_read_report_compression_bomb_takes_little_memory(pdf, said):
     tracemalloc.start()
     found, peak = reason(pdf), tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -285,14 +285,14 @@ def test_bombs_take_little_memory(pdf, said):
     b"/Filter [" + b"/FlateDecode " * 20 + b"]", b"/Filter [/FlateDecode /FlateDecode]",
     b"/Filter /LZWDecode", b"/Filter /Invented", b"/Filter [/DCTDecode /DCTDecode]", b"/Filter 7",
 ])  # fmt: skip
-def test_other_filters(filters):
+def test_read_report_other_compression_is_rejected(filters):
     attached = with_attachment(stream(zlib.compress(JSON), b"/Type /EmbeddedFile " + filters))
     assert "a stream with other compression" in reason(attached)
     content = raw(CATALOG, PAGES, PAGE, stream(b"x", filters))
     assert "a stream with other compression" in reason(content)
 
 
-def test_stream_words_that_make_us_try_again_and_again():
+def test_read_report_many_stream_keywords_are_rejected():
     # each try inflates what follows; all of them pay from one purse
     stored = b"".join(b"stream\x78\x01\x00" + b"\x00\x00\xff\xff\x00" * 3 for _ in range(200_000))
     assert reason(b"%PDF-1.4\n" + stored + b"%%EOF")
@@ -314,11 +314,11 @@ def test_stream_words_that_make_us_try_again_and_again():
     b"%PDF-1.4\nxref\n0 99999999\ntrailer\n<< >>\nstartxref\n9\n%%EOF",
     b"%PDF-1.4\n" + b"startxref\n9\n%%EOF\n" * 20_000,
 ], ids=range(11))  # fmt: skip
-def test_broken_structure(pdf):
+def test_read_report_broken_structure_is_rejected(pdf):
     assert reason(pdf)
 
 
-def test_object_streams():
+def test_read_report_invalid_object_stream_is_rejected():
     """An object stream that holds itself, or what it does not say."""
     for offsets in (b"1 0 2 9 ", b"5 0 5 3 ", b"1 99 ", b"x y "):
         packed = stream(offsets + CATALOG + PAGES, b"/Type /ObjStm /N 2 /First 8")
@@ -329,13 +329,13 @@ def test_object_streams():
         assert reason(pdf)
 
 
-def test_references_to_nothing_are_not_searched_for():
+def test_read_report_many_undefined_references_are_rejected():
     refer = b"".join(b"%d 0 R " % number for number in range(100, 20_000))
     pdf = raw(b"<< /Type /Catalog /Pages 2 0 R /X [%b] >>" % refer, PAGES, PAGE, stream(b""))
     assert "more memory or time" in reason(pdf)
 
 
-def test_too_many_objects():
+def test_read_report_too_many_objects_are_rejected():
     catalog = b"<< /Type /Catalog /Pages 2 0 R /X 5 0 R >>"
     listed = b"[%b]" % b"".join(b"%d 0 R " % number for number in range(6, 25_000))
     many = raw(catalog, PAGES, PAGE, stream(b""), listed, *[b"null"] * 24_995)
@@ -349,7 +349,7 @@ def changed(**entries: object) -> bytes:
     return json.dumps(json.loads(JSON) | entries).encode()
 
 
-def test_texts_are_cleaned():
+def test_read_report_removes_control_characters():
     student = {"name": "Zoë \u202eevil\u2066 李\x1b[31m", "id": "=1+1", "notes": "a\n\tb\x07"}
     report = read_report(small(changed(student=student)), "r.pdf")
     assert report.student == Student("Zoë evil 李[31m", "=1+1", "a\n\tb")
@@ -358,7 +358,7 @@ def test_texts_are_cleaned():
 # ------------------------------------------------------------------ anything at all
 
 
-def test_other_objects_that_pypdf_may_meet():
+def test_read_report_unexpected_types_are_read_or_rejected():
     """Values of a kind that no reader expects, at every key that intake looks at."""
     odd = [NumberObject(7), TEXT, ArrayObject(), dictionary(), DecodedStreamObject()]
     for key in ("/Names", "/Pages", "/Outlines", "/Metadata", "/S", "/Filter", "/EF", "/Annots"):

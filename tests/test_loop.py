@@ -91,7 +91,7 @@ def true_closure_error_m() -> float:
     return float(np.linalg.norm(moved[0] - moved[1]))
 
 
-def test_the_samples_closure_error_is_the_true_one(sample_loop: Loop) -> None:
+def test_loop_sample_closure_error_equals_ground_truth(sample_loop: Loop) -> None:
     assert sample_loop.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.02)
     assert sample_loop.closure_error_m == pytest.approx(1.42, abs=0.05)  # sample_logs/README.md
     assert sample_loop.path_length_m == pytest.approx(87.7, abs=1.5)
@@ -100,7 +100,7 @@ def test_the_samples_closure_error_is_the_true_one(sample_loop: Loop) -> None:
     assert sample_loop.part_reason == "from take-off to landing, by the land detector"
 
 
-def test_both_corrections_bring_the_sample_closer_and_end_where_the_vehicle_did(sample_loop):
+def test_loop_sample_corrections_reduce_ate_and_end_error(sample_loop):
     for reference in (0, 1):  # truth and SLAM
         before = rmse(sample_loop, "uncorrected", reference)
         for way in ("by_distance", "gated"):
@@ -115,7 +115,7 @@ def test_both_corrections_bring_the_sample_closer_and_end_where_the_vehicle_did(
         assert robust.reason == SINGLE_LOOP
 
 
-def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
+def test_loop_lesson_example_2_equals_lesson_output() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
     error, total = missed(found), found.path_length_m
@@ -130,7 +130,7 @@ def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
     ]
 
 
-def test_the_plain_correction_moves_each_pose_by_its_share_and_turns_none(sample_loop) -> None:
+def test_by_distance_plain_shifts_positions_linearly(sample_loop) -> None:
     plain, odometry = path(sample_loop, "by_distance_plain"), sample_loop.odometry.trajectory
     share = sample_loop.distance_m / sample_loop.distance_m[-1]
     moved = odometry.position_m - plain.trajectory.position_m
@@ -138,7 +138,7 @@ def test_the_plain_correction_moves_each_pose_by_its_share_and_turns_none(sample
     assert plain.trajectory.rotation is odometry.rotation
 
 
-def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop) -> None:
+def test_by_distance_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> None:
     """The sample's heading drifts: over 10 m only the one that turns is as good as the odometry."""
     over = [
         next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_words == "10 m")
@@ -149,7 +149,7 @@ def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop
     assert plain > 1.1 * before
 
 
-def test_without_a_known_heading_there_is_one_correction_by_distance(sample, sample_loop) -> None:
+def test_by_distance_without_heading_has_one_path(sample, sample_loop) -> None:
     assert [part.name for part in sample_loop.reported_paths[1:3]] == [POSITIONS_ONLY, BY_DISTANCE]
     found = loop_of(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
@@ -160,7 +160,7 @@ def test_without_a_known_heading_there_is_one_correction_by_distance(sample, sam
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 
 
-def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop) -> None:
+def test_loop_landed_at_option_equals_ground_truth(sample: LoopSource, sample_loop: Loop) -> None:
     forward, right, _ = sample_loop.known_end.displacement  # its nose points along x
     heading = sample_loop.known_end.heading_change_deg
     taped = loop_of(sample, landed_at=Landing(forward, right, heading))
@@ -170,12 +170,12 @@ def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop
 
 
 @pytest.mark.reallogs
-def test_the_tlog_of_the_flight_gives_the_same_loop(shared_logs: Path) -> None:
+def test_loop_tlog_has_same_closure_error(shared_logs: Path) -> None:
     found = analyse(read_source(str(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")))
     assert found.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.05)
 
 
-def test_an_absolute_track_is_not_taken_for_odometry() -> None:
+def test_loop_absolute_track_has_finding() -> None:
     source = read_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
     assert source.trajectory.kind == "ekf2"
     found = analyse(source)
@@ -215,7 +215,7 @@ TRUE = tuple(
 FALSE = GivenClosure(12.0, 2 * LAP_S + 35.0, 0.05)
 
 
-def test_one_false_closure_among_true_ones() -> None:
+def test_loop_false_closure_is_rejected_among_true_ones() -> None:
     truth, odometry = laps(3, 0, OdometryNoise())
     clean = close_loop(odometry, closures=TRUE, reference=truth)
     fooled = close_loop(odometry, closures=(*TRUE, FALSE), reference=truth)
@@ -238,7 +238,7 @@ def test_one_false_closure_among_true_ones() -> None:
     assert "loop_closure_doubtful" not in named
 
 
-def test_the_gate_accepts_true_landings_as_often_as_stated() -> None:
+def test_gate_p_value_of_true_landings_is_uniform() -> None:
     """With the noise that the laps have, p is uniform: a third below a third, and so on."""
     p = []
     for seed in range(60):
@@ -249,7 +249,7 @@ def test_the_gate_accepts_true_landings_as_often_as_stated() -> None:
         assert np.mean(np.array(p) < share) == pytest.approx(share, abs=0.2)
 
 
-def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
+def test_loop_open_end_is_rejected_and_not_corrected() -> None:
     _, odometry = laps(1, 3, OdometryNoise())
     half = odometry[: len(odometry) // 2]
     found = close_loop(half)
@@ -270,7 +270,7 @@ def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
     assert find_loop(opened) == ()
 
 
-def test_the_heading_at_landing_counts_only_where_it_may_be_the_same() -> None:
+def test_loop_heading_is_closed_only_if_similar() -> None:
     _, odometry = laps(1, 4, OdometryNoise())
     turned = close_loop(odometry)  # it ends facing west
     assert isinstance(turned.heading_error_deg, Unavailable)
@@ -283,7 +283,7 @@ def test_the_heading_at_landing_counts_only_where_it_may_be_the_same() -> None:
     assert found.closures[0].degrees_of_freedom == 4
 
 
-def test_a_doubtful_closure_is_named() -> None:
+def test_find_loop_contradicting_closure_is_doubtful() -> None:
     """Off by less than the drift could explain, but the others know better."""
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
@@ -294,7 +294,7 @@ def test_a_doubtful_closure_is_named() -> None:
     assert doubtful[0].evidence["time_1_s"] == 20.0
 
 
-def test_dropping_most_closures_points_to_the_drift() -> None:
+def test_find_loop_too_small_stated_drift_is_reported() -> None:
     """An odometry with a turn in every step, which is said to be almost perfect."""
     _, odometry = laps(3, 7, OdometryNoise())
     turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
@@ -305,7 +305,7 @@ def test_dropping_most_closures_points_to_the_drift() -> None:
     assert "loop_drift_understated" in {finding.id for finding in find_loop(found)}
 
 
-def test_an_assumed_landing_is_said_to_be_assumed(sample: LoopSource, sample_loop: Loop) -> None:
+def test_find_loop_assumed_landing_is_reported(sample: LoopSource, sample_loop: Loop) -> None:
     assert find_loop(sample_loop) == ()  # the log has the truth
     blind = Unavailable("ground truth", "left out", "")
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
@@ -315,7 +315,7 @@ def test_an_assumed_landing_is_said_to_be_assumed(sample: LoopSource, sample_loo
     assert find_loop(loop_of(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_reported_variances_count_where_they_grow() -> None:
+def test_odometry_variances_use_growing_reported_variances() -> None:
     _, odometry = laps(1, 6, OdometryNoise())
     nodes = np.arange(0, len(odometry), 10)
     constant = replace(odometry, position_variance_m2=np.full((len(odometry), 3), 0.0025))
@@ -330,7 +330,7 @@ def test_reported_variances_count_where_they_grow() -> None:
     assert "growth of the logged position variances" in words
 
 
-def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
+def test_pose_graph_interpolates_between_key_frames(sample_loop: Loop) -> None:
     solved, before = path(sample_loop, "gated"), sample_loop.odometry.trajectory
     after, nodes = solved.trajectory, sample_loop.nodes
     poses = solved.solution.poses
@@ -347,7 +347,7 @@ def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
 # ------------------------------------------------------------------ what is given
 
 
-def test_times_of_a_file_in_unix_time_may_count_from_its_first_pose() -> None:
+def test_closure_times_are_unix_or_from_first_pose() -> None:
     source = read_source(str(SLAM))
     relative = loop_of(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
     start = float(source.trajectory.time_s[0])
@@ -355,7 +355,7 @@ def test_times_of_a_file_in_unix_time_may_count_from_its_first_pose() -> None:
     assert relative.closures[1] == stamped.closures[1]
 
 
-def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None:
+def test_loop_slam_file_is_levelled_with_small_closure_error() -> None:
     source = read_source(str(SLAM))
     found = loop_of(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"
@@ -372,12 +372,12 @@ def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None
     ({"start_s": 96.0, "end_s": 98.0}, "too short for a loop"),
     ({"key_frames_m": 101.0}, "`key_frames_m` 101 is out of range"),
 ])  # fmt: skip
-def test_impossible_parts_and_closures_are_refused(sample, how, says) -> None:
+def test_loop_invalid_segment_or_closure_is_refused(sample, how, says) -> None:
     with pytest.raises((TrajectoryError, SettingsError), match=says):
         loop_of(sample, **how)
 
 
-def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:
+def test_split_part_separates_log_and_source_at_colon(tmp_path: Path) -> None:
     assert split_part(f"{SAMPLE}:ekf2") == (SAMPLE, "ekf2")
     assert split_part(str(SAMPLE)) == (SAMPLE, None)
     odd = tmp_path / "a:vio"

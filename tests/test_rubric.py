@@ -12,7 +12,7 @@ NOTES = ITEM + 'check = "verified"\n'
 NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 
 
-def test_default_uses_and_explains_every_check_and_parameter():
+def test_default_rubric_contains_each_check_and_parameter():
     text = rubric_text()
     used = {item["check"] for item in tomllib.loads(text)["item"]}
     checks = AnyItem.__args__
@@ -23,20 +23,20 @@ def test_default_uses_and_explains_every_check_and_parameter():
 
 
 @pytest.mark.parametrize("kind", ["compare", "loop"])
-def test_items_of_the_default_add_up_to_60_and_120_with_a_key(kind):
+def test_default_rubric_points_add_up_to_60_and_120_with_key(kind):
     items = [one for one in read_rubric(None).items if one.report in ("any", kind)]
     assert {one.points for one in items if one.needs_key} == {100.0, 20.0}
     assert [one.by_hand for one in items if one.needs_key] == [False, True]
     assert sum(one.points for one in items) == 60 + 120
 
 
-def test_copy_of_the_default_is_the_default(tmp_path):
+def test_read_rubric_copy_of_default_is_equal(tmp_path):
     path = tmp_path / "rubric.toml"
     path.write_bytes(b"\xef\xbb\xbf" + rubric_text().replace("\n", "\r\n").encode())
     assert read_rubric(path) == read_rubric(None)
 
 
-def test_parameters_left_out_have_their_defaults():
+def test_parse_rubric_missing_parameters_have_defaults():
     (item,) = parse_rubric(ITEM + 'check = "clock"\n', "x").items
     assert (item.margin_s, item.report) == (0.03, "any")
     (item,) = parse_rubric(NUMBER + "at_most = 1\n", "x").items
@@ -75,7 +75,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("text", "said"), BAD.values(), ids=BAD.keys())
-def test_spoilt_rubric_is_one_line_that_says_where(tmp_path, text, said):
+def test_read_rubric_invalid_text_names_place_in_one_line(tmp_path, text, said):
     path = tmp_path / "mine.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(SettingsError) as error:
@@ -87,7 +87,7 @@ def test_spoilt_rubric_is_one_line_that_says_where(tmp_path, text, said):
     assert len(message) < 500
 
 
-def test_files_that_are_no_rubric(tmp_path):
+def test_read_rubric_folder_or_missing_file_is_refused(tmp_path):
     for path, said in ((tmp_path, "is a folder"), (tmp_path / "none.toml", "cannot be read")):
         with pytest.raises(SettingsError, match=said):
             read_rubric(path)

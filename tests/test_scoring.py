@@ -59,7 +59,7 @@ def filled(kinds, results=EXAMPLE, **values):
 # ------------------------------------------------------------------ checks
 
 
-def test_a_file_that_is_not_at_hand():
+def test_check_verified_without_log_has_zero_points():
     pdf = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert checked("verified", verdict=verdict)[0] == 0.0
@@ -131,13 +131,13 @@ CHECKED = [
 
 
 @pytest.mark.parametrize(("check", "results", "given", "points", "said"), CHECKED)
-def test_what_a_check_gives(check, results, given, points, said):
+def test_check_gives_points_and_comment(check, results, given, points, said):
     found, comment = checked(check, results, **given)
     assert found == pytest.approx(points, abs=0.01), comment
     assert said in comment
 
 
-def test_the_clock_of_a_flight_that_was_handed_out_is_not_the_student_s_choice():
+def test_check_clock_of_assigned_flight_has_full_points():
     assert checked("clock", UNCLEAR, key=key())[0] == 1.0
 
 
@@ -157,7 +157,7 @@ def key(*mistakes, sha256=SHA, **values):
 
 
 class TestForm:
-    def test_points_by_the_key(self):
+    def test_form_is_scored_by_answer_key(self):
         found = filled(["dropout"], student__id="S01 ")
         points, comment = checked("answers", found, key=key())
         assert points == 0.3
@@ -177,24 +177,24 @@ class TestForm:
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
         ],
     )
-    def test_what_is_no_form(self, form, said):
+    def test_missing_or_invalid_form_has_zero_points(self, form, said):
         more = {"student__answers": form} if form else {}
         points, comment = checked("answers", changed(student__id="s01", **more), key=key())
         assert (points, said in comment) == (0.0, True)
 
-    def test_another_log_and_an_unknown_id(self):
+    def test_form_on_other_log_has_zero_points(self):
         for student_id in ("s01", "zz"):
             results = filled(["dropout"], student__id=student_id)
             points, comment = checked("answers", results, key=key(sha256="c" * 64))
             assert (points, "not about the log that you were given" in comment) == (0.0, True)
 
     @pytest.mark.parametrize(("owner_id", "points"), [("", 0.0), ("s01", 30.0), ("zz", 0.0)])
-    def test_a_mistyped_id_costs_nothing_where_the_platform_knows_it(self, owner_id, points):
+    def test_platform_id_overrides_mistyped_report_id(self, owner_id, points):
         mistyped = filled(["dropout"], student__id="s02")
         items = assessed(mistyped, key=key(), owner_id=owner_id).items
         assert [item.points for item in items if "Mistakes" in item.title] == [points]
 
-    def test_a_text_waits_for_the_instructor(self):
+    def test_notes_await_points_of_instructor(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
             made = assessed(noted(notes, student__id="s01"), key=key())
             assert (made.awaits_points, made.counted is None, made.items[-1].points) == (
@@ -208,14 +208,14 @@ class TestForm:
 
 
 class TestScore:
-    def test_refuted_reports_get_nothing(self):
+    def test_report_with_differing_numbers_has_zero_points(self):
         verdict = Verdict("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
         made = assessed(verdict=verdict)
         assert {item.points for item in made.items} == {0.0}
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
         assert made.pending == ""
 
-    def test_what_cannot_be_verified_is_pending_unless_the_rubric_says_so(self):
+    def test_unverified_report_is_pending_or_zero_by_rubric(self):
         verdict = Verdict("other log", ("no log",), False, remedy="Look.")
         made = assessed(verdict=verdict)
         assert made.items[0].points == 0.0
@@ -226,7 +226,7 @@ class TestScore:
         assert zero.pending == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
-    def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id):
+    def test_log_of_other_student_follows_rubric_rule(self, student_id):
         given = changed(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert f"given to s01, the {said}" in assessed(given, key=key()).pending
@@ -237,12 +237,12 @@ class TestScore:
         # the platform says whose it is
         assert assessed(given, key=key(), owner_id="s01").pending == ""
 
-    def test_a_log_that_nobody_was_given(self):
+    def test_log_outside_answer_key_is_pending(self):
         made = assessed(noted("", student__id="s01"), key=key(sha256="c" * 64))
         assert "not about a log of the answer key" in made.pending
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
-    def test_whatever_can_be_read_can_be_scored(self, results):
+    def test_any_valid_results_can_be_scored(self, results):
         """Extreme values, and parts that are absent, wherever the contract allows them."""
         rng = random.Random(0)
         numbers, others = [1e308, -1e308, 5e-324, 0.0, -1, 10**19], [NONE, ..., "x" * 2000, "\0"]
@@ -286,7 +286,7 @@ def graded(items=(), **values):
     return GradedReport(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
 
 
-class TestWhatStudentsRead:
+class TestFeedback:
     @pytest.mark.parametrize(
         ("values", "there", "absent"),
         [
@@ -300,12 +300,12 @@ class TestWhatStudentsRead:
              ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip
-    def test_feedback(self, values, there, absent):
+    def test_feedback_text_has_status_and_hides_flags(self, values, there, absent):
         text = fed_back(graded(**values), "Lab 2")
         assert all(said in text for said in there), text
         assert absent not in text
 
-    def test_words_never_ids(self):
+    def test_comments_contain_no_ids_or_paths(self):
         """Whatever is missing is told in words; paths and ids are the program's own."""
         wrong = [finding(name, "error") for name in NAMES]
         spoilt = [
@@ -339,7 +339,7 @@ class TestWhatStudentsRead:
         ({"source__passage": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
-def test_what_stands_out_in_one_report(values, said):
+def test_own_flags_suspicious_report_lists_each_flag(values, said):
     found = list(own_flags(decoded(changed(**values))))
     assert len(found) == len(said)
     assert all(word in flag for word, flag in zip(said, found, strict=True))
@@ -371,10 +371,10 @@ def of(number, **values):
 
 
 class TestClassFlags:
-    def test_an_honest_class(self):
+    def test_class_flags_different_reports_have_none(self):
         assert class_flags([of(n) for n in range(12)]) == {}
 
-    def test_logs_ids_and_files(self):
+    def test_class_flags_shared_log_id_or_file_is_listed(self):
         made = class_flags(
             [of(1, student="a\n<b>", log_sha256="x"), of(2, log_sha256="x"), of(4), of(5),
              of(6, student_id="1005"),
@@ -388,14 +388,14 @@ class TestClassFlags:
         assert "same student id" in made["5.pdf"][0]
         assert "same file" in made["8.pdf"][0]
 
-    def test_two_reports_of_one_student_on_one_log(self):
+    def test_class_flags_two_reports_of_one_student_name_id(self):
         two = [of(1, log_sha256="x"), of(1, log_sha256="x", sha256="z", submission="b.pdf")]
         assert class_flags(two) == {
             "1.pdf": ["The same student id as in Student1 Name1, 1001 (b.pdf)."],
             "b.pdf": ["The same student id as in Student1 Name1, 1001 (1.pdf)."],
         }
 
-    def test_a_classmates_numbers_each_changed_a_little(self):
+    def test_class_flags_similar_form_numbers_are_listed(self):
         claims = ClaimedMistake("yaw", -20.5), ClaimedMistake("nlos", 1.23)
         mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
         other = (ClaimedMistake("nlos", 1.24), ClaimedMistake("yaw", -20.3))

@@ -153,7 +153,7 @@ def points(outcome: GradeOutcome) -> dict[str, float | None]:
     return {one.student_id: one.total for one in outcome.entries}
 
 
-def test_a_term(lab, monkeypatch) -> None:
+def test_grade_term_applies_new_rubric_and_overrides(lab, monkeypatch) -> None:
     verified = at_once(monkeypatch)
     outcome = lab.grade()
     as_it_was_written(lab.output)

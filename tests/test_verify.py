@@ -91,7 +91,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Base:
 # -- what is untouched -----------------------------------------------------------------------------
 
 
-def test_the_shipped_report_is_verified(aisle: Base) -> None:
+def test_verify_example_report_is_verified(aisle: Base) -> None:
     shipped = REPORT.read_bytes()
     verdict = verify(report_of(shipped), shipped, aisle.files, recompute=aisle.recompute)
     assert verdict.status == "verified", verdict
@@ -100,7 +100,7 @@ def test_the_shipped_report_is_verified(aisle: Base) -> None:
     assert LIMIT in verdict.reasons
 
 
-def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
+def test_verify_loop_report_is_verified(loop: Base) -> None:
     verdict = loop.verified(loop.pdf)
     assert verdict.status == "verified", verdict
     text = "".join(page.extract_text() for page in PdfReader(io.BytesIO(loop.pdf)).pages)
@@ -108,7 +108,7 @@ def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
     assert "heading drifts most" in text.replace("*", "")
 
 
-def test_nothing_is_verified_without_the_log(aisle: Base, loop: Base) -> None:
+def test_verify_without_log_cannot_verify(aisle: Base, loop: Base) -> None:
     for one in (aisle, loop):
         verdict = verify(report_of(one.pdf), one.pdf, {})
         assert verdict.status == "cannot verify"
@@ -141,7 +141,9 @@ def shifted(pdf: bytes, by: float) -> bytes:
 
 
 @pytest.mark.parametrize("which", ["aisle", "loop"])
-def test_another_platform_is_still_verified(which: str, request: pytest.FixtureRequest) -> None:
+def test_verify_numbers_of_other_platform_are_verified(
+    which: str, request: pytest.FixtureRequest
+) -> None:
     one: Base = request.getfixturevalue(which)
     drawn = shifted(one.pdf, 0.01)
     nudged_ = read_again(nudged(json.loads(to_json(one.again[0])), -1e-9))
@@ -182,7 +184,7 @@ def test_compare_results_numbers_1e_4_apart_differ(aisle: Base) -> None:
 KF = ("axes", "north", "filters", "kf")
 
 
-def test_tolerances(aisle: Base) -> None:
+def test_compare_results_applies_each_tolerance(aisle: Base) -> None:
     ours = json.loads(to_json(aisle.again[0]))
     for share, path, alike in (
         (0.5 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), True),
@@ -248,7 +250,7 @@ def changed(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("path", KINDS, ids=lambda path: ".".join(map(str, path)))
-def test_a_changed_leaf_of_the_results(aisle: Base, path: tuple[Any, ...]) -> None:
+def test_compare_results_finds_each_changed_value(aisle: Base, path: tuple[Any, ...]) -> None:
     found, *_ = compare_results(changed(aisle.results, path), to_plain(aisle.again[0]))
     difference = found[0]  # where there was none, a list has places of its own
     assert difference.path.startswith(".".join(map(str, path)))
@@ -291,7 +293,9 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize("name", STRUCTURE)
-def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verify_forged_results_are_not_verified(
+    aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     change, expected = STRUCTURE[name]
     monkeypatch.setattr(verification, "compare_pages", lambda *_, **__: ())  # they are as drawn
     results = copy.deepcopy(aisle.results)
@@ -305,7 +309,7 @@ def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     "path", [("student", "name"), ("student", "notes"), ("provenance", "libraries", "matplotlib")]
 )
-def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> None:
+def test_verify_changed_printed_record_is_not_verified(loop: Base, path: tuple[str, ...]) -> None:
     results = copy.deepcopy(loop.results)
     put({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
     again = verification.recompute(read_again(results), loop.files)
@@ -381,7 +385,7 @@ DRAW_LABEL = [
 
 
 @pytest.mark.parametrize(("page", "name"), DRAW_LABEL)
-def test_a_changed_page(aisle: Base, page: int, name: str) -> None:
+def test_verify_changed_page_differs(aisle: Base, page: int, name: str) -> None:
     verdict = aisle.verified(forged(aisle.pdf, on_page(page, DRAWING[name])))
     assert verdict.redrawn == aisle.pdf  # what is redrawn is never touched by a forgery
     assert verdict.status == "verified"
@@ -402,7 +406,7 @@ DOCUMENT: dict[str, tuple[Forge, str, str]] = {
 
 
 @pytest.mark.parametrize("name", DOCUMENT)
-def test_a_changed_document(aisle: Base, name: str) -> None:
+def test_verify_changed_document_states_reason(aisle: Base, name: str) -> None:
     forge, expected, said = DOCUMENT[name]
     verdict = aisle.verified(forged(aisle.pdf, forge))
     assert verdict.redrawn == aisle.pdf
@@ -417,13 +421,13 @@ def test_a_changed_document(aisle: Base, name: str) -> None:
 
 
 @pytest.mark.parametrize("key", ["/OpenAction", "/AA"])
-def test_a_document_with_a_script_is_refused(aisle: Base, key: str) -> None:
+def test_read_report_with_script_is_refused(aisle: Base, key: str) -> None:
     script = dictionary(S=NameObject("/JavaScript"), JS=TextStringObject("app.alert(1)"))
     with pytest.raises(ResultsError):
         read_report(forged(aisle.pdf, root(key, script)), "r.pdf")
 
 
-def test_verify_numbers_that_differ_come_first(aisle: Base) -> None:
+def test_verify_lists_differing_numbers_first(aisle: Base) -> None:
     results = copy.deepcopy(aisle.results)
     results["axes"]["north"]["filters"]["kf"]["nis_mean"] = 1.0
     form = root("/AcroForm", dictionary(Fields=array()))
@@ -473,7 +477,7 @@ FILES: dict[str, tuple[Callable[[Base, Base], bytes], set[str]]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_changed_file(aisle: Base, loop: Base, name: str) -> None:
+def test_verify_changed_file_has_expected_outcome(aisle: Base, loop: Base, name: str) -> None:
     forge, expected = FILES[name]
     pdf = forge(aisle, loop)
     read_report(pdf, "r.pdf")
@@ -483,7 +487,7 @@ def test_a_changed_file(aisle: Base, loop: Base, name: str) -> None:
     assert verdict.redrawn == (b"" if verdict.status == "other log" else aisle.pdf)
 
 
-def test_another_log(aisle: Base) -> None:
+def test_verify_other_log_is_reported(aisle: Base) -> None:
     for files in ([LOOP_LOG], [LOOP_LOG, Path(__file__)]):
         verdict = verify(report_of(aisle.pdf), aisle.pdf, files)
         assert verdict.status == "other log"
@@ -491,7 +495,7 @@ def test_another_log(aisle: Base) -> None:
 
 
 @pytest.mark.usefixtures("drawn_once")
-def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
+def test_verify_finds_joined_recording_by_hash(tmp_path: Path) -> None:
     """And what it is called here does not show."""
     positions, target = SAMPLES / "aisle_uwb_external.csv", tmp_path / "joined.pdf"
     done("compare", LOG, "--position", positions, "--axis", "down", "-o", target)
@@ -509,7 +513,7 @@ def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
 # -- the command -----------------------------------------------------------------------------------
 
 
-def test_the_command_says_what_it_found(
+def test_verify_command_prints_and_writes_verdict(
     tmp_path: Path, aisle: Base, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_this_process(monkeypatch)  # the next one takes one of its own
@@ -525,7 +529,7 @@ def test_the_command_says_what_it_found(
     assert json.loads(output)["status"] == "cannot verify"
 
 
-def test_the_command_verifies(tmp_path: Path) -> None:
+def test_verify_command_finds_renamed_log(tmp_path: Path) -> None:
     target = tmp_path / "loop.pdf"
     done("loop", f"{LOOP_LOG}:ekf2", "-o", target)
     folder = tmp_path / "logs"

@@ -147,7 +147,7 @@ def deny() -> None:
     raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def test_error_stops_writing_and_lists_what_was_written(tmp_path, monkeypatch) -> None:
+def test_error_stops_writing_and_lists_written_files(tmp_path, monkeypatch) -> None:
     a, b, c = (tmp_path / name for name in "abc")
     for path in (a, b, c):
         path.write_bytes(b"old")
@@ -163,7 +163,7 @@ def test_error_stops_writing_and_lists_what_was_written(tmp_path, monkeypatch) -
         write_all({b: b"new"})
 
 
-def test_locked_file_is_to_be_closed(tmp_path, monkeypatch) -> None:
+def test_write_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -> None:
     path = tmp_path / "r.pdf"
     path.write_bytes(b"old")
     at_rename_to(path, monkeypatch, deny)
