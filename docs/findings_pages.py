@@ -38,10 +38,10 @@ import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis, explain  # noqa: E402
 from px4fuse.comparison.comparison import compare  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
-from px4fuse.filter.heading import HeadingPart, combine_heading_parts  # noqa: E402
+from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import NAMES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
-from px4fuse.findings.causes import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
+from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
 from px4fuse.flight import Columns, Unavailable  # noqa: E402
 from px4fuse.report.panels import (  # noqa: E402

@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from px4fuse.comparison.causal_replays import Intervention, interventions, planned_variants
 from px4fuse.comparison.comparison import compare, compare_prepared
+from px4fuse.comparison.difference_steps import explain_ekf2_difference, explanation_variants
 from px4fuse.comparison.estimates import (
     Progress,
     Tuning,
@@ -23,35 +25,33 @@ from px4fuse.comparison.estimates import (
     silent,
     value_or_bound,
 )
-from px4fuse.comparison.events import Events, collect_events
-from px4fuse.comparison.interventions import Intervention, interventions, planned_variants
+from px4fuse.comparison.flight_events import Events, collect_events
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
-from px4fuse.comparison.why import explain_ekf2_difference, explanation_variants
-from px4fuse.display import one_line_repr
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
+from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay
-from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2.steps import Why
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.ekf2_parameters import check_parameters
 from px4fuse.errors import LogError, MissingDataError, SettingsError
-from px4fuse.filter.causes import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, bias_scale_jump_fit
-from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.coloured import (
+from px4fuse.filter.correlated_noise import (
     SourceLowPass,
     TimeCorrelatedNoise,
     fit_time_correlation_to_truth,
     time_correlation_fit,
 )
-from px4fuse.filter.heading import HeadingError
+from px4fuse.filter.frame_rotation import HeadingError
+from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, bias_scale_jump_fit
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers import read_log
 from px4fuse.reading import display_name
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
@@ -302,7 +302,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
     flight = read_log(log, system=request.system if request.mavlink is None else None)
     # late imports: scipy.signal and scipy.ndimage take 0.2 s and are needed for alignment only
     if request.mavlink is not None:
-        from px4fuse.alignment.joining import join  # noqa: PLC0415
+        from px4fuse.alignment.merge_recordings import join  # noqa: PLC0415
 
         other = read_log(Path(request.mavlink), system=request.system)
         if not other.log.format.startswith("MAVLink"):

@@ -17,7 +17,7 @@ from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
 from px4fuse.findings import Finding, find
-from px4fuse.findings.story import story
+from px4fuse.findings.summary import story
 from px4fuse.record import Record, table
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights

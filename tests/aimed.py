@@ -15,7 +15,7 @@ from class_tools import report_of
 from conftest import REPORT, SAMPLES
 from ulog_tools import make_log
 
-from px4fuse.answers import form_text
+from px4fuse.answer_form import form_text
 from px4fuse.assignment.key import AnswerKey, key_text
 
 # Command, its inputs, its options for an output file (with the required ending), and the names that

@@ -34,7 +34,7 @@ from px4fuse import analysis, api
 from px4fuse.assignment import truth
 from px4fuse.comparison import comparison
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.filter.quick import quick_replay
+from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop import tracks
 from px4fuse.readers import read_log

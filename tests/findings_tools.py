@@ -11,17 +11,17 @@ import pandas as pd
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import Intervention
+from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import FILTERS, AgainstTruth, FilterSummary, UnjudgedFilter
-from px4fuse.filter.causes import BiasScaleJumpFit, Estimate, Jump
-from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.consistency import Consistency
+from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate, Jump
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
+from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding
 from px4fuse.flight import Columns, Ekf2, FusionRecord, Unavailable
-from px4fuse.origin import RECEIVED
+from px4fuse.position_source import RECEIVED
 
 T = TypeVar("T")
 

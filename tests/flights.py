@@ -31,8 +31,8 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
-from px4fuse.origin import RECEIVED, Origin
-from px4fuse.recording import Dropout, LogInfo
+from px4fuse.log import Dropout, LogInfo
+from px4fuse.position_source import RECEIVED, Origin
 
 Span = tuple[float, float]
 

@@ -15,8 +15,8 @@ from px4fuse.trajectory.alignment import Transform
 from px4fuse.trajectory.association import Association
 from px4fuse.trajectory.evaluation import AbsoluteError, Score
 from px4fuse.trajectory.model import Track
-from px4fuse.trajectory.offset import TimeOffset
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
+from px4fuse.trajectory.time_offset import TimeOffset
 
 SHIPPED = Path(__file__).parent.parent / "reports" / "example" / "aisle_uwb.json"
 EXAMPLE: dict[str, Any] = json.loads(SHIPPED.read_text(encoding="utf-8"))

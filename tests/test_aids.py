@@ -18,7 +18,7 @@ from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import find_aids
 from px4fuse.findings.aids import find_in
-from px4fuse.findings.causes import CAUSE, CHANGE, SENSOR
+from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.flight import AidLog, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.results.reading import read_results

@@ -20,10 +20,10 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Alignment, Columns, Flight, PositionTrack, Reset
-from px4fuse.origin import POSITION_FILE
+from px4fuse.log import InputFile
+from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
-from px4fuse.recording import InputFile
 
 BOOT_S = 2416.25
 OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock

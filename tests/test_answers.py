@@ -10,7 +10,7 @@ from cli_tools import done, refused
 from flights import aisle_flight
 from pypdf import PdfReader
 
-from px4fuse.answers import MISTAKES, ClaimedMistake, draw_questions, form_text, read_answers
+from px4fuse.answer_form import MISTAKES, ClaimedMistake, draw_questions, form_text, read_answers
 from px4fuse.assignment.truth import quantity_truth
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError

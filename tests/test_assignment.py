@@ -15,10 +15,11 @@ from detector_rates import rates
 
 import px4fuse
 from px4fuse.analysis import explain
-from px4fuse.answers import Answers, read_answers
+from px4fuse.answer_form import Answers, read_answers
 from px4fuse.assignment import assignment
 from px4fuse.assignment.assignment import assign, fly, key_path
-from px4fuse.assignment.drawing import (
+from px4fuse.assignment.key import AnswerKey, key_text, read_key
+from px4fuse.assignment.random_assignment import (
     ASSIGNABLE_MISTAKES,
     COUNTS,
     EASIEST_DIFFICULTY,
@@ -26,7 +27,6 @@ from px4fuse.assignment.drawing import (
     LOOP_SHARE,
     draw,
 )
-from px4fuse.assignment.key import AnswerKey, key_text, read_key
 from px4fuse.assignment.roster import Person
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import OutputError, SettingsError

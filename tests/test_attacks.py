@@ -20,7 +20,7 @@ from exchange import replace
 from forgery import Base, Change, base, forged, on_page, put, read_again, report_of
 from results_tools import LOOP, changed, decoded
 
-from px4fuse.answers import form_text
+from px4fuse.answer_form import form_text
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import ResultsError
@@ -32,8 +32,8 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification import pages
-from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Verdict
+from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import cannot_verify
 
 pytestmark = pytest.mark.usefixtures("analysed_once", "_pages_here")

@@ -6,9 +6,9 @@ import pytest
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings import NAMES, Finding, causes
-from px4fuse.findings.causes import CONSEQUENCES, NOISES, RECORDING, group_by_cause
-from px4fuse.report.words import format_verdict, verdict_notes
+from px4fuse.findings import NAMES, Finding, cause_grouping
+from px4fuse.findings.cause_grouping import CONSEQUENCES, NOISES, RECORDING, group_by_cause
+from px4fuse.report.phrases import format_verdict, verdict_notes
 
 
 def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
@@ -19,7 +19,7 @@ def test_consequences_name_existing_findings_only() -> None:
     listed = {name.split(":")[0] for names in CONSEQUENCES.values() for name in names}
     assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(NAMES)
     kinds = {name.partition(":")[2] for names in CONSEQUENCES.values() for name in names}
-    assert kinds - {""} <= {value for name, value in vars(causes).items() if name.isupper()
+    assert kinds - {""} <= {value for name, value in vars(cause_grouping).items() if name.isupper()
                             and isinstance(value, str)}  # fmt: skip
 
 

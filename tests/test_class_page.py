@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
-from px4fuse.answers import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, ClaimedMistake
 from px4fuse.grading.class_page import html_text, tenths
 from px4fuse.grading.model import Entry, GradedReport, Item, Override
 from px4fuse.grading.outputs import anonymise_entry

@@ -30,20 +30,20 @@ from px4fuse.arrays import Array
 from px4fuse.comparison import estimates
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import MIN_PARTS, noises_and_clock, widen_for_drift
-from px4fuse.filter import clock
-from px4fuse.filter.clock import MAX_CHANGE_P, ClockOffset, PartOffset
+from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import Noises
-from px4fuse.filter.likelihood import PROFILE_DROP, profile_interval
-from px4fuse.filter.motion import (
+from px4fuse.filter.imu_motion import (
     CONSTANT_SIGMA,
     START_PRECISION,
     Signals,
     make_signals,
     prepare_motion,
 )
+from px4fuse.filter.likelihood import PROFILE_DROP, profile_interval
 from px4fuse.filter.signals import Segment
+from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset, PartOffset
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.origin import (
+from px4fuse.position_source import (
     ALIGNED,
     GNSS,
     LOGGED_BY_EKF2,
@@ -60,7 +60,7 @@ def estimate(flight: Flight, **options: object) -> ClockOffset | Unavailable:
     segment = Segment(-np.inf, np.inf, "all of it")
     noises = Noises(SIGMA_A, SIGMA_Z)
     track = flight.positions[0]
-    return clock.estimate_time_offset(flight, track, segment, SETTINGS, noises, **options)
+    return time_offset.estimate_time_offset(flight, track, segment, SETTINGS, noises, **options)
 
 
 def covers(found: ClockOffset, true_s: float) -> bool:
@@ -273,7 +273,7 @@ def test_clock_profile_equals_joint_normal_density(exact_imu) -> None:
 def test_clock_parabola_gives_vertex_sigma_interval() -> None:
     grid = np.linspace(-0.1, 0.3, 41)
     drop = (grid - 0.123) ** 2 / (2.0 * 0.03**2)
-    assert clock._minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
+    assert time_offset._minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
     ends = 0.123 - 1.96 * 0.03, 0.123 + 1.96 * 0.03
     assert profile_interval(grid, drop) == pytest.approx(ends, abs=1e-3)
     # an end outside the grid is None
@@ -282,7 +282,7 @@ def test_clock_parabola_gives_vertex_sigma_interval() -> None:
     wider = 0.123 - 2 * 1.96 * 0.03, 0.123 + 2 * 1.96 * 0.03
     assert profile_interval(grid, drop, 4.0 * PROFILE_DROP) == pytest.approx(wider, abs=1e-3)
     # without a minimum, σ is the width of the grid
-    found, sigma = clock._minimum_and_sigma(grid, -((grid - 0.1) ** 2))
+    found, sigma = time_offset._minimum_and_sigma(grid, -((grid - 0.1) ** 2))
     assert found in (grid[0], grid[-1])
     assert sigma == pytest.approx(0.4)
 
@@ -297,11 +297,11 @@ def test_clock_parts_and_change_follow_profiles(monkeypatch, offset_s, factor) -
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
         return SimpleNamespace(by_stretch=lambda: 0.5 * square[None])
 
-    monkeypatch.setattr(clock, "fit_noises", fit_noises)
+    monkeypatch.setattr(time_offset, "fit_noises", fit_noises)
     moved = SimpleNamespace(
         edges=np.arange(5) * 2, time_s=np.arange(8.0), blocks=lambda grid: grid, weight=None
     )
-    parts, p = clock._offset_per_part(moved, offset_s, Noises(0.1, 0.1), factor)
+    parts, p = time_offset._offset_per_part(moved, offset_s, Noises(0.1, 0.1), factor)
     # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [part.offset_s for part in parts] == pytest.approx(offset_s + shift[:3])
@@ -324,13 +324,13 @@ def test_clock_variance_inflation_simulates_imu_noise(monkeypatch) -> None:
         np.testing.assert_allclose(variance, 0.1**2)
         return np.arange(measured.shape[1])[None, :]
 
-    monkeypatch.setattr(clock, "products_by_stretch", products)
+    monkeypatch.setattr(time_offset, "products_by_stretch", products)
     flight, _ = made_flight()
     samples = flight.positions[0].samples[Columns.POSITION]
     time = samples.index.to_numpy()
     moved = prepare_motion(flight, time, samples.to_numpy(), directions=np.eye(3), dt_s=DT)
-    factor = clock._variance_inflation(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
-    size = clock.SIMULATION_COUNT
+    factor = time_offset._variance_inflation(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
+    size = time_offset.SIMULATION_COUNT
     assert factor == pytest.approx(1.0 + (size**2 - 1) / 12.0 / 40.0)
     error, dp, dv, speed = given
     joined, length = moved.at(0.0).joined, np.diff(moved.time_s)

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import f
 
 from px4fuse.trajectory.correlation import autocovariance, moments
-from px4fuse.trajectory.offset import MIN_SECOND_PEAK_RATIO
+from px4fuse.trajectory.time_offset import MIN_SECOND_PEAK_RATIO
 
 
 @pytest.mark.parametrize("is_complex", [False, True])

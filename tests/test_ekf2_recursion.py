@@ -14,6 +14,16 @@ from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
+from px4fuse.ekf2.filter_recursion import (
+    StretchRun,
+    Variant,
+    _Fusion,
+    _limit_bias,
+    _sequential_update,
+    _settled_correlation,
+    run_stretch,
+)
+from px4fuse.ekf2.filter_recursion import _measurements as measurements
 from px4fuse.ekf2.inputs import FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import (
     FUSE,
@@ -26,17 +36,7 @@ from px4fuse.ekf2.intervals import (
     make_intervals,
 )
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.recursion import (
-    StretchRun,
-    Variant,
-    _Fusion,
-    _limit_bias,
-    _sequential_update,
-    _settled_correlation,
-    run_stretch,
-)
-from px4fuse.ekf2.recursion import _measurements as measurements
-from px4fuse.ekf2.stretches import GRAVITY_M_S2, Stretch, add_field_states
+from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, Stretch, add_field_states
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, settings_in_force
 from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew

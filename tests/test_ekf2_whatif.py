@@ -17,8 +17,8 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
-from px4fuse.ekf2.stretches import SensorSamples, Stretch
-from px4fuse.ekf2.walk import (
+from px4fuse.ekf2.replay_segments import SensorSamples, Stretch
+from px4fuse.ekf2.steps import (
     ATTITUDE,
     FIELD_STEP,
     FLOW_STEP,

@@ -10,7 +10,7 @@ import pytest
 from class_tools import graded
 from exchange import replace
 
-from px4fuse.answers import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, ClaimedMistake
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_page import _point_boxes

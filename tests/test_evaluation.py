@@ -21,7 +21,6 @@ from px4fuse.trajectory.alignment import AlignmentKind, fit_alignment
 from px4fuse.trajectory.association import Method, associate
 from px4fuse.trajectory.evaluation import choose_alignment, evaluate
 from px4fuse.trajectory.model import Trajectory
-from px4fuse.trajectory.offset import clock_difference, estimate_time_offset
 from px4fuse.trajectory.scores import (
     MIN_BLOCKS,
     Delta,
@@ -31,6 +30,7 @@ from px4fuse.trajectory.scores import (
     relative_error,
     rmse_interval,
 )
+from px4fuse.trajectory.time_offset import clock_difference, estimate_time_offset
 
 # -- evo -------------------------------------------------------------------------------------------
 

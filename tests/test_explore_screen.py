@@ -13,13 +13,13 @@ from browser import Browser
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis, run, run_comparison
-from px4fuse.comparison.interventions import error_beyond_reported_sigma
+from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
 from px4fuse.explore.page import html_text
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.plain import format_number
 from px4fuse.request import ComparisonRequest
+from px4fuse.text import format_number
 
 pytestmark = pytest.mark.usefixtures("analysed_once")
 

@@ -20,8 +20,8 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import Flight, Reset
 from px4fuse.inspect import tables as extraction
+from px4fuse.log import ClockMap, Dropout, InputFile
 from px4fuse.readers import read_log
-from px4fuse.recording import ClockMap, Dropout, InputFile
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.scenario import make_scenario
 

@@ -35,10 +35,10 @@ from findings_tools import (
 )
 
 from px4fuse.comparison import remedy as remedies
-from px4fuse.filter.causes import BiasScaleJumpFit, Estimate
-from px4fuse.filter.coloured import SourceLowPass, TimeCorrelatedNoise
-from px4fuse.filter.heading import HeadingError, HeadingPart
-from px4fuse.filter.heading import combine_heading_parts as together
+from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
+from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
+from px4fuse.filter.frame_rotation import combine_heading_parts as together
+from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import Noise
@@ -61,8 +61,15 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.model import fraction_on, moments, spans_at
 from px4fuse.flight import Columns, FusionRecord, Reset, Unavailable
-from px4fuse.origin import ALIGNED, FROM_INNOVATIONS, GNSS, LOGGED_BY_EKF2, MOTION_CAPTURE, RECEIVED
-from px4fuse.recording import Dropout
+from px4fuse.log import Dropout
+from px4fuse.position_source import (
+    ALIGNED,
+    FROM_INNOVATIONS,
+    GNSS,
+    LOGGED_BY_EKF2,
+    MOTION_CAPTURE,
+    RECEIVED,
+)
 
 
 def with_fusion(*pairs: tuple[float, float], column: str = "horizontal") -> dict[str, Any]:

@@ -23,9 +23,9 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import NAMES, Finding, by_root, find
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, Reset, Unavailable
-from px4fuse.origin import ALIGNED, LOGGED_BY_EKF2
+from px4fuse.log import ClockMap, Dropout
+from px4fuse.position_source import ALIGNED, LOGGED_BY_EKF2
 from px4fuse.readers import read_log
-from px4fuse.recording import ClockMap, Dropout
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
 NO_VISION = {"EKF2_EVP_NOISE": 0.1, "SDLOG_PROFILE": 1.0}

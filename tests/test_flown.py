@@ -9,7 +9,7 @@ from flights import with_noises
 
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter.clock import MAX_CHANGE_P
+from px4fuse.filter.time_offset import MAX_CHANGE_P
 from px4fuse.findings import find
 from px4fuse.readers import read_log
 from px4fuse.report.clock import clock_advice

@@ -14,8 +14,8 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.answers import CURES, MISTAKES, PANELS, Answers, ClaimedMistake, update_values
-from px4fuse.assignment.drawing import draw
+from px4fuse.answer_form import CURES, MISTAKES, PANELS, Answers, ClaimedMistake, update_values
+from px4fuse.assignment.random_assignment import draw
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
 from px4fuse.grading.form_points import PART_NAMES, TABLE, cures, form_points, panels

@@ -31,7 +31,7 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, noises
 from px4fuse.flight import Columns, Flight, FusionRecord, PositionTrack, Unavailable
-from px4fuse.origin import GNSS
+from px4fuse.position_source import GNSS
 from px4fuse.readers import px4_fixes, read_log
 from px4fuse.readers.px4_fixes import reconstruct_fixes
 from px4fuse.report.clock import clock_advice

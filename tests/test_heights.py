@@ -14,16 +14,16 @@ from exchange import replace
 from findings_tools import made
 
 from px4fuse.analysis import WhatIfAnalysis
+from px4fuse.ekf2.filter_recursion import StretchRun, Variant
 from px4fuse.ekf2.heights import HeightFilter, add_heights, barometer_samples
 from px4fuse.ekf2.model import Model, run_variants
-from px4fuse.ekf2.recursion import StretchRun, Variant
-from px4fuse.ekf2.stretches import HeightSamples, Stretch
+from px4fuse.ekf2.replay_segments import HeightSamples, Stretch
 from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight import AidLog, Flight
 from px4fuse.readers import read_log
+from px4fuse.report.difference_page import format_agreement
 from px4fuse.report.whatif import rows
-from px4fuse.report.why import format_agreement
 from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json

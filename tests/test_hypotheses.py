@@ -16,7 +16,7 @@ from flights import aisle_flight, unavailable, unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_frame_rotation, noises_and_clock
-from px4fuse.filter.causes import DesignMatrix, bias_scale_jump_fit, make_design_matrix
+from px4fuse.filter.hypotheses import DesignMatrix, bias_scale_jump_fit, make_design_matrix
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings

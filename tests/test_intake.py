@@ -23,8 +23,8 @@ from results_tools import LOOP, decoded
 from px4fuse.errors import ResultsError
 from px4fuse.results.contract import Reported, to_json
 from px4fuse.results.model import Student
-from px4fuse.verification import intake
-from px4fuse.verification.intake import read_report
+from px4fuse.verification import pdf_input
+from px4fuse.verification.pdf_input import read_report
 
 ROOT = Path(__file__).parent.parent
 REAL = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
@@ -121,7 +121,7 @@ def test_read_report_resaved_returns_same_results():
     (REAL[: len(REAL) // 2], "the end of the PDF is missing"),
     (REAL[:300_000] + b"\n%%EOF\n", DAMAGED),
     (b"%PDF-1.4\nstartxref\n5\n%%EOF", DAMAGED),
-    (b"%PDF-1.4\n" + bytes(intake.MAX_BYTES), "larger than 25 MB"),
+    (b"%PDF-1.4\n" + bytes(pdf_input.MAX_BYTES), "larger than 25 MB"),
     (small(None), "printed to PDF, which removes attachments. Hand in the original"),
     (
         small(name="../../results.json"),

@@ -10,8 +10,7 @@ import pytest
 from exchange import replace
 
 from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.interventions import (
+from px4fuse.comparison.causal_replays import (
     CLOCK,
     FORWARD,
     MIN_EXPLAINED_SHARE,
@@ -22,14 +21,15 @@ from px4fuse.comparison.interventions import (
     interventions,
     planned_variants,
 )
-from px4fuse.comparison.interventions import RIGHT as TO_RIGHT
+from px4fuse.comparison.causal_replays import RIGHT as TO_RIGHT
+from px4fuse.comparison.comparison import compare
+from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.model import replay_settings, with_misaligned_positions, with_position_noise
-from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.whatif import what_if
-from px4fuse.filter.heading import HeadingError
+from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.story import story
+from px4fuse.findings.summary import story
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse

@@ -8,7 +8,7 @@ from flights import aisle_flight
 from mavlink_tools import BOOT_S, Aisle, boot, track_of, unix
 from ulog_tools import load
 
-from px4fuse.alignment.joining import join, shift_times
+from px4fuse.alignment.merge_recordings import join, shift_times
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, FlightMode, Reset, Unavailable
 from px4fuse.readers import read_log

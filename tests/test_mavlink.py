@@ -51,7 +51,7 @@ from px4fuse.errors import LogError, MissingDataError
 from px4fuse.findings import find
 from px4fuse.flight import Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.inspect.inventory import take_inventory
-from px4fuse.origin import MOTION_CAPTURE, RECEIVED
+from px4fuse.position_source import MOTION_CAPTURE, RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import wire_layout
 from px4fuse.readers.mavlink_positions import pressure_altitude

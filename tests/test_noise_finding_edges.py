@@ -31,14 +31,14 @@ from findings_tools import (
 )
 
 from px4fuse.comparison.model import Difference
-from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2.steps import Why
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOutCheck, Noise
-from px4fuse.findings import Finding, hidden_errors, loops, noises, since
-from px4fuse.findings.causes import group_by_cause
+from px4fuse.findings import Finding, cause_text, hidden_errors, loops, noises
+from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _is_default
-from px4fuse.findings.story import story
+from px4fuse.findings.summary import story
 from px4fuse.loop.model import Closure, Loop
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
@@ -311,7 +311,7 @@ def test_variances_cause_determines_action(owner, change, kind, action, monkeypa
         ((name, value),) = changes.items()
         return f"{{{name}: {value:g} {PARAMETERS[name].unit}|{helps.__name__}}}"
 
-    monkeypatch.setattr(since.remedy, "format_ekf2_remedy", changes_only)
+    monkeypatch.setattr(cause_text.remedy, "format_ekf2_remedy", changes_only)
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 1.0)))
     # changes that explain less than 0.5 or more than 1.5 are not causes
     causes = (tried(owner, {"sigma_z_m": 7.0}, explains=0.4), tried(owner, change),
@@ -627,4 +627,4 @@ def test_format_change_names_old_and_new_value(
 ) -> None:
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 7.0)))
     one = analysis(settings=replace(CHOSEN, clock_offset_s=0.1), ekf2_model=model)
-    assert since.format_change(one, tried(owner, change)) == expected
+    assert cause_text.format_change(one, tried(owner, change)) == expected

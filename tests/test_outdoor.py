@@ -17,15 +17,15 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from px4fuse.analysis import Analysis, explain
+from px4fuse.comparison.causal_replays import TURN, cause_of
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.interventions import TURN, cause_of
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2.whatif import HEADING_STAYS, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, source_clock
-from px4fuse.findings.story import story
+from px4fuse.findings.summary import story
 from px4fuse.flight import Columns
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_positions import project, unproject

@@ -46,9 +46,9 @@ from pypdf.generic import (
 
 from px4fuse.errors import ResultsError
 from px4fuse.verification import pages
-from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pages import COORDINATE_PT, compare_pages
+from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import Rounding, same_words
 
 STRING = TextStringObject

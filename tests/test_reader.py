@@ -30,7 +30,14 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import Columns, Reset, Unavailable
-from px4fuse.origin import ALIGNED, FROM_INNOVATIONS, GNSS, LOGGED_BY_EKF2, MOTION_CAPTURE, RECEIVED
+from px4fuse.position_source import (
+    ALIGNED,
+    FROM_INNOVATIONS,
+    GNSS,
+    LOGGED_BY_EKF2,
+    MOTION_CAPTURE,
+    RECEIVED,
+)
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S
 

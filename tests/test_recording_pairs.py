@@ -6,9 +6,9 @@ from flights import Imu, aisle_flight
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
-from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight import Unavailable
-from px4fuse.recording import Stream
+from px4fuse.log import Stream
 
 
 @pytest.mark.parametrize(("topic", "imu_hz", "needed"), [

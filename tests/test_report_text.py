@@ -18,9 +18,9 @@ from matplotlib import font_manager
 from page_tools import set_by_typst
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.clock import ClockOffset, PartOffset
 from px4fuse.filter.likelihood import filter_states, preintegrate
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.findings import Finding
 from px4fuse.flight import Unavailable
 from px4fuse.report import clock, fonts, notes

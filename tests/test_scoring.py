@@ -10,7 +10,7 @@ import pytest
 from exchange import replace
 from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, finding
 
-from px4fuse.answers import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, ClaimedMistake
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth
 from px4fuse.errors import ResultsError
@@ -21,8 +21,8 @@ from px4fuse.grading.outputs import feedback_text
 from px4fuse.grading.rubric import assess, parse_rubric, read_rubric
 from px4fuse.results.contract import to_plain
 from px4fuse.simulation.flights import HARDWARE
-from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Verdict
+from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import verify
 
 ROOT = Path(__file__).parent.parent

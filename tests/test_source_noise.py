@@ -11,12 +11,12 @@ from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.filter import coloured
-from px4fuse.filter.coloured import time_correlation_fit
+from px4fuse.filter import correlated_noise
+from px4fuse.filter.correlated_noise import time_correlation_fit
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
-from px4fuse.findings.causes import SETTINGS
+from px4fuse.findings.cause_grouping import SETTINGS
 from px4fuse.findings.source_noise import detect, noise_variation
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
@@ -244,7 +244,7 @@ def test_time_correlation_fit_tries_zero_and_estimated_offset(
         tried.append(offsets)
         return 0.0, noises[0]
 
-    monkeypatch.setattr(coloured, "_best_of_grid", none_better)
+    monkeypatch.setattr(correlated_noise, "_best_of_grid", none_better)
     for offset_s in (0.0, 0.3, -0.2):
         time_correlation_fit(
             analysis.flight, (analysis.axes["north"].axis,), RIGHT, Noises(0.3, 0.1),

@@ -14,7 +14,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import EV_POS, FLOW, Aid
 from px4fuse.findings import find
-from px4fuse.findings.story import MAX_PARAGRAPHS, story
+from px4fuse.findings.summary import MAX_PARAGRAPHS, story
 from px4fuse.flight import AidLog
 
 ALONG_DEG = 30.0

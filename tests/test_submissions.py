@@ -21,7 +21,7 @@ from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
 from px4fuse.grading.submissions import find_submissions, origin_of, read, with_origins
 from px4fuse.reading import files_by_sha256
-from px4fuse.verification.intake import MAX_BYTES, read_report
+from px4fuse.verification.pdf_input import MAX_BYTES, read_report
 
 PDF = b"%PDF-1.4 a small one\n%%EOF\n"
 

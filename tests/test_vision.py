@@ -18,21 +18,21 @@ from exchange import replace
 
 from px4fuse.analysis import explain, run_what_if
 from px4fuse.comparison.comparison import compare
-from px4fuse.ekf2 import walk
+from px4fuse.ekf2 import steps
+from px4fuse.ekf2.filter_recursion import StretchRun, Variant, run_stretch
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import Events, make_intervals
 from px4fuse.ekf2.model import Model, modelled_aids, open_model, replay_settings, run_variants
-from px4fuse.ekf2.recursion import StretchRun, Variant, run_stretch
-from px4fuse.ekf2.stretches import Stretch
+from px4fuse.ekf2.replay_segments import Stretch
 from px4fuse.ekf2.vision import STOP_S
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.flight import AidLog, Columns, Flight, PositionTrack, Unavailable
-from px4fuse.origin import RECEIVED
+from px4fuse.position_source import RECEIVED
+from px4fuse.report.difference_page import format_agreement
 from px4fuse.report.whatif import rows
-from px4fuse.report.why import format_agreement
 from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json
@@ -537,15 +537,17 @@ def test_model_incomplete_vision_is_unavailable() -> None:
 
 
 def test_steps_contain_vision_and_causes_only_kf() -> None:
-    found = walk.explain_by_steps(model())
+    found = steps.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]
         assert (
-            names.index(walk.VELOCITY_STEP) < names.index(walk.VISION_STEP) < names.index(walk.GATE)
+            names.index(steps.VELOCITY_STEP)
+            < names.index(steps.VISION_STEP)
+            < names.index(steps.GATE)
         )
         assert why.position_left_share < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
-        assert min(moved_m[walk.VELOCITY_STEP], moved_m[walk.VISION_STEP]) > 0.05
+        assert min(moved_m[steps.VELOCITY_STEP], moved_m[steps.VISION_STEP]) > 0.05
     analysis = explain(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"

@@ -9,13 +9,13 @@ from flights import unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.why import add_sentences, explain_ekf2_difference
-from px4fuse.ekf2.walk import SAMPLES, STAMPS, Why
+from px4fuse.comparison.difference_steps import add_sentences, explain_ekf2_difference
+from px4fuse.ekf2.steps import SAMPLES, STAMPS, Why
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
+from px4fuse.report.difference_page import draw, unexplained_note
 from px4fuse.report.style import report_style
-from px4fuse.report.why import draw, unexplained_note
 
 
 def of(analysis: Analysis, name: str = "aisle") -> Why:

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.answers import GATE_UPDATES, FormQuestion, draw_questions, update_values
+from px4fuse.answer_form import GATE_UPDATES, FormQuestion, draw_questions, update_values
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
-from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import COVARIANCES, process_noise_unit, symmetric_matrix, transition
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
@@ -39,8 +39,8 @@ class TrueMistake(Record, frozen=True):
     Attributes
     ----------
     size : float or None
-        In the first unit of :data:`px4fuse.answers.MISTAKES`; answers from ``low`` to ``high`` are
-        right.
+        In the first unit of :data:`px4fuse.answer_form.MISTAKES`; answers from ``low`` to ``high``
+        are right.
     from_s, until_s : float or None
         Time (s) since the first data; both None: the whole flight.
     """
@@ -70,7 +70,7 @@ class FormTruth(Record, frozen=True):
     ekf2_did, ekf2_did_also : tuple of str
         Behaviour of EKF2 that must be named, and that may be named.
     quantities : tuple
-        Answers to :func:`px4fuse.answers.draw_questions`; None if the flight is too short.
+        Answers to :func:`px4fuse.answer_form.draw_questions`; None if the flight is too short.
     """
 
     mistakes: tuple[TrueMistake, ...]

@@ -37,7 +37,7 @@ def _list_page() -> Page:
 
 
 def _finding_page(typed: str) -> Page:
-    from px4fuse.findings.causes import CONSEQUENCES
+    from px4fuse.findings.cause_grouping import CONSEQUENCES
     from px4fuse.findings.model import CATALOGUE, load_examples
     from px4fuse.report.page import Page
 

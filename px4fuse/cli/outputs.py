@@ -112,7 +112,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
     """
     from px4fuse.results.contract import file_hashes_in, to_json
     from px4fuse.results.reading import read_results
-    from px4fuse.verification.intake import attached_results
+    from px4fuse.verification.pdf_input import attached_results
 
     name = f"{stem}{settings}"
     if len(os.fsencode(name)) > LONGEST_NAME:

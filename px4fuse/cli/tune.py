@@ -76,8 +76,8 @@ def noise_text(noise: Noise) -> str:
 
 def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> Page:
     from px4fuse.report.page import Page
+    from px4fuse.report.phrases import format_settings, tuning_advice
     from px4fuse.report.style import MUTED_COLOUR
-    from px4fuse.report.words import format_settings, tuning_advice
 
     page, rows, notes = Page(), [], list[str]()
     for name, tuning in tuned.items():

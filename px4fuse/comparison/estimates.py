@@ -16,10 +16,10 @@ from scipy.special import stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.clock import MAX_HALF_INTERVAL_S, ClockOffset, estimate_time_offset
 from px4fuse.filter.fitting import Noises
-from px4fuse.filter.heading import HeadingError, estimate_heading_error
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S, SignalCache
+from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
+from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, SignalCache
+from px4fuse.filter.time_offset import MAX_HALF_INTERVAL_S, ClockOffset, estimate_time_offset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
 
@@ -74,7 +74,7 @@ def tuned(
     progress : callable
         Called with the name of each step.
     cache : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
+        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
     """
     flight, slow_imu = comparison.flight, missing_imu_rate(comparison.flight)
     return tune(

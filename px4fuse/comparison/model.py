@@ -6,13 +6,13 @@ from typing import Literal
 
 import pandas as pd
 
-from px4fuse.display import one_line_repr
 from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis, Segment
 from px4fuse.flight import Flight, PositionTrack
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import (
     Count,
     NotNegative,

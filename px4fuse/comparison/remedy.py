@@ -19,14 +19,14 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.ekf2_parameters import EV_POS, PARAMETERS, Aid
-from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.quick import quick_replay
+from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, make_axes
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capitalise_first
 from px4fuse.request import OPTIONS
+from px4fuse.text import capitalise_first
 
 # Ratio of √R to EKF2_EVP_NOISE above which R is from the sender
 MIN_REPORTED_RATIO = 1.25

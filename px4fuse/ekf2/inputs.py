@@ -12,12 +12,17 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import one_line_repr
-from px4fuse.ekf2.earth import ekf2_metres_per_metre
+from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.output_predictor import corrections
-from px4fuse.ekf2.stretches import IMU_GAP_S, MIN_STRETCH_S, Stretch, find_stretches, predict_s
+from px4fuse.ekf2.replay_segments import (
+    IMU_GAP_S,
+    MIN_STRETCH_S,
+    Stretch,
+    find_stretches,
+    predict_s,
+)
 from px4fuse.ekf2_parameters import (
     AID_MASK,
     AIDS,
@@ -41,7 +46,8 @@ from px4fuse.flight import (
     Unavailable,
     step_values_at,
 )
-from px4fuse.origin import POSITION_FILE
+from px4fuse.notebook_display import one_line_repr
+from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_THINNED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE

@@ -9,13 +9,13 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import one_line_repr
 from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
-from px4fuse.ekf2.stretches import SETTLING_S
+from px4fuse.ekf2.replay_segments import SETTLING_S
 from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_HGT, GNSS_POS, GNSS_VEL, MAG
 from px4fuse.filter import signals
-from px4fuse.filter.heading import heading_rad
+from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers.px4_innovations import along as innovations_along
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
@@ -104,7 +104,7 @@ class Agreement(Record, frozen=True, kw_only=True):
         Heights, if the log contains all fused samples.
     samples : int
         Logged innovations compared, without the first seconds of each stretch
-        (:data:`~px4fuse.ekf2.stretches.SETTLING_S`).
+        (:data:`~px4fuse.ekf2.replay_segments.SETTLING_S`).
     rejected_share_logged, rejected_share_replayed : float
         Share of these samples.
     decisions_same : float

@@ -9,7 +9,6 @@ import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.arrays import Array
-from px4fuse.display import one_line_repr
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
@@ -27,8 +26,9 @@ from px4fuse.ekf2.replay import (
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, check_parameters
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
-from px4fuse.filter.heading import heading_rad
+from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight import AxisName, Columns, Ekf2, Flight, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share
 
 ANALYSIS_NAME = "EKF2 what-if"

@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import (
+from px4fuse.comparison.causal_replays import (
     MAX_UNSUSPICIOUS_NIS,
     MIN_NEES_FINDING,
     error_beyond_reported_sigma,
@@ -20,18 +20,18 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter import settings as allowed
-from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding, by_root, find, finding_title
-from px4fuse.findings.causes import NOISES
-from px4fuse.findings.story import story
+from px4fuse.findings.cause_grouping import NOISES
+from px4fuse.findings.summary import story
 from px4fuse.flight import Columns, PositionTrack, Unavailable
-from px4fuse.plain import capitalise_first
 from px4fuse.request import ComparisonRequest, command_line
+from px4fuse.text import capitalise_first
 
 # s; range of the clock offset slider on each side (the option --clock-offset has a larger range)
 OFFSET_REACH_S = 0.6

@@ -1,9 +1,9 @@
 """Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals, and a held-out check.
 
 Constant errors are not noise: with IMU data, biases, tilt and time offset are fitted, too
-(:mod:`px4fuse.filter.motion`), so that SIGMA_A is the noise of the acceleration and SIGMA_Z that of
-the source. KF has no states for biases. The SIGMA_A that it needs to cover them is larger and is
-estimated separately.
+(:mod:`px4fuse.filter.imu_motion`), so that SIGMA_A is the noise of the acceleration and SIGMA_Z
+that of the source. KF has no states for biases. The SIGMA_A that it needs to cover them is larger
+and is estimated separately.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import one_line_repr
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
@@ -27,6 +26,7 @@ from px4fuse.filter.fitting import (
     filter_positions,
     maximise_likelihood,
 )
+from px4fuse.filter.imu_motion import SignalCache, prepare_motion
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -34,10 +34,10 @@ from px4fuse.filter.likelihood import (
     profile_ends,
     score_grid,
 )
-from px4fuse.filter.motion import SignalCache, prepare_motion
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, OrUnavailable, Record
 
 HORIZONTAL = "horizontal"
@@ -223,7 +223,7 @@ def tune(
     drifts : bool
         True if the source may drift, as odometry does.
     signals : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
+        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
 
     Returns
     -------
@@ -267,7 +267,7 @@ def tune_axes(
     drifts : bool
         True if the source may drift, as odometry does.
     signals : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
+        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
     """
     intervals = [preintegrate(axis, settings) for axis in axes]
     count = len(intervals[0].measurement_m)

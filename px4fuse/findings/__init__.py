@@ -31,7 +31,7 @@ from px4fuse.findings import (
     source_positions,
     source_stamps,
 )
-from px4fuse.findings.causes import group_by_cause
+from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import NAMES, Finding, Found, Severity, by_root
 from px4fuse.loop.model import Loop
 

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from px4fuse.analysis import Analysis
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, MAG
-from px4fuse.findings.causes import CAUSE, CHANGE, SENSOR
+from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Found, format_percent, info, warning
 from px4fuse.flight import Unavailable
-from px4fuse.plain import format_factor, format_number
+from px4fuse.text import format_factor, format_number
 
 EVALUATED_ELSEWHERE = ("ev_pos", "ev_hgt")
 

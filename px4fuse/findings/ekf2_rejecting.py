@@ -4,10 +4,10 @@ import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.comparison.interventions import cause_of
+from px4fuse.comparison.causal_replays import cause_of
 from px4fuse.ekf2_parameters import GNSS_POS, Aid
+from px4fuse.findings.cause_text import format_remedy_of_ekf2
 from px4fuse.findings.model import Finding, Found, finding, format_percent, moments
-from px4fuse.findings.since import format_remedy_of_ekf2
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # of the innovations; a gate of 5 √S rejects 6e-7 if consistent

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.causes import MIN_BIAS_M_S2, BiasScaleJumpFit
+from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, BiasScaleJumpFit
 from px4fuse.filter.signals import Segment, imu_gaps, within
 from px4fuse.findings.model import MAX_MOMENT_S, Found, error, finding, warning
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate

@@ -3,7 +3,7 @@
 from px4fuse.analysis import Analysis
 from px4fuse.findings.model import Finding, Found, error, info, warning
 from px4fuse.loop.model import LANDING, Closure, Loop
-from px4fuse.plain import capitalise_first
+from px4fuse.text import capitalise_first
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
 MAX_DROPPED_SHARE = 0.5  # of the closures; most closures of a flight are true

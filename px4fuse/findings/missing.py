@@ -7,7 +7,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.findings.model import Found, format_percent, info, warning
 from px4fuse.flight import Ekf2, Unavailable
-from px4fuse.origin import RECEIVED
+from px4fuse.position_source import RECEIVED
 
 WANTED_TOPIC = "vehicle_visual_odometry"
 VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp

@@ -13,8 +13,7 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.comparison.estimates import first_axis_tuning
-from px4fuse.comparison.interventions import (
+from px4fuse.comparison.causal_replays import (
     SETTING_CHANGES,
     SIGMA_A,
     SIGMA_Z,
@@ -25,6 +24,7 @@ from px4fuse.comparison.interventions import (
     is_inconsistent,
     tuning_of_axis,
 )
+from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of
@@ -32,7 +32,8 @@ from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
-from px4fuse.findings.causes import CAUSE, ELSEWHERE, NOISE
+from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
+from px4fuse.findings.cause_text import format_remedy, format_remedy_of_ekf2, format_rerun, kind_of
 from px4fuse.findings.hidden_errors import hidden_errors
 from px4fuse.findings.model import (
     Finding,
@@ -43,11 +44,10 @@ from px4fuse.findings.model import (
     format_percent,
     one_level_lower,
 )
-from px4fuse.findings.since import format_remedy, format_remedy_of_ekf2, format_rerun, kind_of
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
-from px4fuse.plain import format_factor, format_number
 from px4fuse.request import OPTIONS
+from px4fuse.text import format_factor, format_number
 
 MIN_NOISE_RATIO = 1.5  # ratio of σ; below, the tracks hardly change
 MIN_NOISE_RATIO_ERROR = 4.0  # ratio of σ; the gain differs clearly

@@ -7,7 +7,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.findings.model import Found, finding, format_count, info, warning
 from px4fuse.flight import Ekf2, Flight
-from px4fuse.plain import capitalise_first
+from px4fuse.text import capitalise_first
 
 
 def detect(analysis: Analysis) -> Found:

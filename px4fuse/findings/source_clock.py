@@ -7,7 +7,7 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
-from px4fuse.filter.clock import MAX_CHANGE_P, ClockOffset
+from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings.model import Found, error, finding, warning
 from px4fuse.findings.source_positions import low_pass
 from px4fuse.findings.source_stamps import until_synchronised

@@ -1,11 +1,11 @@
 """Frame of the source: FRD instead of NED, misalignment, EKF2 heading errors, file alignment."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.heading import MAX_DRIFT_P, HeadingError
+from px4fuse.filter.frame_rotation import MAX_DRIFT_P, HeadingError
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Finding, Found, Severity, finding, fraction_on, info, warning
 from px4fuse.flight import Ekf2, Unavailable
-from px4fuse.plain import capitalise_first
+from px4fuse.text import capitalise_first
 
 MIN_HEADING_SIGMAS = 4.0  # standard deviations; clean flights reach 3.2
 MIN_HEADING_ERROR_DEG = 5.0  # °; EKF2's magnetic heading was wrong by 3 to 4° on real flights

@@ -8,11 +8,11 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.events import longest_s, source_gaps
+from px4fuse.comparison.flight_events import longest_s, source_gaps
 from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
 from px4fuse.findings.model import Found, finding, format_percent, info, warning
-from px4fuse.origin import ALIGNED
+from px4fuse.position_source import ALIGNED
 
 MIN_LOST_SHARE = 0.02  # of the source's samples; seen: 0 to 0.3 %, and 8 to 9 % in v1.13
 MIN_INTERVALS = 50

@@ -10,16 +10,16 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.filter.coloured import TimeCorrelatedNoise
+from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
-from px4fuse.findings.causes import WHITE_RATIO
+from px4fuse.findings.cause_grouping import WHITE_RATIO
 from px4fuse.findings.model import Found, error, format_percent, info, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight import Columns, Unavailable
-from px4fuse.plain import format_number
+from px4fuse.text import format_number
 
 MIN_CORRELATION_GAIN_NATS = 5.0  # likelihood ratio 150 for two parameters; 1 of 400 clean flights
 MIN_REPEAT_SHARE = 0.05  # of the positions

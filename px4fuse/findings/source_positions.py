@@ -12,10 +12,10 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.causes import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
-from px4fuse.filter.clock import ClockOffset
-from px4fuse.filter.coloured import SourceLowPass, TimeCorrelatedNoise
+from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
+from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
 from px4fuse.filter.signals import within
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, too_slow
 from px4fuse.findings.model import (
@@ -29,7 +29,7 @@ from px4fuse.findings.model import (
 )
 from px4fuse.findings.source_stamps import arrivals
 from px4fuse.flight import Columns, Unavailable
-from px4fuse.plain import format_factor
+from px4fuse.text import format_factor
 
 MIN_MOTION_RANGE_M = 0.5  # m, 5 to 95 %; a hovering vehicle with UWB noise of 0.1 m stays below
 NOISE_RANGE_FACTOR = 1.25 * 3.29  # 5 to 95 % range of white noise in σ, with a margin of 25 %

@@ -7,7 +7,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.findings.model import Found, error, warning
 from px4fuse.flight import ARRIVAL_METHODS, Ekf2, FusionRecord
-from px4fuse.recording import ClockMap
+from px4fuse.log import ClockMap
 
 MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good UWB (0.1 m)
 MAX_ARRIVAL_AGE_S = 0.001  # s; from receiving a message to publishing it

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from px4fuse.ekf2_parameters import AIDS
-from px4fuse.filter.clock import Clock
-from px4fuse.filter.heading import HeadingError
+from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
+from px4fuse.filter.time_offset import Clock
 from px4fuse.fleet.rows import at, read_rows
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 

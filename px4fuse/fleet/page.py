@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.findings import finding_title
 from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, PLACES
-from px4fuse.plain import format_factor, format_number, join_first
+from px4fuse.text import format_factor, format_number, join_first
 from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Part, Row
 from px4fuse.webpage.safe import clean, local_link

@@ -10,10 +10,10 @@ import pandas as pd
 
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import Finding
-from px4fuse.plain import utc_time
 from px4fuse.record import Unavailable
 from px4fuse.results.contract import ComparisonResults, Log
 from px4fuse.spreadsheet import neutralise_formulas
+from px4fuse.text import utc_time
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 from px4fuse.findings import finding_title
 from px4fuse.fleet.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from px4fuse.fleet.rows import FAILED, FINDING_SEPARATOR
-from px4fuse.plain import format_factor, format_number
 from px4fuse.report.page import Page, words
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval
+from px4fuse.text import format_factor, format_number
 
 if TYPE_CHECKING:
     from px4fuse.fleet.run import Fleet

@@ -16,15 +16,14 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.answers import Answers, check
+from px4fuse.answer_form import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.comparison.model import AgainstTruth
-from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, HorizontalNis
+from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
 from px4fuse.loop.model import Correction, LoopResult, Way
-from px4fuse.plain import capitalise_first, format_factor, format_length
 from px4fuse.record import OrUnavailable, Share
 from px4fuse.results.contract import (
     TUNED_FIELDS,
@@ -34,6 +33,7 @@ from px4fuse.results.contract import (
     to_plain,
 )
 from px4fuse.results.reading import one_line
+from px4fuse.text import capitalise_first, format_factor, format_length
 from px4fuse.trajectory.evaluation import Score
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import flatten, is_number, log_sha256

@@ -14,11 +14,11 @@ from typing import Any
 from px4fuse.assignment.roster import normalise_text
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.grading.model import GradedReport
-from px4fuse.plain import capitalise_first, join_first
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Reported
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
+from px4fuse.text import capitalise_first, join_first
 from px4fuse.verification.model import Verdict
 
 # number of equal values in two forms that is not a coincidence, and relative tolerance for copies

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from px4fuse.answers import MISTAKES, Answers, ClaimedMistake, QuantityAnswer
+from px4fuse.answer_form import MISTAKES, Answers, ClaimedMistake, QuantityAnswer
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING
 from px4fuse.record import table

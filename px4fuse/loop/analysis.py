@@ -7,7 +7,7 @@ import numpy as np
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.loop import part
+from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import key_frame_spacing_m, key_frames, to_z_down
 from px4fuse.loop.corrections import correct_paths_by_distance, gate_closures, score_all, solve_all
 from px4fuse.loop.model import LANDING, KnownEnd, Loop, OdometryNoise
@@ -64,12 +64,14 @@ def analyse(
 
     request_times = (request.start_s, request.end_s)
     start, end = (None if time_s is None else stamp(time_s) for time_s in request_times)
-    segment, at_rest = part.choose_loop_segment(flight, trajectory, start, end)
+    segment, at_rest = loop_segment.choose_loop_segment(flight, trajectory, start, end)
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
     z_down_trajectory = to_z_down(trajectory)
-    path = part.cut_trajectory(z_down_trajectory, segment, at_rest)
+    path = loop_segment.cut_trajectory(z_down_trajectory, segment, at_rest)
     truth_used = truth if request.came_back and request.landed_at is None else None
-    by_truth = None if truth_used is None else part.true_end(path, truth_used, segment, at_rest)
+    by_truth = (
+        None if truth_used is None else loop_segment.true_end(path, truth_used, segment, at_rest)
+    )
     known_end_found = _find_known_end(path, request, by_truth)
     given_closures = [
         GivenClosure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in request.closures
@@ -94,7 +96,7 @@ def analyse(
         notes.append(f"the landing place is not in the ground truth: {by_truth}")
     gated_closures = gate_closures(graph, claims)
     graph_corrections, gated_closures = solve_all(path, nodes, graph, gated_closures, progress)
-    end_m, heading = path.position_m[-1] - path.position_m[0], part.heading_change_deg(path)
+    end_m, heading = path.position_m[-1] - path.position_m[0], loop_segment.heading_change_deg(path)
     misclosure_m = (
         known_end_found
         if isinstance(known_end_found, Unavailable)
@@ -149,10 +151,10 @@ def _find_known_end(
             raise SettingsError(
                 "`landed_at` and `came_back` exclude each other.", "Omit one of them."
             )
-        return part.measured_end(path, request.landed_at)
+        return loop_segment.measured_end(path, request.landed_at)
     if not request.came_back:
         return Unavailable("closure error", "the loop is declared open (--open)", "Remove --open.")
-    return by_truth if isinstance(by_truth, KnownEnd) else part.assumed_end(path)
+    return by_truth if isinstance(by_truth, KnownEnd) else loop_segment.assumed_end(path)
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
@@ -236,7 +238,7 @@ def analyse_flight_loop(
         return Unavailable(
             "loop closure", reason, "A loop needs visual-inertial odometry, sent as ODOMETRY."
         )
-    segment, _ = part.choose_loop_segment(flight, trajectory, None, None)
+    segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
     time = trajectory.time_s
     inside = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
     extent = gap = 0.0

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.display import one_line_repr
 from px4fuse.errors import MissingDataError
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, OrUnavailable, Record, Share, Unavailable
 from px4fuse.trajectory.evaluation import Evaluation, Score
 from px4fuse.trajectory.graph.model import PoseGraph

@@ -18,7 +18,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, settings_in_force
 from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, step_values_at
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import Layout, expand_columns
+from px4fuse.readers.field_maps import Layout, expand_columns
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids, read_enabled_aids
 from px4fuse.readers.px4_innovations import innovations_of
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us

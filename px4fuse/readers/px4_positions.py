@@ -20,15 +20,15 @@ from px4fuse.flight import (
     sample_rate,
     sort_by_preference,
 )
-from px4fuse.origin import Origin, with_orientation
+from px4fuse.log import ClockMap
+from px4fuse.position_source import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import GLOBAL_COLUMNS
-from px4fuse.readers.parts import finite_rows, join_nearest, read_attitude, read_orientation
+from px4fuse.readers.common import finite_rows, join_nearest, read_attitude, read_orientation
+from px4fuse.readers.field_maps import GLOBAL_COLUMNS
 from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.readers.ulog_topics import Topics
-from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h

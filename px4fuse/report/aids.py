@@ -9,14 +9,14 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.ekf2.aids import AidResult, flight_span
 from px4fuse.findings import Finding
 from px4fuse.flight import AidLog, Flight, Unavailable, step_values_at
-from px4fuse.plain import format_number
 from px4fuse.report import style
 from px4fuse.report.cover import flight_line, write_findings
-from px4fuse.report.marks import GROUND_BAND
+from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix
-from px4fuse.report.words import format_sigma_verdict
+from px4fuse.report.phrases import format_sigma_verdict
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults
+from px4fuse.text import format_number
 
 TITLE = "Aids of EKF2"
 LEAD = (

@@ -5,14 +5,14 @@ from collections.abc import Iterable, Iterator
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
-from px4fuse.filter.clock import MAX_CHANGE_P, ClockOffset
+from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import typed_offset_s
 from px4fuse.flight import Unavailable
-from px4fuse.plain import format_p_value
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
 from px4fuse.results.contract import ComparisonResults
+from px4fuse.text import format_p_value
 
 CURVE_HEIGHT = 170.0  # points; height of the axes
 MAX_DROP = 12.0  # nats; lower end of the log-likelihood axis

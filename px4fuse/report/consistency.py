@@ -9,14 +9,14 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.interventions import Of
+from px4fuse.comparison.causal_replays import Of
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
-from px4fuse.findings.since import format_change, format_explained_share
+from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable
-from px4fuse.plain import format_number, format_p_value
-from px4fuse.report import marks
+from px4fuse.report import event_marks
 from px4fuse.report.page import Cell, Page, halves, legend_above
+from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, format_verdict, verdict_rows
 from px4fuse.report.style import (
     DOTS,
     KF_BAND_COLOUR,
@@ -26,7 +26,7 @@ from px4fuse.report.style import (
     draw_curve,
     set_plain_ticks,
 )
-from px4fuse.report.words import VERDICT_HEAD, filters_by_name, format_verdict, verdict_rows
+from px4fuse.text import format_number, format_p_value
 
 MAX_LAG = 20
 MAX_NORMALISED = 4.0
@@ -68,7 +68,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     series = _series(result)
     if series:
-        axes = marks.panel(
+        axes = event_marks.panel(
             page,
             analysis,
             "Running mean NIS (log scale)",

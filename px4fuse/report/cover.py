@@ -8,16 +8,23 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.interventions import error_beyond_reported_sigma
+from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, within
 from px4fuse.findings import Finding, by_root, finding_title
 from px4fuse.flight import Ekf2, Truth, Unavailable
-from px4fuse.plain import capitalise_first, format_number
-from px4fuse.recording import LogInfo
-from px4fuse.report.marks import LANDING_MARK, TAKE_OFF_MARK
+from px4fuse.log import LogInfo
+from px4fuse.report.event_marks import LANDING_MARK, TAKE_OFF_MARK
 from px4fuse.report.page import PAGE_WIDTH, Page, halves, legend_above, words
+from px4fuse.report.phrases import (
+    filters_by_name,
+    format_clock_map,
+    format_consequences,
+    format_settings,
+    format_verdict,
+    write_errors,
+)
 from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_COLOUR,
@@ -28,16 +35,9 @@ from px4fuse.report.style import (
     Axes,
     set_map_axes,
 )
-from px4fuse.report.words import (
-    filters_by_name,
-    format_clock_map,
-    format_consequences,
-    format_settings,
-    format_verdict,
-    write_errors,
-)
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
+from px4fuse.text import capitalise_first, format_number
 
 # Ratio of length and width above which the track is drawn along the page; else north is up
 MIN_LONG_RATIO = 2.2

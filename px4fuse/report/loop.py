@@ -12,13 +12,13 @@ from px4fuse.loop import corrections
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.loop.corrections import SINGLE_LOOP
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
-from px4fuse.plain import capitalise_first, format_p_value
 from px4fuse.report import style
 from px4fuse.report.cover import student_line, write_finding
 from px4fuse.report.evaluation import describe_score, format_interval, plot_path
 from px4fuse.report.page import AXIS_LABEL_HEIGHT, TICKS_HEIGHT, Cell, Page, appendix
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
+from px4fuse.text import capitalise_first, format_p_value
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA

@@ -13,10 +13,10 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight import Unavailable
-from px4fuse.report import marks, style
+from px4fuse.report import event_marks, style
 from px4fuse.report.page import Page
+from px4fuse.report.phrases import filters_by_name, format_verdict
 from px4fuse.report.style import DOTS, LINES, Axes, draw_curve, draw_sigma_band, set_log_scale
-from px4fuse.report.words import filters_by_name, format_verdict
 
 NARROW_HEIGHT = 72.0  # points; height of the axes in the three-column appendix
 # Half height of the innovation axes: EDGE_FACTOR times the larger of 2√S and the 99 % quantile,
@@ -82,7 +82,7 @@ class Panel(NamedTuple):
         )
         # this panel already shows the rejected innovations as hollow dots
         rejected = "" if self is INNOVATIONS else result.axis.name
-        axes = marks.panel(
+        axes = event_marks.panel(
             page,
             analysis,
             self.full_title(result),

@@ -12,9 +12,9 @@ from px4fuse.filter.fitting import FIRST_WIDTH
 from px4fuse.filter.likelihood import FilterStates, filter_states, preintegrate, score_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
-from px4fuse.plain import format_factor, format_number
 from px4fuse.report.page import Page, legend_above
 from px4fuse.report.style import KF_COLOUR, set_plain_ticks
+from px4fuse.text import format_factor, format_number
 
 NOISE_FACTOR = 4.0
 # Label and factors on SIGMA_A and SIGMA_Z

@@ -3,14 +3,14 @@
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
-from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2.steps import Why
 from px4fuse.findings import by_root
 from px4fuse.report.aids import write_alone, write_appendix
 from px4fuse.report.cover import facts, write_finding
+from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
+from px4fuse.report.phrases import verdict_notes, write_errors
 from px4fuse.report.style import MUTED_COLOUR
-from px4fuse.report.why import write_explanation
-from px4fuse.report.words import verdict_notes, write_errors
 
 MAX_FINDINGS = 4
 ERROR_LEGEND = (

@@ -10,9 +10,9 @@ from px4fuse.ekf2.whatif import DISTURBED_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHAR
 from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
-from px4fuse.plain import format_number
+from px4fuse.report.difference_page import format_agreement, write_explanation
 from px4fuse.report.page import Page
-from px4fuse.report.why import format_agreement, write_explanation
+from px4fuse.text import format_number
 
 NOT_PREDICTABLE = "not predictable"
 Rows = tuple[tuple[str, Callable[[Any], str]], ...]

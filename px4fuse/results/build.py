@@ -8,10 +8,10 @@ import msgspec
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.filter.clock import ClockOffset
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find, find_aids, find_loop
-from px4fuse.findings.story import story
+from px4fuse.findings.summary import story
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.record import to_serializable

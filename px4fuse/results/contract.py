@@ -12,22 +12,22 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.comparison.interventions import Intervention
+from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
-from px4fuse.ekf2.walk import WhySteps
+from px4fuse.ekf2.steps import WhySteps
 from px4fuse.ekf2.whatif import Summary
-from px4fuse.filter.clock import Clock
 from px4fuse.filter.consistency import HorizontalNis
-from px4fuse.filter.heading import HeadingError
+from px4fuse.filter.frame_rotation import HeadingError
+from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.findings import Finding
 from px4fuse.flight import Alignment
+from px4fuse.log import ClockMap, InputFile, LogInfo
 from px4fuse.loop.model import LoopResult
-from px4fuse.origin import Passage, PositionKind
+from px4fuse.position_source import Passage, PositionKind
 from px4fuse.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
-from px4fuse.recording import ClockMap, InputFile, LogInfo
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Score

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.answers import Answers
+from px4fuse.answer_form import Answers
 from px4fuse.record import Record
 
 VERSION: Literal["3.0"] = "3.0"

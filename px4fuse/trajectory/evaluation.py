@@ -15,17 +15,17 @@ from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
-from px4fuse.display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capitalise_first
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import OrUnavailable, Record
+from px4fuse.text import capitalise_first
 from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
 from px4fuse.trajectory.association import Association, Method, associate
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
-from px4fuse.trajectory.offset import TimeOffset, clock_difference, estimate_time_offset
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
+from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
 MAX_SCALE_ERROR = 0.1  # relative scale factor error that is accepted without a warning
 MIN_COVERAGE = 0.5  # fraction of poses or time below which a warning is given

@@ -17,7 +17,7 @@ from statistics import fmean
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.answers import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, ClaimedMistake
+from px4fuse.answer_form import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, ClaimedMistake
 from px4fuse.assignment.assignment import fly
 from px4fuse.assignment.roster import Person
 from px4fuse.assignment.truth import FormTruth, TrueMistake

@@ -39,7 +39,7 @@ import ulog_tools  # noqa: E402
 from class_tools import in_turn  # noqa: E402
 from conftest import page_of  # noqa: E402
 
-from px4fuse import answers, workers  # noqa: E402
+from px4fuse import answer_form, workers  # noqa: E402
 from px4fuse.analysis import run_or_evaluate_aids  # noqa: E402
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
 from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
@@ -58,7 +58,7 @@ from px4fuse.results.build import outcome_results  # noqa: E402
 from px4fuse.results.contract import to_json  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402
 from px4fuse.trajectory.graph.analysis import analyse_graph  # noqa: E402
-from px4fuse.verification.intake import read_report  # noqa: E402
+from px4fuse.verification.pdf_input import read_report  # noqa: E402
 
 REPOSITORY = TESTS.parent
 REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
@@ -218,8 +218,8 @@ TARGETS = (
     Target("g2o", _text(_GRAPH_2D, _GRAPH_3D), read_g2o, ".g2o", True, 1800, 20.0),
     Target("pose graph", _text(_GRAPH_2D, _GRAPH_3D), _graph, ".g2o", True, 180, 2.0),
     Target(
-        "answers", lambda: [answers.form_text("a.ulg", "0" * 64).encode()], answers.read_answers,
-        ".toml", True, 900, 8.0,
+        "answers", lambda: [answer_form.form_text("a.ulg", "0" * 64).encode()],
+        answer_form.read_answers, ".toml", True, 900, 8.0,
     ),
     Target(
         "results", lambda: [(REPORT.with_suffix(".json")).read_bytes()],

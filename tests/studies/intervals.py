@@ -19,7 +19,7 @@ from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import noises_and_clock
-from px4fuse.filter.clock import MAX_CHANGE_P, ClockOffset
+from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.source_clock import MIN_OFFSET_S
 from px4fuse.simulation.flights import simulate_flight

@@ -44,9 +44,9 @@ SWAPPED = {
 
 # Changes that no test can tell, by file and what they make of a line
 EQUIVALENT = {
-    ("px4fuse/ekf2/walk.py", "for column in Columns.POSITION[:3]"):
+    ("px4fuse/ekf2/steps.py", "for column in Columns.POSITION[:3]"):
         "numpy.hypot takes a third array for its output",
-    ("px4fuse/filter/causes.py", "1.5e-12 * np.eye("): "below rounding, keeps a matrix regular",
+    ("px4fuse/filter/hypotheses.py", "1.5e-12 * np.eye("): "below rounding, keeps a matrix regular",
     ("px4fuse/trajectory/graph/covariance.py", "_SINGULAR = 1.5"): "below rounding",
     ("px4fuse/ekf2/replay.py", ">= MAX_S_OFF"): "no double is 0.05 from 1, exactly",
 }  # fmt: skip

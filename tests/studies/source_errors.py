@@ -39,7 +39,7 @@ from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.story import story
+from px4fuse.findings.summary import story
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 

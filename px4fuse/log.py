@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from px4fuse.display import one_line_repr
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
 

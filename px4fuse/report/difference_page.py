@@ -9,12 +9,11 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
-from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2.steps import Why
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capitalise_first
-from px4fuse.report import marks
+from px4fuse.report import event_marks
 from px4fuse.report.page import Page, halves
 from px4fuse.report.style import (
     EKF2_BAND_COLOUR,
@@ -26,6 +25,7 @@ from px4fuse.report.style import (
     Axes,
     draw_curve,
 )
+from px4fuse.text import capitalise_first
 
 TITLE = "Difference between KF and EKF2, step by step"
 ROW_HEIGHT, LABEL_WIDTH, COLUMN_GAP = 12.0, 128.0, 14.0  # points; bar, step names, columns
@@ -132,7 +132,7 @@ def _draw_axis(page: Page, name: str, why: Why, analysis: Analysis) -> None:
     axes.set_yticklabels([])
     page.beside(*columns, gap=COLUMN_GAP)
     title = "Position difference KF - EKF2 (m, dark) and unexplained part (light)"
-    axes = marks.panel(
+    axes = event_marks.panel(
         page, analysis, title, _time_sentence(why), TIME_HEIGHT, axis=name, strip=True
     )
     position_difference, remainder = (

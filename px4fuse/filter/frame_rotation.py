@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, cumulative_integral
-from px4fuse.display import one_line_repr
+from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, continuous_noise_unit
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import NotNegative, Record, Share
 
 # s; averaging time of the parts

@@ -12,9 +12,9 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.flight import Alignment, Truth, Unavailable
-from px4fuse.plain import format_factor, format_number
-from px4fuse.recording import ClockMap
+from px4fuse.log import ClockMap
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
+from px4fuse.text import format_factor, format_number
 
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis

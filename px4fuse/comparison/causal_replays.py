@@ -33,19 +33,18 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source, ml_delay_change, noise_change
+from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
-from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
-from px4fuse.filter.causes import BiasScaleJumpFit
-from px4fuse.filter.clock import ClockOffset
 from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, nis_band
-from px4fuse.filter.heading import HeadingError
+from px4fuse.filter.fast_replay import quick_replay
+from px4fuse.filter.frame_rotation import HeadingError
+from px4fuse.filter.hypotheses import BiasScaleJumpFit
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.likelihood import innovations, preintegrate
-from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
@@ -54,6 +53,7 @@ from px4fuse.filter.signals import (
     project_acceleration,
     within,
 )
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.record import Positive, Record

@@ -10,20 +10,20 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import interventions
-from px4fuse.comparison.interventions import Intervention, Of, cause_of, interventions_on
+from px4fuse.comparison import causal_replays
+from px4fuse.comparison.causal_replays import Intervention, Of, cause_of, interventions_on
 from px4fuse.comparison.model import FILTERS, AgainstTruth, Difference, FilterName
-from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2.steps import Why
 from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at
-from px4fuse.findings.causes import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
+from px4fuse.findings.cause_grouping import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
+from px4fuse.findings.cause_text import FINDINGS_OF_CAUSE, format_rerun, kind_of
 from px4fuse.findings.model import Finding, format_percent
-from px4fuse.findings.since import FINDINGS_OF_CAUSE, format_rerun, kind_of
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.plain import capitalise_first, format_factor
 from px4fuse.readers.px4_ekf2 import OTHER_AIDING
+from px4fuse.text import capitalise_first, format_factor
 
 MAX_PARAGRAPHS = 3  # paragraphs of the summary
 # Findings whose content is in the first paragraph
@@ -82,7 +82,7 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     known = IN_FIRST_PARAGRAPH
     for cause in filter(None, cause_by_filter.values()):
         known |= FINDINGS_OF_CAUSE.get(kind_of(analysis, cause), frozenset())
-    if cause_by_filter["kf"] is not None and not interventions.SETTING_CHANGES.isdisjoint(
+    if cause_by_filter["kf"] is not None and not causal_replays.SETTING_CHANGES.isdisjoint(
         cause_by_filter["kf"].change
     ):
         known |= SETTINGS
@@ -107,7 +107,9 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
 def _failed_statistic(analysis: Analysis, owner: FilterName) -> Of:
     """Statistic that a cause has to explain: mean NEES if the error exceeds σ, else mean NIS."""
     return (
-        "nees" if interventions.error_beyond_reported_sigma(analysis.main.filters[owner]) else "nis"
+        "nees"
+        if causal_replays.error_beyond_reported_sigma(analysis.main.filters[owner])
+        else "nis"
     )
 
 
@@ -172,7 +174,7 @@ def _filter_sentence(analysis: Analysis, owner: FilterName) -> str:
     if not isinstance(statement.truth, AgainstTruth):
         return f"By its innovations along {along} {name} {verdict}."
     rmse = format_metres(statement.truth.position_rmse_m)
-    if hidden := interventions.error_beyond_reported_sigma(statement):
+    if hidden := causal_replays.error_beyond_reported_sigma(statement):
         verdict = f"reports σ {format_metres(hidden.reported_sigma_m)}"
         return f"Along {along} {name} has a position RMSE of {rmse}, but {verdict}."
     return f"Along {along} {name} has a position RMSE of {rmse} and {verdict}."
@@ -183,7 +185,7 @@ def _explanation(
 ) -> str:
     """Re-run that explains an inconsistent filter, or a note that no change does, else ""."""
     statement, axis = analysis.main.filters[owner], analysis.main.axis.name
-    is_hidden = interventions.error_beyond_reported_sigma(statement)
+    is_hidden = causal_replays.error_beyond_reported_sigma(statement)
     if isinstance(statement, Unavailable) or (statement.verdict == "consistent" and not is_hidden):
         return ""
     if cause is not None:
@@ -254,7 +256,7 @@ def _difference_after_change(
         for intervention in interventions_on(
             analysis.causes, owner, analysis.main.axis.name, "apart"
         )
-        if cause is not None and intervention.explains >= interventions.MIN_EXPLAINED_SHARE
+        if cause is not None and intervention.explains >= causal_replays.MIN_EXPLAINED_SHARE
     ]
     if reductions:
         most = max(reductions, key=lambda intervention: intervention.explains)

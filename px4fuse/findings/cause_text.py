@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import interventions as changed
+from px4fuse.comparison import causal_replays as changed
 from px4fuse.comparison import remedy
-from px4fuse.comparison.interventions import Intervention
+from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.ekf2_parameters import PARAMETERS
-from px4fuse.filter.heading import HeadingError
-from px4fuse.findings import causes as kinds
+from px4fuse.filter.frame_rotation import HeadingError
+from px4fuse.findings import cause_grouping as kinds
 from px4fuse.flight import Unavailable
-from px4fuse.plain import capitalise_first, format_number
 from px4fuse.request import OPTIONS
+from px4fuse.text import capitalise_first, format_number
 
 # Findings that state the same fault as a re-run in the summary, by kind of cause
 FINDINGS_OF_CAUSE: Mapping[str, frozenset[str]] = {

@@ -2,8 +2,8 @@
 
 Positions whose timestamps are wrong by τ lag or lead the measured acceleration. Innovations hardly
 grow, because the filter follows; the disagreement with the acceleration shows the offset. So the
-likelihood of the positions is maximised over τ. The constants of :mod:`px4fuse.filter.motion` that
-could be confused with τ are marginalised, and the noises are maximised at every τ.
+likelihood of the positions is maximised over τ. The constants of :mod:`px4fuse.filter.imu_motion`
+that could be confused with τ are marginalised, and the noises are maximised at every τ.
 
 The noise of the IMU moves with τ, too: it looks like motion that the positions do not follow. That
 does not bias the estimate, but increases its scatter beyond the curvature of the likelihood. The
@@ -19,11 +19,8 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array
-from px4fuse.display import one_line_repr
 from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_likelihood
-from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal import FittedPositions, products_by_stretch
-from px4fuse.filter.motion import (
+from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
     COARSE_POINTS,
     CONSTANT_SIGMA,
@@ -32,9 +29,12 @@ from px4fuse.filter.motion import (
     SignalCache,
     prepare_motion,
 )
+from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
+from px4fuse.filter.marginal_likelihood import FittedPositions, products_by_stretch
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, within
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share, Span
 
 FINE_POINTS, CURVE_POINTS = 11, 121
@@ -160,7 +160,7 @@ def estimate_time_offset(
         Timestamps of measurements to exclude.
     progress : callable
     signals : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
+        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
 
     Returns
     -------

@@ -13,13 +13,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import one_line_repr
 from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SD, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import FusionRules, Inputs
 from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing, make_intervals
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_field, mean_by_event
-from px4fuse.ekf2.stretches import (
+from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     BIASES,
     GRAVITY_M_S2,
@@ -32,6 +31,7 @@ from px4fuse.ekf2.stretches import (
 )
 from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
+from px4fuse.notebook_display import one_line_repr
 
 # s; length of the first pass, which estimates the initial correlations
 CORRELATION_PASS_S = 8.0

@@ -308,7 +308,7 @@ def form_name(log_name: str) -> str:
 
 def form_text(log_name: str, log_sha256: str) -> str:
     """Return an empty answer form for a log, with comments that list all choices."""
-    template = Template(files("px4fuse").joinpath("answers.toml").read_text(encoding="utf-8"))
+    template = Template(files("px4fuse").joinpath("answer_form.toml").read_text(encoding="utf-8"))
     questions = [
         f'# {one.text}\nq{number} = ""{"    # such as [61, 64]" * (one.kind == "gate")}'
         for number, one in enumerate(draw_questions(log_sha256), start=1)

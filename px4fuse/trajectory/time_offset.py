@@ -1,11 +1,12 @@
 """Time offset between two recordings of the same motion: search over all lags, then least squares.
 
 The same method is used for trajectories here, and for a position file against EKF2 or the IMU in
-:mod:`px4fuse.alignment.fitting`. Two series are correlated at all lags (:mod:`correlation`). The
-best lag is refined by least squares, and is rejected if another lag has a residual within the
-factor :data:`MIN_SECOND_PEAK_RATIO`. Trajectories may have any frame and scale: their speeds are
-correlated, and a similarity transform is refined. A position file is in metres with z vertical, and
-has outliers: horizontal positions are correlated, and yaw and origin are refined robustly.
+:mod:`px4fuse.alignment.time_and_pose_fit`. Two series are correlated at all lags
+(:mod:`correlation`). The best lag is refined by least squares, and is rejected if another lag has a
+residual within the factor :data:`MIN_SECOND_PEAK_RATIO`. Trajectories may have any frame and scale:
+their speeds are correlated, and a similarity transform is refined. A position file is in metres
+with z vertical, and has outliers: horizontal positions are correlated, and yaw and origin are
+refined robustly.
 """
 
 from __future__ import annotations

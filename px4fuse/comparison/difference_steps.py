@@ -1,6 +1,6 @@
 """Explanation of the difference KF - EKF2 along each horizontal axis, step by step.
 
-The steps are those of :mod:`px4fuse.ekf2.walk`, from KF as set to the logged EKF2. For the largest
+The steps are those of :mod:`px4fuse.ekf2.steps`, from KF as set to the logged EKF2. For the largest
 steps, sentences state both filters' behaviour, the share and the time of the largest effect.
 """
 
@@ -12,15 +12,15 @@ from msgspec import structs
 
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import noise_used_m
-from px4fuse.ekf2 import walk as ways
+from px4fuse.ekf2 import steps as ways
+from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Spans, inside_spans
-from px4fuse.ekf2.walk import Step, UnreplayedPart, Why
-from px4fuse.filter.clock import ClockOffset
+from px4fuse.ekf2.steps import Step, UnreplayedPart, Why
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight import Unavailable
 
 # Relative difference of two position RMSEs below which a text calls them equal

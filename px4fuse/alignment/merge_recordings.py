@@ -10,8 +10,8 @@ from msgspec import structs
 
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preference
-from px4fuse.readers.parts import collect_unavailable
-from px4fuse.recording import InputFile
+from px4fuse.log import InputFile
+from px4fuse.readers.common import collect_unavailable
 
 # names of fields that contain times
 TIMES = ("time_s", "start_s", "end_s")

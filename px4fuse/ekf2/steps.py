@@ -19,16 +19,16 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.display import one_line_repr
+from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_variants, modelled_aids, replay_with_logged_rejections
-from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, inside_spans, rms_to_truth
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record
 
 ANALYSIS_NAME = "difference KF - EKF2"
