@@ -11,7 +11,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from class_tools import report_of
+from class_tools import make_report
 from conftest import REPORT, SAMPLES
 from ulog_tools import make_log
 
@@ -55,10 +55,10 @@ RUNS = [
 PATHS = ("typed", "relative", "absolute", "link", "link to link", "hard link", "folder", "letters")
 
 
-def made_desk(folder: Path) -> Path:
+def make_desk(folder: Path) -> Path:
     """Write all types of inputs to a folder, each type of table to a subfolder."""
     log = make_log("v1.16", 20.0).encode()
-    report = report_of("Ada", "1")
+    report = make_report("Ada", "1")
     for name, content in {
         "l.ulg": log, "logs/x.ulg": log,
         "m.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes()[:200_000],
@@ -80,7 +80,7 @@ def made_desk(folder: Path) -> Path:
     return folder
 
 
-def hashed(folder: Path) -> dict[str, str]:
+def file_hashes(folder: Path) -> dict[str, str]:
     """Every regular file, without links, with its hash."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
     return {
@@ -179,12 +179,12 @@ def aims() -> list[Aim]:
     return found
 
 
-def drawn(count: int, seed: int) -> list[Aim]:
+def draw_aims(count: int, seed: int) -> list[Aim]:
     """So many, drawn with replacement."""
     return random.Random(seed).choices(aims(), k=count)
 
 
-def cleared(place: Path) -> Path:
+def make_empty_folder(place: Path) -> Path:
     """An empty folder for links and outputs."""
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()

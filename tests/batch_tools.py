@@ -49,23 +49,23 @@ def analyse(work: job.Job) -> job.Outcome:
     name = Path(work.address).stem
     if name in ("hang", "crash"):
         bad_jobs.act(("hang", 0) if name == "hang" else ("exit", 3))
-    return analyse_once(work)
+    return analyse_cached(work)
 
 
 # Where what was found in a log is kept, for the tests of what surrounds that
 MEMORY = "PX4FUSE_TESTS_MEMORY"
 
 
-def analyse_once(work: job.Job) -> job.Outcome:
+def analyse_cached(work: job.Job) -> job.Outcome:
     """As the worker does, but what was found in the same log before serves again."""
-    with mock.patch.object(job, "_compare_log", _remembered):  # the worker is also other tests'
+    with mock.patch.object(job, "_compare_log", _compare_cached):  # the worker is also other tests'
         return job.analyse(work)
 
 
 _compare_log = job._compare_log
 
 
-def _remembered(work: job.Job, path: Path, sha256: str) -> job.Outcome:
+def _compare_cached(work: job.Job, path: Path, sha256: str) -> job.Outcome:
     known = repr((path.name, sha256, work.request, work.reports))
     kept = Path(os.environ[MEMORY]) / hashlib.sha256(known.encode()).hexdigest()
     if not kept.is_file():
@@ -80,7 +80,7 @@ def environment(**more: str) -> dict[str, str]:
 
 
 @contextmanager
-def started(*command: str, says: str, log: Path, **more: str) -> Iterator[str]:
+def start_dask(*command: str, says: str, log: Path, **more: str) -> Iterator[str]:
     """A process of Dask's, once it has said that it is ready; the line in which it said so."""
     with (
         log.open("w") as file,

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextvars import copy_context
 from pathlib import Path
 
-from conftest import REPORT, page_of
+from conftest import REPORT, blank_page
 
 from px4fuse import workers
 from px4fuse.grading import grade as grading
@@ -21,32 +21,32 @@ from px4fuse.verification.verification import log_sha256, verify
 VERIFIED = Verdict("verified", ("the log gives every value again",), True, page_status="same")
 
 
-def report_of(name: str, student_id: str, log: str = "") -> bytes:
+def make_report(name: str, student_id: str, log: str = "") -> bytes:
     """The sample's report on an empty page, with another student and log in its results."""
     results = json.loads(REPORT.with_suffix(".json").read_text(encoding="utf-8"))
     results["student"] = {"name": name, "id": student_id, "notes": ""}
     if log:
         results["log"]["sha256"] = log
-    return page_of(None, json.dumps(results))
+    return blank_page(None, json.dumps(results))
 
 
-def at_once(monkeypatch) -> list[str]:
+def skip_verification(monkeypatch) -> list[str]:
     """Grade in this process, and believe every report whose log is there; gives what was verified.
 
     Bounds and verification have tests of their own, and take seconds per report.
     """
-    asked: list[str] = []
+    verified_ids: list[str] = []
 
-    def believed(results, pdf, logs):
-        asked.append(results.student.id)
+    def verify_by_log(results, pdf, logs):
+        verified_ids.append(results.student.id)
         return VERIFIED if log_sha256(results) in logs else verify(results, pdf, logs)
 
-    monkeypatch.setattr(records, "verify", believed)
+    monkeypatch.setattr(records, "verify", verify_by_log)
     in_this_process(monkeypatch)
-    return asked
+    return verified_ids
 
 
-def in_turn(function, jobs, **_):
+def run_in_turn(function, jobs, **_):
     """One job after the other, in this process, whose limits stay as they are."""
     for index, job in enumerate(jobs):
         function_, job_ = pickle.loads(pickle.dumps((function, job)))
@@ -60,17 +60,17 @@ def in_this_process(monkeypatch) -> None:
     """
 
     for module in (grading, workers):
-        monkeypatch.setattr(module, "run_bounded", in_turn)
+        monkeypatch.setattr(module, "run_bounded", run_in_turn)
 
 
-def zipped(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 0, 0)) -> Path:
+def write_zip(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 0, 0)) -> Path:
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in entries.items():
             archive.writestr(zipfile.ZipInfo(name, date), content)
     return path
 
 
-def graded(
+def graded_report(
     name: str, *points: float, student: str = "", student_id: str = "", **more
 ) -> GradedReport:
     """A report with items A, B, … of ten points each."""
@@ -82,5 +82,7 @@ def graded(
 
 
 def entry(student_id: str, name: str, total: float | None, **more) -> Entry:
-    one = None if total is None else graded(f"{student_id}.pdf", total, student_id=student_id)
+    one = (
+        None if total is None else graded_report(f"{student_id}.pdf", total, student_id=student_id)
+    )
     return Entry(name, student_id, one, total=total, **({"of": 10.0} | more))

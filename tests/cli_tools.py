@@ -17,14 +17,14 @@ def run(*arguments: object) -> Result:
     return CliRunner(env={"COLUMNS": None}).invoke(cli, [str(argument) for argument in arguments])
 
 
-def done(*arguments: object, code: int = 0) -> Result:
+def run_checked(*arguments: object, code: int = 0) -> Result:
     """A command that ends with this exit code."""
     result = run(*arguments)
     assert result.exit_code == code, (arguments, result.output, result.exception)
     return result
 
 
-def refused(*arguments: object) -> str:
+def error_line(*arguments: object) -> str:
     """What is said, in one line, of what cannot be done."""
     result = run(*arguments)
     assert isinstance(result.exception, Px4FuseError), (arguments, result.output)

@@ -123,7 +123,7 @@ def model(sample_flight: Flight) -> Model:
 @pytest.fixture(scope="session")
 def sample(sample_log: Path) -> analysis.Analysis:
     """The sample flight, analysed once; tests must not change it."""
-    return _run_once(ComparisonRequest(log=str(sample_log)))
+    return _run_cached(ComparisonRequest(log=str(sample_log)))
 
 
 def shared(name: str) -> Path:
@@ -161,7 +161,7 @@ def read(tmp_path: Path) -> Callable[..., Flight]:
     return write_and_read
 
 
-def page_of(*drawn: Any) -> bytes:
+def blank_page(*drawn: Any) -> bytes:
     """An empty page with results attached: the text that is last of what is drawn."""
     writer = PdfWriter()
     writer.add_blank_page(100, 100)
@@ -174,35 +174,35 @@ def page_of(*drawn: Any) -> bytes:
 @pytest.fixture
 def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages take most of the time; for tests that look at none of them."""
-    monkeypatch.setattr(pdf, "render", page_of)
+    monkeypatch.setattr(pdf, "render", blank_page)
 
 
 # The last ones of a process are kept
 MOST_ANALYSES = 16
-_drawn: dict[str, bytes] = {}
+_page_cache: dict[str, bytes] = {}
 
 
 @pytest.fixture
-def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def cached_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same results are drawn once; for tests of what follows."""
     render = pdf.render
 
     def from_memory(found: object, results: object, text: str) -> bytes:
-        if text not in _drawn:
-            _drawn[text] = render(found, results, text)
-            if len(_drawn) > MOST_ANALYSES:
-                del _drawn[next(iter(_drawn))]
-        return _drawn[text]
+        if text not in _page_cache:
+            _page_cache[text] = render(found, results, text)
+            if len(_page_cache) > MOST_ANALYSES:
+                del _page_cache[next(iter(_page_cache))]
+        return _page_cache[text]
 
     monkeypatch.setattr(pdf, "render", from_memory)
 
 
 # Of the unchanged program: they are there before any test patches them
 _run, _read = analysis.run, analysis.read_flight
-_kept: dict[tuple[str | bytes, ...] | None, Any] = {}
+_cache: dict[tuple[str | bytes, ...] | None, Any] = {}
 
 
-def _known(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | None:
+def _cache_key(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | None:
     """What it is kept under: where the files lie is no part of it, verification has links."""
     position = request.position
     paths = [request.log, request.mavlink, None if position is None else position.path]
@@ -218,47 +218,51 @@ def _known(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | N
     return (what, repr(named), *(sha256(file.read_bytes()).digest() for file in files))
 
 
-def _known_flight(request: ComparisonRequest) -> tuple[str | bytes, ...] | None:
+def _flight_key(request: ComparisonRequest) -> tuple[str | bytes, ...] | None:
     names = ("log", "mavlink", "system", "position", "clock_offset_s")
-    return _known(ComparisonRequest(**{name: getattr(request, name) for name in names}), "flight")
+    return _cache_key(
+        ComparisonRequest(**{name: getattr(request, name) for name in names}), "flight"
+    )
 
 
-def _once(known: tuple[str | bytes, ...] | None, make: Callable[[], Any]) -> Any:
+def _cached(known: tuple[str | bytes, ...] | None, make: Callable[[], Any]) -> Any:
     if known is None:
         return make()
     # the last one used stands last
-    _kept[known] = _kept.pop(known) if known in _kept else make()
-    if len(_kept) > 2 * MOST_ANALYSES:
-        del _kept[next(iter(_kept))]
-    return _kept[known]
+    _cache[known] = _cache.pop(known) if known in _cache else make()
+    if len(_cache) > 2 * MOST_ANALYSES:
+        del _cache[next(iter(_cache))]
+    return _cache[known]
 
 
-def _read_once(request: ComparisonRequest, progress: analysis.Progress = analysis.silent) -> Flight:
-    return _once(_known_flight(request), lambda: _read(request, progress))
+def _read_cached(
+    request: ComparisonRequest, progress: analysis.Progress = analysis.silent
+) -> Flight:
+    return _cached(_flight_key(request), lambda: _read(request, progress))
 
 
-def _log_once(path: str | Path, *, system: int | None = None) -> Flight:
-    return _read_once(ComparisonRequest(log=str(path), system=system))
+def _read_log_cached(path: str | Path, *, system: int | None = None) -> Flight:
+    return _read_cached(ComparisonRequest(log=str(path), system=system))
 
 
-def _run_once(
+def _run_cached(
     request: ComparisonRequest,
     progress: analysis.Progress = analysis.silent,
     flight: Flight | None = None,
 ) -> analysis.Analysis:
-    if flight is not None and flight is not _kept.get(_known_flight(request)):
+    if flight is not None and flight is not _cache.get(_flight_key(request)):
         return _run(request, progress, flight)
-    return _once(_known(request, "analysis"), lambda: _run(request, progress, flight))
+    return _cached(_cache_key(request, "analysis"), lambda: _run(request, progress, flight))
 
 
 @pytest.fixture(scope="module")
-def analysed_once() -> Iterator[None]:
+def cached_analyses() -> Iterator[None]:
     """The same request on the same files is read and analysed once; where nothing is patched."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(analysis, "read_flight", _read_once)
-        patch.setattr(tracks, "read_log", _log_once)
+        patch.setattr(analysis, "read_flight", _read_cached)
+        patch.setattr(tracks, "read_log", _read_log_cached)
         for place in (analysis, api):
-            patch.setattr(place, "run", _run_once)
+            patch.setattr(place, "run", _run_cached)
         yield
 
 

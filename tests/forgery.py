@@ -41,17 +41,17 @@ def forged(pdf: bytes, *changes: Forge) -> bytes:
     writer = PdfWriter(clone_from=io.BytesIO(pdf))
     for change in changes:
         change(writer)
-    return saved(writer)
+    return pdf_bytes(writer)
 
 
-def saved(writer: PdfWriter) -> bytes:
+def pdf_bytes(writer: PdfWriter) -> bytes:
     """The bytes of what was written."""
     out = io.BytesIO()
     writer.write(out)
     return out.getvalue()
 
 
-def edited(stream: Any, change: Edit) -> DecodedStreamObject:
+def edit_stream(stream: Any, change: Edit) -> DecodedStreamObject:
     """A stream with other content."""
     before = stream.get_data()
     content = change(before)
@@ -64,19 +64,19 @@ def edited(stream: Any, change: Edit) -> DecodedStreamObject:
     return made
 
 
-def replaced(holder: Any, key: str, change: Edit) -> Forge:
+def replace_stream(holder: Any, key: str, change: Edit) -> Forge:
     """Another stream in place of the one that a dictionary holds."""
 
     def forge(writer: PdfWriter) -> None:
         held = holder(writer)
-        held[NameObject(key)] = writer._add_object(edited(held[key].get_object(), change))
+        held[NameObject(key)] = writer._add_object(edit_stream(held[key].get_object(), change))
 
     return forge
 
 
 def on_page(number: int, change: Edit) -> Forge:
     """What a page draws, changed."""
-    return replaced(lambda writer: writer.pages[number - 1], "/Contents", change)
+    return replace_stream(lambda writer: writer.pages[number - 1], "/Contents", change)
 
 
 def with_results(text: str) -> Forge:
@@ -85,7 +85,7 @@ def with_results(text: str) -> Forge:
     def forge(writer: PdfWriter) -> None:
         files: Any = writer.root_object["/Names"]["/EmbeddedFiles"]["/Names"]  # type: ignore[index]
         held = files[1].get_object()["/EF"]
-        made = writer._add_object(edited(held["/F"].get_object(), lambda _: text.encode()))
+        made = writer._add_object(edit_stream(held["/F"].get_object(), lambda _: text.encode()))
         for key in ("/F", "/UF"):
             held[NameObject(key)] = made
 
@@ -148,27 +148,27 @@ def stream(data: bytes, **entries: Any) -> DecodedStreamObject:
     return made
 
 
-def root(key: str, value: Any) -> Forge:
+def catalogue(key: str, value: Any) -> Forge:
     """An entry of the catalogue."""
     return lambda writer: entry(key, value)(writer.root_object)
 
 
-def titled(**entries: str) -> Forge:
+def document_info(**entries: str) -> Forge:
     """Entries of the document information."""
     return lambda writer: writer.add_metadata({f"/{key}": held for key, held in entries.items()})
 
 
-def appended(pdf: bytes, change: Forge) -> bytes:
+def append_update(pdf: bytes, change: Forge) -> bytes:
     """An incremental update, as viewers append one."""
     writer = PdfWriter(io.BytesIO(pdf), incremental=True)
     change(writer)
-    return saved(writer)
+    return pdf_bytes(writer)
 
 
 # ------------------------------------------------------------------ reports that verify
 
 
-def put(value: Any, *path: Any) -> Change:
+def set_value(value: Any, *path: Any) -> Change:
     """Another value at a place in the results; behind the end of a list it is added."""
 
     def change(results: dict[str, Any]) -> None:
@@ -183,12 +183,12 @@ def put(value: Any, *path: Any) -> Change:
     return change
 
 
-def report_of(pdf: bytes) -> Reported:
+def attached_results(pdf: bytes) -> Reported:
     """A report, read without care: tests of reading are elsewhere."""
     return read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
 
 
-def plain(report: Reported) -> dict[str, Any]:
+def to_dict(report: Reported) -> dict[str, Any]:
     """The results of a report, to be changed."""
     made: dict[str, Any] = json.loads(to_json(report))
     return made
@@ -200,7 +200,7 @@ def read_again(results: dict[str, Any]) -> Reported:
 
 
 @dataclass(frozen=True)
-class Base:
+class VerifiedReport:
     """A report that is verified, and its analysis, computed once."""
 
     pdf: bytes
@@ -221,7 +221,7 @@ class Base:
     def verified(self, pdf: bytes) -> Verdict:
         """The verdict on a forged report, with the log."""
         try:
-            report = report_of(pdf)
+            report = attached_results(pdf)
         except ResultsError as error:  # refused before there is anything to verify
             return Verdict("cannot verify", (str(error),), with_log=False)
         return verify(report, pdf, self.files, recompute=self.recompute)
@@ -231,8 +231,8 @@ class Base:
         return forged(self.pdf, with_results(to_json(results)))
 
 
-def base(pdf: bytes, log: Path) -> Base:
+def make_verified_report(pdf: bytes, log: Path) -> VerifiedReport:
     files = files_by_sha256([log])
-    again = verification.recompute(report_of(pdf), files)
+    again = verification.recompute(attached_results(pdf), files)
     drawn = again[1]()
-    return Base(drawn, plain(report_of(drawn)), (again[0], lambda: drawn), files)
+    return VerifiedReport(drawn, to_dict(attached_results(drawn)), (again[0], lambda: drawn), files)

@@ -100,7 +100,7 @@ LOOP = to_plain(
 )
 
 
-def changed(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
+def changed_results(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
     """Results with the values at some paths, "__" for dots, replaced; ``...`` removes."""
     changed_ = copy.deepcopy(results)
     for path, value in values.items():
@@ -115,7 +115,7 @@ def changed(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
     return changed_
 
 
-def decoded(results: dict[str, Any]) -> Results:
+def decode_results(results: dict[str, Any]) -> Results:
     """Results as they are read from a report."""
     return read_results(json.dumps(results).encode())
 

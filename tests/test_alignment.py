@@ -84,7 +84,7 @@ def position_file(
     )  # fmt: skip
 
 
-def recorded(
+def uwb_file(
     flight: Flight, *, offset_s: float = OFFSET_S, frame: str = "enu", yaw_deg: float = 0.0,
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0), **made: Any,
 ) -> PositionRecording:  # fmt: skip
@@ -96,20 +96,22 @@ def recorded(
     return position_file(samples.index.to_numpy() + flight.log.boot_time_s - offset_s, xyz, **made)
 
 
-def placed(
+def align(
     flight: Flight, file: PositionRecording, **options: Any
 ) -> tuple[Alignment, PositionTrack]:
     track = align_position_file(flight, file, **options).positions[0]
     return track.alignment, track
 
 
-def off_s(alignment: Alignment, true_s: float = OFFSET_S, sigma_s: Span = (0.0, np.inf)) -> float:
+def clock_error_s(
+    alignment: Alignment, true_s: float = OFFSET_S, sigma_s: Span = (0.0, np.inf)
+) -> float:
     """How far the clock offset is off (s), with a standard deviation between two bounds."""
     assert sigma_s[0] < alignment.clock_offset_sigma_s < sigma_s[1]
     return abs(alignment.clock_offset_s - true_s)
 
 
-def turn(one_deg: float, other_deg: float) -> float:
+def yaw_difference_deg(one_deg: float, other_deg: float) -> float:
     """Angle between two yaws."""
     return abs((one_deg - other_deg + 180.0) % 360.0 - 180.0)
 
@@ -151,14 +153,14 @@ def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
 def test_align_sample_file_without_options_recovers_placement(
     sample_flight, external, true_offset_s
 ) -> None:
-    alignment, track = placed(sample_flight, external)
+    alignment, track = align(sample_flight, external)
     assert alignment.frame == "enu"
     assert "fits EKF2 position best" in alignment.frame_reason
     assert alignment.reference == EKF2_POSITION
     assert alignment.yaw_deg == 0.0
     assert alignment.yaw_sigma_deg is None
     assert alignment.origin_m == (0.0, 0.0, 0.0)
-    error = off_s(alignment, true_offset_s, (0.003, 0.03))
+    error = clock_error_s(alignment, true_offset_s, (0.003, 0.03))
     assert error < min(0.03, 3.0 * (alignment.clock_offset_sigma_s or 0.0))
     assert alignment.correlation == pytest.approx(0.9994, abs=3e-4)
     assert alignment.residual_rms_m == pytest.approx(0.115, abs=0.01)
@@ -174,24 +176,24 @@ def test_align_sample_file_without_options_recovers_placement(
 @given(
     seed=st.integers(0, 3),
     frame=st.sampled_from(sorted(FROM_NED)),
-    told=st.booleans(),
+    frame_given=st.booleans(),
     offset_s=st.floats(-2e9, 2e9),
     yaw_deg=st.floats(-179.0, 179.0),
     origin_m=st.tuples(*[st.floats(-8.0, 8.0)] * 3),
 )
 def test_align_any_clock_frame_yaw_and_origin_is_recovered(
-    seed, frame, told, offset_s, yaw_deg, origin_m
+    seed, frame, frame_given, offset_s, yaw_deg, origin_m
 ):
     flight = flight_along(seed=seed)
-    file = recorded(flight, offset_s=offset_s, frame=frame, yaw_deg=yaw_deg, origin_m=origin_m)
-    alignment, track = placed(flight, file, frame=frame if told else None, yaw_deg="auto")
-    if told:
-        assert turn(alignment.yaw_deg, yaw_deg) < 0.5
+    file = uwb_file(flight, offset_s=offset_s, frame=frame, yaw_deg=yaw_deg, origin_m=origin_m)
+    alignment, track = align(flight, file, frame=frame if frame_given else None, yaw_deg="auto")
+    if frame_given:
+        assert yaw_difference_deg(alignment.yaw_deg, yaw_deg) < 0.5
         np.testing.assert_allclose(alignment.origin_m, origin_m, atol=0.05)
     else:
         assert alignment.frame == {"ned": "ned"}.get(frame, "enu")
     assert_same_track(track, flight.positions[0], 0.1)
-    assert off_s(alignment, offset_s, (5e-4, 0.02)) < 0.03
+    assert clock_error_s(alignment, offset_s, (5e-4, 0.02)) < 0.03
     assert alignment.misplaced == alignment.warnings == ()
 
 
@@ -199,7 +201,7 @@ def test_align_clock_and_yaw_sigma_match_scatter_of_flights() -> None:
     clock, yaw = [], []
     for seed in range(24):
         flight = flight_along(seed=seed, duration_s=60.0)
-        alignment, _ = placed(flight, recorded(flight), frame="enu", yaw_deg="auto")
+        alignment, _ = align(flight, uwb_file(flight), frame="enu", yaw_deg="auto")
         clock.append((alignment.clock_offset_s - OFFSET_S) / (alignment.clock_offset_sigma_s or 0))
         yaw.append(alignment.yaw_deg / (alignment.yaw_sigma_deg or 0))
     # 95 % of the root mean squares of 24 normal variables lie between 0.72 and 1.28
@@ -209,46 +211,46 @@ def test_align_clock_and_yaw_sigma_match_scatter_of_flights() -> None:
 
 @pytest.mark.parametrize("frame", sorted(FROM_NED))
 def test_align_frame_is_from_columns_or_best_fit(flight: Flight, frame: str) -> None:
-    file = recorded(flight, frame=frame)
-    alignment, track = placed(flight, file)
+    file = uwb_file(flight, frame=frame)
+    alignment, track = align(flight, file)
     assert alignment.frame == frame
     assert alignment.frame_reason.startswith(f"fits EKF2 position best; residuals: {frame} 0.1")
     assert_same_track(track, flight.positions[0], 1e-9)
-    alignment, _ = placed(flight, replace(file, frame=frame))
+    alignment, _ = align(flight, replace(file, frame=frame))
     assert alignment.frame == frame
     assert alignment.frame_reason == "from the column names of the file"
 
 
 def test_align_aisle_at_45_degrees_without_height_needs_frame() -> None:
     flight = flight_along(partial(passes, across_m=0.0), heading_deg=45.0)
-    file = recorded(flight, frame="enu")
+    file = uwb_file(flight, frame="enu")
     file.samples["z_m"] = np.nan
     with pytest.raises(MissingDataError, match=r"no frame fits .*Give `frame`"):
         align_position_file(flight, file)
-    alignment, track = placed(flight, file, frame="enu")
-    assert off_s(alignment) < 0.03
+    alignment, track = align(flight, file, frame="enu")
+    assert clock_error_s(alignment) < 0.03
     assert track.samples["down_m"].isna().all()
     assert track.samples["north_m"].notna().all()
 
 
 def test_align_rotates_variances_with_track(flight: Flight) -> None:
-    file = recorded(flight, frame="enu", yaw_deg=90.0, sigma_m=[0.1, 0.2, 0.3])
+    file = uwb_file(flight, frame="enu", yaw_deg=90.0, sigma_m=[0.1, 0.2, 0.3])
     options: dict[str, Any] = {"frame": "enu", "clock_offset_s": OFFSET_S}
     variances = [
-        placed(flight, file, yaw_deg=yaw, **options)[1].samples[Columns.POSITION_VARIANCE].iloc[7]
+        align(flight, file, yaw_deg=yaw, **options)[1].samples[Columns.POSITION_VARIANCE].iloc[7]
         for yaw in (0.0, 90.0, 30.0)
     ]
     np.testing.assert_allclose(variances[0], [0.04, 0.01, 0.09])
     np.testing.assert_allclose(variances[1], [0.01, 0.04, 0.09])
     # cos² 30° = 3/4
     np.testing.assert_allclose(variances[2], [0.0325, 0.0175, 0.09])
-    alignment, track = placed(flight, file, yaw_deg=90.0, **options)
+    alignment, track = align(flight, file, yaw_deg=90.0, **options)
     assert (alignment.yaw_deg, alignment.yaw_reason) == (90.0, "given with --position-yaw")
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
 def test_align_result_contains_track_file_and_reader_notes(flight: Flight) -> None:
-    result = align_position_file(flight, recorded(flight))
+    result = align_position_file(flight, uwb_file(flight))
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
     assert (track.origin, track.frame) == (POSITION_FILE, "NED")
@@ -266,38 +268,38 @@ def test_align_result_contains_track_file_and_reader_notes(flight: Flight) -> No
     (0.0, (2.0, 0.0, 0.0)),
 ])  # fmt: skip
 def test_align_misaligned_frame_warns_and_recovers_clock(flight, yaw_deg, origin_m):
-    file = recorded(flight, yaw_deg=yaw_deg, origin_m=origin_m)
-    alignment, _ = placed(flight, file, frame="enu")
+    file = uwb_file(flight, yaw_deg=yaw_deg, origin_m=origin_m)
+    alignment, _ = align(flight, file, frame="enu")
     assert alignment.yaw_deg == 0.0
-    assert off_s(alignment) < 0.03
+    assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.misplaced
     seen = re.search(r"rotated by ([-0-9.]+)° and shifted by ([0-9.]+) m relative", warning)
     assert seen
     turned, shifted = map(float, seen.groups())
-    assert turn(turned, yaw_deg) < 0.5
+    assert yaw_difference_deg(turned, yaw_deg) < 0.5
     assert shifted == pytest.approx(np.hypot(*origin_m[:2]), abs=0.1)
     assert warning.endswith("Give --position-yaw auto.")
-    alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
+    alignment, _ = align(flight, file, frame="enu", yaw_deg="auto")
     assert alignment.misplaced == alignment.warnings == ()
 
 
 def test_align_given_clock_offset_is_used_and_checked(flight: Flight) -> None:
-    wrong, _ = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
+    wrong, _ = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings
     assert warning.startswith("The position file does not match the EKF2 position (correlation ")
     assert wrong.correlation < 0.7
-    file = recorded(flight, yaw_deg=40.0)
-    alignment, track = placed(flight, file, yaw_deg="auto", clock_offset_s=OFFSET_S)
+    file = uwb_file(flight, yaw_deg=40.0)
+    alignment, track = align(flight, file, yaw_deg="auto", clock_offset_s=OFFSET_S)
     assert alignment.yaw_deg == pytest.approx(40.0, abs=0.5)
     assert alignment.clock_offset_sigma_s is None
     assert_same_track(track, flight.positions[0], 0.1)
 
 
 def test_align_inverted_height_or_other_start_time_warns(flight: Flight) -> None:
-    file = recorded(flight)
+    file = uwb_file(flight)
     file.samples["z_m"] *= -1.0
     other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
-    alignment = placed(other, file, frame="enu")[0]
+    alignment = align(other, file, frame="enu")[0]
     (height,), (day,) = alignment.misplaced, alignment.warnings
     assert "heights of file and EKF2" in height
     assert "file and log differ by 100 s" in day
@@ -308,8 +310,8 @@ def test_align_inverted_height_or_other_start_time_warns(flight: Flight) -> None
 
 def test_align_outliers_and_gap_keep_clock_and_yaw() -> None:
     flight = flight_along(uwb=Uwb(outlier_share=0.08, gap_s=(30.0, 48.0)))
-    alignment, _ = placed(flight, recorded(flight), frame="enu", yaw_deg="auto")
-    assert off_s(alignment) < 0.03
+    alignment, _ = align(flight, uwb_file(flight), frame="enu", yaw_deg="auto")
+    assert clock_error_s(alignment) < 0.03
     assert abs(alignment.yaw_deg) < 0.5
     np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
 
@@ -318,8 +320,8 @@ def test_align_outliers_and_gap_keep_clock_and_yaw() -> None:
 def test_align_ekf2_position_reset_keeps_placement(delta: tuple[float, float, float]) -> None:
     flight = flight_along(ekf2=Estimator(resets=(Reset(70.0, "position", delta),)))
     for yaw in (None, "auto"):
-        alignment, track = placed(flight, recorded(flight), frame="enu", yaw_deg=yaw)
-        assert off_s(alignment) < 0.03
+        alignment, track = align(flight, uwb_file(flight), frame="enu", yaw_deg=yaw)
+        assert clock_error_s(alignment) < 0.03
         assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
         assert_same_track(track, flight.positions[0], 0.1)
         assert alignment.misplaced == alignment.warnings == ()
@@ -333,10 +335,10 @@ QUIET = Imu(sigma_a_m_s2=0.1)
 @pytest.mark.parametrize("noise", [0.1, 0.5])
 def test_align_without_ekf2_uses_imu_for_clock_and_yaw(noise: float) -> None:
     flight = flight_along(imu=Imu(sigma_a_m_s2=noise), ekf2=None)
-    file = recorded(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
-    alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
+    file = uwb_file(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
+    alignment, _ = align(flight, file, frame="enu", yaw_deg="auto")
     assert alignment.reference == IMU
-    assert off_s(alignment, sigma_s=(2e-3, 0.05)) < 0.05
+    assert clock_error_s(alignment, sigma_s=(2e-3, 0.05)) < 0.05
     assert alignment.yaw_deg == pytest.approx(25.0, abs=3.0)
     assert alignment.origin_m == (0.0, 0.0, 0.0)
     assert alignment.residual_rms_m is None
@@ -347,16 +349,16 @@ def test_align_without_ekf2_uses_imu_for_clock_and_yaw(noise: float) -> None:
 def test_align_without_ekf2_imu_finds_frame_and_misalignment() -> None:
     flight = flight_along(imu=QUIET)
     blind = replace(flight, ekf2=unavailable("EKF2"))
-    assert placed(blind, recorded(flight, frame="nwu"))[0].frame == "nwu"
-    alignment, _ = placed(blind, recorded(flight, yaw_deg=120.0), frame="enu")
-    assert off_s(alignment) < 0.05
+    assert align(blind, uwb_file(flight, frame="nwu"))[0].frame == "nwu"
+    alignment, _ = align(blind, uwb_file(flight, yaw_deg=120.0), frame="enu")
+    assert clock_error_s(alignment) < 0.05
     assert "is rotated by 1" in alignment.misplaced[-1]
     assert "shifted" not in alignment.misplaced[-1]
     # an EKF2 that stands still leaves it to the IMU
     still = replace(flight, ekf2=replace(flight.ekf2, state=flight.ekf2.state * 0.0))
-    alignment, _ = placed(still, recorded(flight), frame="enu")
+    alignment, _ = align(still, uwb_file(flight), frame="enu")
     assert alignment.reference == IMU
-    assert off_s(alignment) < 0.05
+    assert clock_error_s(alignment) < 0.05
 
 
 # -- what cannot be placed -------------------------------------------------------------------------
@@ -369,8 +371,8 @@ def test_align_vehicle_at_rest_needs_clock_offset() -> None:
     for parts in ({}, {"ekf2": unavailable("EKF2")}):
         said = rf"^uwb\.csv: .*hardly change; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
         with pytest.raises(MissingDataError, match=said):
-            align_position_file(replace(flight, **parts), recorded(flight), frame="enu")
-    alignment, track = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S)
+            align_position_file(replace(flight, **parts), uwb_file(flight), frame="enu")
+    alignment, track = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S)
     assert alignment.misplaced == alignment.warnings == ()
     assert alignment.correlation is None
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
@@ -379,13 +381,13 @@ def test_align_vehicle_at_rest_needs_clock_offset() -> None:
 
 def test_align_without_ekf2_and_imu_needs_offset_and_frame() -> None:
     flight = flight_along(imu=None, ekf2=None)
-    file = recorded(flight)
+    file = uwb_file(flight)
     said = f"no EKF2 position; the log has no acceleration.*{BOTH_SPANS}.*"
     with pytest.raises(MissingDataError, match=said + r"Give `clock_offset_s` and `frame`\.$"):
         align_position_file(flight, file)
     with pytest.raises(MissingDataError, match=r"Give `yaw_deg`\.$"):
         align_position_file(flight, file, frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S)
-    alignment, track = placed(flight, file, frame="enu", clock_offset_s=OFFSET_S)
+    alignment, track = align(flight, file, frame="enu", clock_offset_s=OFFSET_S)
     assert alignment.reference == ""
     assert alignment.correlation is alignment.residual_rms_m is None
     assert_same_track(track, flight.positions[0], 1e-9)
@@ -393,7 +395,7 @@ def test_align_without_ekf2_and_imu_needs_offset_and_frame() -> None:
 
 def test_align_no_overlap_long_or_short_file_is_refused(flight: Flight) -> None:
     """By an offset without overlap, over days, of a few positions."""
-    file = recorded(flight)
+    file = uwb_file(flight)
     for offset in (0.0, OFFSET_S + 121.0, OFFSET_S - 121.0):
         with pytest.raises(MissingDataError, match="does not overlap the log ." + BOTH_SPANS):
             align_position_file(flight, file, frame="enu", clock_offset_s=offset)
@@ -414,28 +416,28 @@ def test_align_file_of_other_flight_is_refused(flight: Flight) -> None:
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1)
 
     with pytest.raises(MissingDataError, match="does not match the EKF2 position"):
-        align_position_file(flight, recorded(flight_along(other)), frame="enu")
+        align_position_file(flight, uwb_file(flight_along(other)), frame="enu")
 
 
 @pytest.mark.parametrize("yaw", [None, "auto"])
 def test_align_periodic_path_needs_clock_offset(yaw: Any) -> None:
     flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
-    file = recorded(flight)
+    file = uwb_file(flight)
     said = r"from this path; offsets that differ by [1-6]0\.\d s fit.*"
     with pytest.raises(MissingDataError, match=said + BOTH_SPANS + r".*Give `clock_offset_s`\.$"):
         align_position_file(flight, file, frame="enu", yaw_deg=yaw)
-    alignment, _ = placed(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
+    alignment, _ = align(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
 
 
 def test_align_almost_periodic_path_warns() -> None:
-    def ever_faster(time_s: Array, heading_deg: float, length_m: float) -> Array:
+    def accelerating_passes(time_s: Array, heading_deg: float, length_m: float) -> Array:
         along = 5.0 * (1.0 - np.cos(2.0 * np.pi * (time_s / 20.0 + time_s**2 / 2e5)))
         return np.stack([along, 0.0 * along, 0.0 * along], axis=1)
 
-    flight = flight_along(ever_faster)
-    alignment, _ = placed(flight, recorded(flight), frame="enu")
-    assert off_s(alignment) < 0.03
+    flight = flight_along(accelerating_passes)
+    alignment, _ = align(flight, uwb_file(flight), frame="enu")
+    assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.warnings
     assert re.match(r"A time offset that differs by [-+]19\.\d s fits nearly as well ", warning)
 
@@ -450,7 +452,7 @@ def test_align_invalid_options_raise_settings_error(
     flight: Flight, options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(SettingsError) as caught:
-        align_position_file(flight, recorded(flight), **options)
+        align_position_file(flight, uwb_file(flight), **options)
     assert str(caught.value) == message
 
 
@@ -467,14 +469,16 @@ def test_align_simulated_logs_recovers_clock_and_frame(shared_logs: Path, name: 
     flight = read_log(log)
     true_s = record["clock"]["px4_boot_minus_companion_unix_ns"] * 1e-9
     for options in ({"frame": "ned"}, {"yaw_deg": "auto"}):
-        alignment, track = placed(flight, file, **options)
+        alignment, track = align(flight, file, **options)
         assert alignment.frame == "ned"
         # EKF2 itself lags by about 15 ms
-        assert off_s(alignment, true_s) < min(0.05, 3.0 * (alignment.clock_offset_sigma_s or 0.0))
+        assert clock_error_s(alignment, true_s) < min(
+            0.05, 3.0 * (alignment.clock_offset_sigma_s or 0.0)
+        )
         assert abs(alignment.yaw_deg) < 0.5
         np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
         truth = np.array([sample["truth"] for sample in record["uwb"]])
         error_m = track.samples[Columns.POSITION[:2]].to_numpy() - truth[:, :2]
         assert np.median(np.abs(error_m)) < 0.08
-    alignment, _ = placed(replace(flight, ekf2=unavailable("EKF2")), file, frame="ned")
-    assert off_s(alignment, true_s) < 2.0 * (alignment.clock_offset_sigma_s or 0.0)
+    alignment, _ = align(replace(flight, ekf2=unavailable("EKF2")), file, frame="ned")
+    assert clock_error_s(alignment, true_s) < 2.0 * (alignment.clock_offset_sigma_s or 0.0)

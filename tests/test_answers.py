@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_tools import done, refused
+from cli_tools import error_line, run_checked
 from flights import aisle_flight
 from pypdf import PdfReader
 
@@ -121,17 +121,17 @@ def test_quantity_truth_source_gap_matches_closed_form() -> None:
     assert quantity_truth(main, quantity) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.usefixtures("analysed_once", "drawn_once")
+@pytest.mark.usefixtures("cached_analyses", "cached_pages")
 def test_compare_answers_option_adds_form_to_page_and_results(
     tmp_path: Path, sample_log: Path
 ) -> None:
     """``answers`` writes it, ``compare`` reads it into page and results."""
     form, report = tmp_path / "f.toml", tmp_path / "r.pdf"
-    done("answers", sample_log, "-o", form)
-    assert "f.toml exists and was not overwritten" in refused("answers", sample_log, "-o", form)
+    run_checked("answers", sample_log, "-o", form)
+    assert "f.toml exists and was not overwritten" in error_line("answers", sample_log, "-o", form)
     text = form.read_text(encoding="utf-8").replace('kind = ""', 'kind = "none"')
     form.write_text(text, encoding="utf-8")
-    done("compare", sample_log, "--answers", form, "-o", report)
+    run_checked("compare", sample_log, "--answers", form, "-o", report)
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)

@@ -10,7 +10,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from cli_tools import done
+from cli_tools import run_checked
 from detector_rates import rates
 
 import px4fuse
@@ -51,12 +51,12 @@ FINDINGS = {
 CHOICE = {choice.mistake: choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind}
 
 
-def chosen(drawn):
+def choices_of(drawn):
     return [CHOICE[typed.partition("=")[0]] for typed in drawn.typed]
 
 
 @pytest.fixture(autouse=True, scope="module")
-def flown_once():
+def cached_flights():
     """Each flight is made once, but for the test that it is made the same again."""
     made = {}
 
@@ -109,7 +109,7 @@ class TestDraw:
         for count, share in enumerate(COUNTS[kind]):
             found = sum(len(one.typed) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
-        names = {choice.mistake for one in flights for choice in chosen(one)}
+        names = {choice.mistake for one in flights for choice in choices_of(one)}
         assert names == {choice.mistake for choice in ASSIGNABLE_MISTAKES[kind]}
 
     def test_mixed_kind_equals_separate_draws_of_each_kind(self):
@@ -122,12 +122,12 @@ class TestDraw:
         signs = Counter()
         for n in range(300):
             drawn = draw(SECRET, f"s{n}", "aisle", 2)
-            first, second = chosen(drawn)
+            first, second = choices_of(drawn)
             assert first.goes_with(second)
             assert second.goes_with(first)
             parse(drawn.typed)
             ratios = [EASIEST_DIFFICULTY]
-            for choice, text in zip(chosen(drawn), drawn.typed, strict=True):
+            for choice, text in zip(choices_of(drawn), drawn.typed, strict=True):
                 if choice.limit is None:
                     assert text == choice.mistake
                     continue
@@ -182,7 +182,7 @@ def test_fly_log_has_finding_of_each_mistake_in_key(tmp_path, kind, number, coun
     else:
         found = find(explain(compare(flight, axes=("north", "east"))))
     drawn = draw(SECRET, CLASS[number].student_id, kind, count)
-    wanted = {FINDINGS[choice.mistake] for choice in chosen(drawn)}
+    wanted = {FINDINGS[choice.mistake] for choice in choices_of(drawn)}
     assert len(wanted) == count
     assert wanted <= {finding.id for finding in found}
 
@@ -194,7 +194,7 @@ class TestAssign:
     """Two mistakes each, so that the flights are the same everywhere and are made once."""
 
     @pytest.fixture(autouse=True)
-    def one_secret_is_made_up(self, monkeypatch):
+    def fixed_secret(self, monkeypatch):
         made_up = iter([SECRET.decode()])
         monkeypatch.setattr(secrets, "token_urlsafe", lambda _: next(made_up))
 
@@ -308,16 +308,17 @@ class TestKey:
     def test_read_key_invalid_content_raises_one_line(self, tmp_path):
         good = json.loads(key_text(self.key()))
 
-        def spoilt(**values):
+        def with_values(**values):
             return json.dumps({**good, **values})
 
         def with_student(**values):
-            return spoilt(students=[{**good["students"][0], **values}])
+            return with_values(students=[{**good["students"][0], **values}])
 
         texts = [
-            "", "[" * 1_000_000, "9" * 10_000, spoilt(schema={**good["schema"], "version": 99}),
-            spoilt(students=[]), spoilt(students=[good["students"][0]] * 2),
-            spoilt(students=good["students"] * 600), with_student(id=" "),
+            "", "[" * 1_000_000, "9" * 10_000,
+            with_values(schema={**good["schema"], "version": 99}),
+            with_values(students=[]), with_values(students=[good["students"][0]] * 2),
+            with_values(students=good["students"] * 600), with_student(id=" "),
             with_student(sha256="x" * 64), with_student(name="x" * 2000),
             with_student(mistakes=["x"] * 100), with_student(truth={"sigma_z_m": True}),
         ]  # fmt: skip
@@ -348,11 +349,11 @@ class TestCommand:
         given = ("--assignment", "roster.csv", "-o", "f", "--kind", "mixed", "--mistakes", "1",
                  "--secret-file", "secret.txt")  # fmt: skip
         before = files(at)
-        shown = done("simulate", *given, "--preview").output
+        shown = run_checked("simulate", *given, "--preview").output
         assert files(at) == before
         assert "nothing was written" in shown
-        done("simulate", *given)
-        assert "0 written, 2 existed already" in done("simulate", *given).output
+        run_checked("simulate", *given)
+        assert "0 written, 2 existed already" in run_checked("simulate", *given).output
         assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
         key = read_key(at / "f_answers.json")
         lines = shown.splitlines()
@@ -363,9 +364,9 @@ class TestCommand:
             assert line.strip().endswith(f"{answer.difficulty:.2f}")
         # the key's secret serves where none is given
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
-        kept = done("simulate", *given).output
+        kept = run_checked("simulate", *given).output
         assert "stored in the answers" in kept
         assert read_key(at / "g_answers.json").secret not in kept
-        again = done("simulate", *given, "--preview").output
+        again = run_checked("simulate", *given, "--preview").output
         for answer in read_key(at / "g_answers.json").answers:
             assert " ".join(answer.mistakes) in again

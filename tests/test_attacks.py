@@ -14,11 +14,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from cli_tools import done
-from conftest import page_of
+from cli_tools import run_checked
+from conftest import blank_page
 from exchange import replace
-from forgery import Base, Change, base, forged, on_page, put, read_again, report_of
-from results_tools import LOOP, changed, decoded
+from forgery import (
+    Change,
+    VerifiedReport,
+    attached_results,
+    forged,
+    make_verified_report,
+    on_page,
+    read_again,
+    set_value,
+)
+from results_tools import LOOP, changed_results, decode_results
 
 from px4fuse.answer_form import form_text
 from px4fuse.assignment.key import Answer, AnswerKey
@@ -36,7 +45,7 @@ from px4fuse.verification.model import Verdict
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import cannot_verify
 
-pytestmark = pytest.mark.usefixtures("analysed_once", "_pages_here")
+pytestmark = pytest.mark.usefixtures("cached_analyses", "_compare_pages_in_process")
 
 MISTAKES = ("nlos=3%", "dropout=5s,30s")
 GAP = '[[mistake]]\nkind = "dropout"\nsize = 5\nfrom_s = 30\nuntil_s = 35\npanel = "innovations"\n'
@@ -62,7 +71,7 @@ time I would move the anchor at the end of the aisle and log the ranges themselv
 class Flight:
     """A flight that was handed out, the honest report on it, and the answer key."""
 
-    honest: Base
+    honest: VerifiedReport
     key: AnswerKey
 
     def graded(
@@ -84,7 +93,7 @@ class Flight:
 
 
 @pytest.fixture
-def _pages_here(monkeypatch: pytest.MonkeyPatch) -> None:
+def _compare_pages_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
     monkeypatch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
 
@@ -107,9 +116,9 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     notes.write_text(HONEST, encoding="utf-8")
     own = "--student", "Ada", "--id", "s01", "--notes", notes, "--answers", folder / "a.toml"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pdf_module, "render", page_of)  # drawn below, from its results
-        done("compare", log, "-o", pdf, *own)
-    honest = base(pdf.read_bytes(), log)
+        patch.setattr(pdf_module, "render", blank_page)  # drawn below, from its results
+        run_checked("compare", log, "-o", pdf, *own)
+    honest = make_verified_report(pdf.read_bytes(), log)
     (sha256,) = honest.files
     truth = form_truth(simulation, sha256)
     answers = (
@@ -122,7 +131,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
 @pytest.fixture(scope="module")
 def honest(flight: Flight, rubric: Rubric) -> GradedReport:
     verdict = flight.honest.verified(flight.honest.pdf)
-    return flight.graded(report_of(flight.honest.pdf), verdict, rubric)
+    return flight.graded(attached_results(flight.honest.pdf), verdict, rubric)
 
 
 def test_grade_honest_report_is_verified_with_points(honest: GradedReport) -> None:
@@ -159,7 +168,7 @@ def test_grade_notes_without_content_earn_no_points(
 # ------------------------------------------------------------------ files
 
 
-def position(results: dict[str, Any]) -> None:
+def forge_position_file(results: dict[str, Any]) -> None:
     """The attack that was paid best: numbers at will, and a file that nobody has."""
     results["request"]["position"] = {"path": "uwb.csv"}
     results["provenance"]["command"] += " --position uwb.csv"
@@ -168,8 +177,8 @@ def position(results: dict[str, Any]) -> None:
     results["findings"] = []
 
 
-def joined(results: dict[str, Any]) -> None:
-    position(results)
+def forge_joined_file(results: dict[str, Any]) -> None:
+    forge_position_file(results)
     results["log"]["joined"] = [
         {"name": "uwb.csv", "sha256": "a" * 64, "bytes": 9, "role": "position"}
     ]
@@ -177,38 +186,44 @@ def joined(results: dict[str, Any]) -> None:
 
 # Change of the attached results, what the report is then called, and what pending says
 FILES: dict[str, tuple[Change, str, str]] = {
-    "--position uwb.csv": (position, "cannot verify", "Add uwb.csv to --logs."),
-    "--position with a hash": (joined, "cannot verify", "Add uwb.csv to --logs."),
+    "--position uwb.csv": (forge_position_file, "cannot verify", "Add uwb.csv to --logs."),
+    "--position with a hash": (forge_joined_file, "cannot verify", "Add uwb.csv to --logs."),
     "--mavlink that nobody has": (
-        put("a.tlog", "request", "mavlink"), "cannot verify", "Add a.tlog to --logs.",
+        set_value("a.tlog", "request", "mavlink"), "cannot verify", "Add a.tlog to --logs.",
     ),
     "command for people alone": (
-        put("px4fuse compare s01.ulg --position uwb.csv", "provenance", "command"),
+        set_value("px4fuse compare s01.ulg --position uwb.csv", "provenance", "command"),
         "numbers differ", "",
     ),
     "another version": (
-        put("0.1.1", "provenance", "px4fuse"), "cannot verify", "Verify it with px4fuse 0.1.1.",
+        set_value("0.1.1", "provenance", "px4fuse"), "cannot verify",
+        "Verify it with px4fuse 0.1.1.",
     ),
     "another schema": (
-        put("9.9", "schema", "version"), "cannot verify", "use the px4fuse version that wrote it",
+        set_value("9.9", "schema", "version"), "cannot verify",
+        "use the px4fuse version that wrote it",
     ),
-    "libraries left out": (put({}, "provenance", "libraries"), "cannot verify", "Ask how"),
-    "an unknown log": (put("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
-    "the log of another": (put("b" * 64, "log", "sha256"), "other log", "given to s02"),
-    "a better NIS": (put(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", ""),
-    "no finding": (put([], "findings"), "numbers differ", ""),
-    "other settings": (put(0.3, "request", "sigma_a_m_s2"), "numbers differ", ""),
-    "another part of the flight": (put(20.0, "request", "start_s"), "numbers differ", ""),
+    "libraries left out": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
+    "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
+    "the log of another": (set_value("b" * 64, "log", "sha256"), "other log", "given to s02"),
+    "a better NIS": (
+        set_value(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", "",
+    ),
+    "no finding": (set_value([], "findings"), "numbers differ", ""),
+    "other settings": (set_value(0.3, "request", "sigma_a_m_s2"), "numbers differ", ""),
+    "another part of the flight": (set_value(20.0, "request", "start_s"), "numbers differ", ""),
     "settings that no run can have": (
-        put(1e9, "request", "sigma_a_m_s2"), "cannot verify", "Ask how",
+        set_value(1e9, "request", "sigma_a_m_s2"), "cannot verify", "Ask how",
     ),
-    "a path": (put("../../etc/passwd", "request", "log"), "cannot verify", "Ask how"),
-    "the folder above": (put("..", "request", "log"), "cannot verify", "Ask how"),
-    "a step that fails": (put(1e-9, "request", "dt_s"), "cannot verify", "Ask how"),
+    "a path": (set_value("../../etc/passwd", "request", "log"), "cannot verify", "Ask how"),
+    "the folder above": (set_value("..", "request", "log"), "cannot verify", "Ask how"),
+    "a step that fails": (set_value(1e-9, "request", "dt_s"), "cannot verify", "Ask how"),
     "ten thousand lines of notes": (
-        put("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
+        set_value("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
     ),
-    "the id of another student": (put("s02", "student", "id"), "page differs", "given to s01"),
+    "the id of another student": (
+        set_value("s02", "student", "id"), "page differs", "given to s01",
+    ),
 }  # fmt: skip
 
 
@@ -218,12 +233,14 @@ def test_grade_forged_results_are_not_verified(
 ) -> None:
     change, status, pending = FILES[name]
     if status == "numbers differ":  # whatever the pages look like
-        monkeypatch.setattr(pdf_module, "render", page_of)
+        monkeypatch.setattr(pdf_module, "render", blank_page)
     results = copy.deepcopy(flight.honest.results)
     change(results)
     # only where numbers agree are pages compared
     text = json.dumps(results)
-    pdf = flight.honest.with_results(results) if status == "page differs" else page_of(None, text)
+    pdf = (
+        flight.honest.with_results(results) if status == "page differs" else blank_page(None, text)
+    )
     try:
         report: Reported | ResultsError = read_report(pdf, "a.pdf")
         verdict = flight.honest.verified(pdf)
@@ -246,11 +263,11 @@ def test_grade_painted_page_is_scored_from_redrawn_report(
     painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
     pdf = forged(flight.honest.pdf, painted)
     verdict = flight.honest.verified(pdf)
-    graded = flight.graded(report_of(pdf), verdict, rubric)
+    graded = flight.graded(attached_results(pdf), verdict, rubric)
     assert graded.status == "page differs"
     assert graded.points == honest.points
     for rule, counted in (("pending", None), ("zero", 0.0)):
-        strict = flight.graded(report_of(pdf), verdict, replace(rubric, pages=rule))
+        strict = flight.graded(attached_results(pdf), verdict, replace(rubric, pages=rule))
         assert strict.counted == counted
 
 
@@ -267,11 +284,11 @@ NO_END: dict[str, Any] = {
 }
 
 
-def looped(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> GradedReport:
+def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> GradedReport:
     """Points of the item on the loop."""
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
-    results = decoded(changed(LOOP, student__id="s01", **values))
+    results = decode_results(changed_results(LOOP, student__id="s01", **values))
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
     made = assess(results, verdict, read_rubric(None), key)
@@ -300,6 +317,6 @@ LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
 @pytest.mark.parametrize("name", LOOPS)
 def test_loop_item_points_and_flags(name: str) -> None:
     truth, request, loop, points, flags = LOOPS[name]
-    graded = looped(truth, request, loop)
+    graded = grade_loop(truth, request, loop)
     assert graded.points == pytest.approx(points), graded.items
     assert len(graded.flags) == flags, graded.flags

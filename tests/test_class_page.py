@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from browser import Browser, Elements, content
-from golden_tools import agrees, of_values
+from golden_tools import assert_matches_golden, of_values
 from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
@@ -120,7 +120,7 @@ def test_class_page_matches_golden_file() -> None:
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
     lines = [line for line in above if line.strip() and "sha256" not in line]
     lines += of_values(content(text))
-    agrees("class_page", [line[:300] for line in lines])
+    assert_matches_golden("class_page", [line[:300] for line in lines])
 
 
 @given(text=st.text(max_size=60) | st.sampled_from([MARKUP, BREAKOUT, "\0\x1b\ud800", "$title"]))

@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
-from class_tools import graded
+from class_tools import graded_report
 from exchange import replace
 
 from px4fuse.answer_form import Answers, ClaimedMistake
@@ -35,7 +35,7 @@ LATEST = Course(RUBRIC)
 PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", login="grace"))
 
 
-def laid_out(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
+def make_entries(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
     """Entries by id, of reports by the names of their files."""
     reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
     zipped, times = Path("x.zip"), packed or {}
@@ -48,15 +48,15 @@ def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
 
 
 THREE = {
-    blackboard("ada", "19-10-00-00"): graded("", 4.0),
-    blackboard("ada", "20-11-00-00"): graded("", 9.0),
-    blackboard("ada", "22-10-00-00"): graded("", 7.0),
+    blackboard("ada", "19-10-00-00"): graded_report("", 4.0),
+    blackboard("ada", "20-11-00-00"): graded_report("", 9.0),
+    blackboard("ada", "22-10-00-00"): graded_report("", 7.0),
 }
 
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
 def test_class_entries_attempt_rule_selects_counting_report(attempt, points) -> None:
-    (ada, grace), _ = laid_out(THREE, Course(RUBRIC, attempt=attempt))
+    (ada, grace), _ = make_entries(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counting.points == ada.total == points
     assert len(ada.others) == 2
     assert ada.counting not in ada.others
@@ -65,13 +65,13 @@ def test_class_entries_attempt_rule_selects_counting_report(attempt, points) -> 
 
 def test_class_entries_late_report_has_deduction() -> None:
     term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
-    (ada, _), _ = laid_out(THREE, term)
+    (ada, _), _ = make_entries(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
     assert ada.handed_in == "2026-11-22 10:00"
     # of the best, the loss for being late is part
-    files = {blackboard("ada", "20-11-00-00"): graded("", 6.0),
-             blackboard("ada", "22-10-00-00"): graded("", 7.0)}  # fmt: skip
-    (ada, _), _ = laid_out(files, replace(term, attempt="best"))
+    files = {blackboard("ada", "20-11-00-00"): graded_report("", 6.0),
+             blackboard("ada", "22-10-00-00"): graded_report("", 7.0)}  # fmt: skip
+    (ada, _), _ = make_entries(files, replace(term, attempt="best"))
     assert (ada.late_s, ada.deduction, ada.total) == (0.0, 0.0, 6.0)
 
 
@@ -84,7 +84,7 @@ def test_class_entries_late_report_has_deduction() -> None:
     ],
 )
 def test_class_entries_deduction_ends_at_zero_points(due, rule, late_s, off) -> None:
-    (ada, _), _ = laid_out(THREE, Course(RUBRIC, due=due, late=late_rule(rule)))
+    (ada, _), _ = make_entries(THREE, Course(RUBRIC, due=due, late=late_rule(rule)))
     assert (ada.late_s, ada.deduction) == (late_s, off)
     assert ada.total == 0.0
 
@@ -92,43 +92,45 @@ def test_class_entries_deduction_ends_at_zero_points(due, rule, late_s, off) -> 
 def test_class_entries_zip_time_orders_without_deduction() -> None:
     first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
-    files = {second: graded("", 7.0), first: graded("", 9.0)}
+    files = {second: graded_report("", 7.0), first: graded_report("", 9.0)}
     term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
-    (_, grace), _ = laid_out(files, term, packed=packed)
+    (_, grace), _ = make_entries(files, term, packed=packed)
     assert (grace.total, grace.late_s, grace.handed_in) == (7.0, None, "")
     assert "no points" in grace.flags[0]
     # nor does a mark without a time
-    (_, grace), _ = laid_out({"hoppergrace_LATE_7_8_r.pdf": graded("", 7.0)}, term)
+    (_, grace), _ = make_entries({"hoppergrace_LATE_7_8_r.pdf": graded_report("", 7.0)}, term)
     assert (grace.late_s, grace.total) == (None, 7.0)
     assert "Canvas marks the file as late" in grace.flags[0]
 
 
 def test_class_entries_other_pdf_counts_only_without_report() -> None:
-    essay = replace(graded("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False))
-    files = {blackboard("ada", "19-10-00-00"): graded("", 4.0),
+    essay = replace(
+        graded_report("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False)
+    )
+    files = {blackboard("ada", "19-10-00-00"): graded_report("", 4.0),
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
-    (ada, _), _ = laid_out(files)
+    (ada, _), _ = make_entries(files)
     assert ada.total == 4.0
     assert "is not a report" in ada.flags[0]
-    (ada, _), _ = laid_out({blackboard("ada", "20-10-00-00"): essay})
+    (ada, _), _ = make_entries({blackboard("ada", "20-10-00-00"): essay})
     assert ada.total == 0.0
 
 
 def of_form(points: float, kind: str, **more):
     form = Answers(log_sha256="a" * 64, mistakes=(ClaimedMistake(kind),))
-    return replace(graded("", points, student_id="1"), form=form, **more)
+    return replace(graded_report("", points, student_id="1"), form=form, **more)
 
 
 def test_class_entries_differing_forms_are_pending() -> None:
     """None of those that came together counts until the instructor says which is meant."""
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
-    (ada, _), _ = laid_out(files)
+    (ada, _), _ = make_entries(files)
     assert ada.total is None
     assert ada.counting.pending == "Ask which of 2 reports counts: their forms differ."
     assert len(ada.others) == 1
-    assert laid_out(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
+    assert make_entries(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
     # the same form twice is no guess
-    (ada, _), _ = laid_out({name: of_form(4.0, "yaw") for name in files})
+    (ada, _), _ = make_entries({name: of_form(4.0, "yaw") for name in files})
     assert ada.total == 4.0
 
 
@@ -137,34 +139,36 @@ def test_class_entries_pending_report_keeps_counting_report() -> None:
     files = {"a.pdf": of_form(9.0, "yaw"), "z.pdf": of_form(2.0, "nlos", pending="Ask whose.")}
     packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
     for times in (None, packed):
-        (ada, _), _ = laid_out(files, packed=times)
+        (ada, _), _ = make_entries(files, packed=times)
         assert ada.total == 9.0
         assert [one.submission for one in ada.others] == ["z.pdf"]
         assert ada.flags == ("z.pdf is pending, so another file counts.",)
     waiting = replace(files["a.pdf"].items[0], awaits_points=True)  # for the points of the text
     files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
-    (ada, _), _ = laid_out(files)
+    (ada, _), _ = make_entries(files)
     assert ada.counting.submission == "a.pdf"
 
 
 def test_class_entries_imitated_platform_name_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
-    (ada, _), _ = laid_out({name: graded("", 4.0)})
+    (ada, _), _ = make_entries({name: graded_report("", 4.0)})
     assert ada.handed_in == "2026-11-20 10:00"
     assert ada.flags == ("The file name imitates the names of a platform (found: Blackboard).",)
 
 
 def test_class_entries_better_file_of_submission_counts() -> None:
-    files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded("", 8.0),
-             blackboard("ada", "19-10-00-00", "b.pdf"): graded("", 2.0)}  # fmt: skip
+    files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
+             blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
-        (ada, _), _ = laid_out(files, Course(RUBRIC, attempt=attempt))
+        (ada, _), _ = make_entries(files, Course(RUBRIC, attempt=attempt))
         assert ada.total == 8.0, attempt
 
 
 def test_class_entries_platform_id_overrides_report_id() -> None:
-    files = {blackboard("grace", "19-10-00-00"): graded("", 8.0, student="Ada", student_id="1")}
-    (ada, grace), _ = laid_out(files)
+    files = {
+        blackboard("grace", "19-10-00-00"): graded_report("", 8.0, student="Ada", student_id="1")
+    }
+    (ada, grace), _ = make_entries(files)
     assert ada.counting is None
     assert grace.total == 8.0
     assert "is that of 1 (Ada Lovelace)" in grace.flags[0]
@@ -172,10 +176,10 @@ def test_class_entries_platform_id_overrides_report_id() -> None:
 
 def test_class_entries_unlisted_student_has_flagged_row() -> None:
     files = {
-        "report.pdf": graded("", 8.0, student="Mallory", student_id="9"),
-        "other.pdf": graded("", 3.0, student="lovelace ADA"),
+        "report.pdf": graded_report("", 8.0, student="Mallory", student_id="9"),
+        "other.pdf": graded_report("", 3.0, student="lovelace ADA"),
     }
-    (ada, grace, stranger), _ = laid_out(files)
+    (ada, grace, stranger), _ = make_entries(files)
     assert (ada.total, grace.total) == (3.0, None)
     assert (stranger.student, stranger.student_id, stranger.total) == ("Mallory", "9", 8.0)
     assert stranger.flags[0] == "Not in the class list."
@@ -183,13 +187,17 @@ def test_class_entries_unlisted_student_has_flagged_row() -> None:
 
 def test_class_entries_without_roster_one_row_per_student() -> None:
     files = {
-        "Doe Jane_5_assignsubmission_file_/a.pdf": graded("", 1.0, student="Jane", student_id="42"),
-        "Roe Max_6_assignsubmission_file_/a.pdf": graded("", 2.0, student="Jane", student_id="42"),
-        "b.pdf": graded("", 3.0, student="Kim", student_id="44"),
-        "c.pdf": graded("", 4.0, student="Kim", student_id="44"),
-        "d.pdf": graded("", 5.0),
+        "Doe Jane_5_assignsubmission_file_/a.pdf": graded_report(
+            "", 1.0, student="Jane", student_id="42"
+        ),
+        "Roe Max_6_assignsubmission_file_/a.pdf": graded_report(
+            "", 2.0, student="Jane", student_id="42"
+        ),
+        "b.pdf": graded_report("", 3.0, student="Kim", student_id="44"),
+        "c.pdf": graded_report("", 4.0, student="Kim", student_id="44"),
+        "d.pdf": graded_report("", 5.0),
     }
-    entries, _ = laid_out(files, people=())
+    entries, _ = make_entries(files, people=())
     assert [(one.student, one.student_id, one.total) for one in entries] == [
         ("Jane", "42", 1.0), ("Roe Max", "6", 2.0), ("Kim", "44", 4.0), ("", "", 5.0)
     ]  # fmt: skip
@@ -198,22 +206,25 @@ def test_class_entries_without_roster_one_row_per_student() -> None:
 # ------------------------------------------------------------------ overrides
 
 
-def said(tmp_path: Path, *rows: str, head: str = "id,item,points,comment"):
+def write_overrides(tmp_path: Path, *rows: str, head: str = "id,item,points,comment"):
     path = tmp_path / "overrides.csv"
     path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
     return read_overrides(path)
 
 
-TWO_OF_ONE = {"1.pdf": graded("", 4.0, 6.0, student_id="1")}
-TWO = {"1.pdf": graded("", 4.0, 6.0, student_id="1"), "2.pdf": graded("", 1.0, student_id="2")}
+TWO_OF_ONE = {"1.pdf": graded_report("", 4.0, 6.0, student_id="1")}
+TWO = {
+    "1.pdf": graded_report("", 4.0, 6.0, student_id="1"),
+    "2.pdf": graded_report("", 1.0, student_id="2"),
+}
 
 
 def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
-    rows = said(
+    rows = write_overrides(
         tmp_path, "1,a,9.5,A good idea.", '01,,,"Come and', 'see me."', "1,total,8,Agreed.",
         "2,total,3,", "3,total,1,", "1,C,1,", '2,B,2,"x"',
     )  # fmt: skip
-    (ada, grace), notes = laid_out(TWO, overrides=rows)
+    (ada, grace), notes = make_entries(TWO, overrides=rows)
     assert ada.overrides == {
         "A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed."),
         "": Override(None, "Come and\nsee me."),
@@ -240,15 +251,17 @@ def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
     ], ids=["more points than there are", "a second row on the same"],
 )  # fmt: skip
 def test_overrides_excess_or_duplicate_row_is_noted(rows, points, told, tmp_path) -> None:
-    (ada, _), notes = laid_out(TWO, overrides=said(tmp_path, *rows))
+    (ada, _), notes = make_entries(TWO, overrides=write_overrides(tmp_path, *rows))
     assert (ada.counting.points, ada.total) == points
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
 def test_overrides_class_page_download_is_complete(tmp_path) -> None:
     """Also of who handed in nothing: the download replaces the file."""
-    rows = said(tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown.")
-    entries, notes = laid_out({"1.pdf": TWO["1.pdf"]}, overrides=rows)
+    rows = write_overrides(
+        tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."
+    )
+    entries, notes = make_entries({"1.pdf": TWO["1.pdf"]}, overrides=rows)
     again: dict[str, dict[str, Override]] = {}
     for _, _, owner, boxes, kept in map(_point_boxes, entries):
         for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
@@ -258,23 +271,25 @@ def test_overrides_class_page_download_is_complete(tmp_path) -> None:
 
 
 def test_overrides_total_makes_pending_points_count(tmp_path) -> None:
-    files = {"1.pdf": graded("", 4.0, student_id="1", pending="Run 0.1.1.")}
-    (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,A,9,"))
+    files = {"1.pdf": graded_report("", 4.0, student_id="1", pending="Run 0.1.1.")}
+    (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
-    (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,total,9,"))
+    (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,total,9,"))
     assert ada.total == 9.0
 
 
 def test_overrides_without_submission_give_points(tmp_path) -> None:
-    (_, grace), notes = laid_out({}, overrides=said(tmp_path, "2,Total,5,Shown in class."))
+    (_, grace), notes = make_entries(
+        {}, overrides=write_overrides(tmp_path, "2,Total,5,Shown in class.")
+    )
     assert (grace.total, notes) == (5.0, ())
     assert "Shown in class." in feedback_text(grace)
-    (_, grace), notes = laid_out(TWO_OF_ONE, overrides=said(tmp_path, "2,total,50,"))
+    (_, grace), notes = make_entries(TWO_OF_ONE, overrides=write_overrides(tmp_path, "2,total,50,"))
     assert (grace.total, len(notes)) == (None, 1)
 
 
 def test_read_overrides_semicolons_and_decimal_commas_are_read(tmp_path) -> None:
-    rows = said(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
+    rows = write_overrides(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
     assert rows == {"1": {"A": Override(7.5)}}
 
 
@@ -291,9 +306,9 @@ def test_read_overrides_semicolons_and_decimal_commas_are_read(tmp_path) -> None
 )
 def test_read_overrides_invalid_row_raises_error(tmp_path, row, says) -> None:
     with pytest.raises(SettingsError, match=says):
-        said(tmp_path, row)
+        write_overrides(tmp_path, row)
     with pytest.raises(SettingsError, match="no column comment"):
-        said(tmp_path, row, head="id,item,points")
+        write_overrides(tmp_path, row, head="id,item,points")
 
 
 # ------------------------------------------------------------------ due times and late rules

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
-from trajectory_tools import NAMES, PUBLISHED, SHIFT, TURN, flight, moved, published
+from trajectory_tools import NAMES, PUBLISHED, SHIFT, TURN, flight, read_public, transformed
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight import Unavailable
@@ -63,7 +63,7 @@ def test_ate_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     from evo.core.metrics import APE, PoseRelation
 
     true, made = evo_aligned(*pair, kind)
-    got = evaluate(*map(published, pair), alignment=kind, association="nearest", rpe_deltas=())
+    got = evaluate(*map(read_public, pair), alignment=kind, association="nearest", rpe_deltas=())
     np.testing.assert_array_equal(got.reference_m, true.positions_xyz)
     np.testing.assert_allclose(got.estimate_m, made.positions_xyz, rtol=0, atol=1e-9)
     for relation, errors, ours in (
@@ -93,7 +93,7 @@ def test_rpe_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     true, made = evo_aligned(*pair, kind)
     for all_pairs in (True, False):
         how = {"rpe_deltas": DELTAS, "all_pairs": all_pairs}
-        got = evaluate(*map(published, pair), alignment=kind, association="nearest", **how)
+        got = evaluate(*map(read_public, pair), alignment=kind, association="nearest", **how)
         for ours in got.rpe:
             if kind != "se3" and ours.unit == "frames":
                 continue  # scale and turn do not change these pairs; evo takes its time
@@ -243,7 +243,7 @@ def test_evaluate_no_overlap_names_spans_and_remedy(method: Method) -> None:
 def test_evaluate_transformed_copy_has_zero_error(kind: AlignmentKind) -> None:
     reference = flight()
     turn = Rotation.from_euler("z", 2.0) if kind == "yaw" else TURN
-    copied = moved(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
+    copied = transformed(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
     got = evaluate(copied, reference, alignment=kind)
     assert got.ate.translation_m.max < 1e-9
     assert got.ate.rotation_deg.max < 1e-9
@@ -256,7 +256,7 @@ def test_evaluate_transformed_copy_has_zero_error(kind: AlignmentKind) -> None:
 
 def test_ate_tilt_remains_after_yaw_alignment_only() -> None:
     reference = flight()
-    tilted = moved(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
+    tilted = transformed(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
     got = evaluate(tilted, reference)
     assert got.alignment == "yaw"
     assert got.ate.rotation_deg.rmse == pytest.approx(5.0, abs=0.1)
@@ -266,7 +266,9 @@ def test_ate_tilt_remains_after_yaw_alignment_only() -> None:
 
 def test_rpe_scale_error_is_proportional_to_distance() -> None:
     reference = flight(200.0, 50.0)
-    got = evaluate(moved(reference, TURN, SHIFT, 1.02, kind="vio"), reference, alignment="se3")
+    got = evaluate(
+        transformed(reference, TURN, SHIFT, 1.02, kind="vio"), reference, alignment="se3"
+    )
     for one in got.rpe:
         chord = np.linalg.norm(got.reference_m[one.end] - got.reference_m[one.start], axis=1)
         np.testing.assert_allclose(one.translation_error_m, 0.02 * chord, atol=1e-9)
@@ -296,7 +298,7 @@ def test_pairs_equal_their_definition(steps: list[float], value: float) -> None:
 def test_relative_error_pairs_follow_reference_distance() -> None:
     """Also where the estimate's path is twice as long."""
     reference = flight(30.0)
-    double = moved(reference, TURN, SHIFT, 2.0, kind="vio")
+    double = transformed(reference, TURN, SHIFT, 2.0, kind="vio")
     same, other = (relative_error(one, reference, Delta(1.0, "m")) for one in (reference, double))
     assert other.pairs_from == "reference"
     np.testing.assert_array_equal((other.start, other.end), (same.start, same.end))
@@ -337,7 +339,7 @@ def test_choose_alignment_depends_on_kinds_and_frames(
     estimate, reference, name, scale, expected, why
 ):
     y = replace(flight(), kind=reference[0], frame=reference[1])
-    x = moved(y, TURN, SHIFT, scale, kind=estimate[0], frame=estimate[1], name=name)
+    x = transformed(y, TURN, SHIFT, scale, kind=estimate[0], frame=estimate[1], name=name)
     kind, reason = choose_alignment(x, y)
     assert kind == expected
     assert why in reason
@@ -356,7 +358,7 @@ def test_evaluate_aisle_with_vertical_z_is_aligned_by_yaw() -> None:
 def test_evaluate_camera_removes_mounting_rotation() -> None:
     reference = flight()
     mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
-    camera = moved(reference, TURN, SHIFT, kind="slam", frame="camera")
+    camera = transformed(reference, TURN, SHIFT, kind="slam", frame="camera")
     noise = Rotation.from_rotvec(np.random.default_rng(1).normal(0.0, 0.01, (len(camera), 3)))
     camera = replace(camera, rotation=camera.rotation * mounted * noise)
     got = evaluate(camera, reference)
@@ -373,9 +375,9 @@ def test_evaluate_camera_removes_mounting_rotation() -> None:
 
 def test_evaluate_doubtful_arguments_give_warnings() -> None:
     truth = flight()
-    vio = moved(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
+    vio = transformed(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
     slam = replace(vio, kind="slam", name="slam")
-    large = moved(truth, TURN, SHIFT, 1.5, kind="vio")
+    large = transformed(truth, TURN, SHIFT, 1.5, kind="vio")
     assert not evaluate(vio, truth).warnings
     # clocks that fit better apart; less may be the filter's own lag
     lag, late = (replace(slam, time_s=slam.time_s - offset_s) for offset_s in (0.08, 0.12))
@@ -400,7 +402,7 @@ def test_evaluate_doubtful_arguments_give_warnings() -> None:
 def test_time_offset_is_recovered_at_each_rate(offset_s: float, rate_hz: float) -> None:
     reference = flight()
     random = np.random.default_rng(4)
-    estimate = moved(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")
+    estimate = transformed(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")
     noise = random.normal(0.0, 0.02, (len(estimate), 3))
     position_m = estimate.position_m + noise
     estimate = replace(estimate, time_s=estimate.time_s - offset_s, position_m=position_m)
@@ -473,7 +475,7 @@ def test_time_offset_periodic_motion_is_undetermined() -> None:
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 def test_time_offset_shifted_public_data_is_recovered(pair: tuple[str, str]) -> None:
-    estimate, reference = map(published, pair)
+    estimate, reference = map(read_public, pair)
     base = estimate_time_offset(estimate, reference).offset_s
     assert abs(base) < 0.06  # their own clocks are not perfect
     for shift_s in (0.137, 30.0, 12.5 - estimate.time_s[0]):

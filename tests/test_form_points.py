@@ -210,7 +210,7 @@ def answers_of(form: dict[str, Any]) -> Answers:
     return Answers(
         log_sha256=SHA256, mistakes=tuple(claims), verdict_ours=form["verdict_ours"],
         verdict_ekf2=form["verdict_ekf2"], ekf2_did=tuple(form["ekf2_did"]),
-        quantities=tuple(given(one["given"]) for one in form["quantities"]),
+        quantities=tuple(to_tuple(one["given"]) for one in form["quantities"]),
     )  # fmt: skip
 
 
@@ -221,7 +221,7 @@ def distance(value: Any) -> Any:
     return float(np.linalg.norm(value)) if isinstance(value, list) else value
 
 
-def given(value: Any) -> Any:
+def to_tuple(value: Any) -> Any:
     return tuple(map(float, value)) if isinstance(value, list) else value
 
 
@@ -234,7 +234,7 @@ def test_form_points_agree_with_points_given_by_hand(shared_logs: Path) -> None:
     }
     ours, theirs = [], []
     for form in bank["forms"]:
-        known = tuple(given(one["truth"]) for one in form["quantities"])
+        known = tuple(to_tuple(one["truth"]) for one in form["quantities"])
         truth = truths[form["flight"]]
         made = form_points(answers_of(form), replace(truth, quantities=known))
         ours.append(sum(made.points_by_part.values()))

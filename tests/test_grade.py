@@ -12,7 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 from class_tools import in_this_process
-from cli_tools import done, refused, run
+from cli_tools import error_line, run, run_checked
 from conftest import LOG, REPORT
 from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
@@ -29,18 +29,18 @@ from px4fuse.verification import pages
 from px4fuse.verification.model import Verdict
 from px4fuse.workers import JobFailure
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 UNKNOWN = Verdict("cannot verify", (), with_log=False)
 
 
 @pytest.fixture
-def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def jobs_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     in_this_process(monkeypatch)
 
 
 @pytest.fixture
-def handed_in(tmp_path: Path) -> Path:
+def submitted(tmp_path: Path) -> Path:
     """A folder as a learning platform exports it: one report, and what goes wrong."""
     folder = tmp_path / "handed in"
     for name in ("Lovelace Ada_1_assignsubmission_file_", "Hopper Grace_2_assignsubmission_file_"):
@@ -57,11 +57,11 @@ def handed_in(tmp_path: Path) -> Path:
     return folder
 
 
-def test_grade_table_lists_every_submitted_file(handed_in, tmp_path) -> None:
+def test_grade_table_lists_every_submitted_file(submitted, tmp_path) -> None:
     output = tmp_path / "class"
     before = {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)}
     outcome = grade(
-        [handed_in, tmp_path / "more.zip"], Course(read_rubric(None)), output, processes=1
+        [submitted, tmp_path / "more.zip"], Course(read_rubric(None)), output, processes=1
     )
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)} == before
     assert len(outcome.graded) == 6
@@ -73,9 +73,9 @@ def test_grade_table_lists_every_submitted_file(handed_in, tmp_path) -> None:
     assert len(scored) == 3
     assert all(row["points"] == row["total"] == "" and "--logs" in row["pending"] for row in scored)
     assert all("the same" in row["flags"].lower() for row in scored)
-    refused = {row["file"]: row["reasons"] for row in table if row["points"] == "0"}
-    assert len(refused) == 3
-    assert any("encrypted" in reason for reason in refused.values())
+    refused_files = {row["file"]: row["reasons"] for row in table if row["points"] == "0"}
+    assert len(refused_files) == 3
+    assert any("encrypted" in reason for reason in refused_files.values())
     assert not any(row["file"].startswith(("=", "+", "-", "@")) for row in table)
     page = (output / "class.html").read_text(encoding="utf-8")
     assert "<img src=x" not in page
@@ -83,7 +83,7 @@ def test_grade_table_lists_every_submitted_file(handed_in, tmp_path) -> None:
     assert len(list((output / "feedback").glob("*.txt"))) == 6
 
 
-@pytest.mark.usefixtures("at_once", "drawn_once")
+@pytest.mark.usefixtures("jobs_in_process", "cached_pages")
 def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> None:
     """As where they take more time or memory than there is for them."""
     folder = tmp_path / "in"
@@ -102,7 +102,7 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
     assert any("not compared within the limits" in flag for flag in only.flags)
 
 
-@pytest.mark.usefixtures("at_once", "drawn_once")
+@pytest.mark.usefixtures("jobs_in_process", "cached_pages")
 def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
@@ -140,13 +140,13 @@ def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     assert again.graded == outcome.graded
 
 
-@pytest.mark.usefixtures("at_once")
-def test_grade_again_processes_changed_files_only(handed_in, tmp_path) -> None:
+@pytest.mark.usefixtures("jobs_in_process")
+def test_grade_again_processes_changed_files_only(submitted, tmp_path) -> None:
     output = tmp_path / "class"
 
     def reused(title: str = "") -> int:
         return grade(
-            [handed_in, tmp_path / "more.zip"],
+            [submitted, tmp_path / "more.zip"],
             Course(read_rubric(None), title=title),
             output,
             processes=2,
@@ -156,19 +156,19 @@ def test_grade_again_processes_changed_files_only(handed_in, tmp_path) -> None:
     assert reused("Lab 4") == 3  # what is no report is read again
     assert b"<title>Lab 4</title>" in (output / "class.html").read_bytes()
     # what is known is known by its content, under any name
-    (handed_in / "essay.pdf").write_bytes(REPORT.read_bytes())
+    (submitted / "essay.pdf").write_bytes(REPORT.read_bytes())
     assert reused() == 4
-    (handed_in / "essay.pdf").write_bytes(b"%PDF-1.7\nanother one")
+    (submitted / "essay.pdf").write_bytes(b"%PDF-1.7\nanother one")
     assert reused() == 3
     for record in (output / "records").glob("*.json"):
         record.write_text('{"rests_on": {"verdict": 3}}')
     assert reused() == 2
     (output / "overrides (1).csv").write_text("id,item,points,comment\n")
-    again = grade([handed_in, tmp_path / "more.zip"], Course(read_rubric(None)), output)
+    again = grade([submitted, tmp_path / "more.zip"], Course(read_rubric(None)), output)
     assert "overrides (1).csv was not read; only overrides.csv is read." in again.notes
 
 
-@pytest.mark.usefixtures("at_once", "drawn_once")
+@pytest.mark.usefixtures("jobs_in_process", "cached_pages")
 def test_grade_with_other_logs_verifies_again(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")
@@ -185,7 +185,7 @@ def test_grade_with_other_logs_verifies_again(tmp_path) -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.usefixtures("at_once")
+@pytest.mark.usefixtures("jobs_in_process")
 def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in")
@@ -203,7 +203,7 @@ def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
         assert "aisle_uwb.ulg" in one.pending
 
 
-@pytest.mark.usefixtures("at_once")
+@pytest.mark.usefixtures("jobs_in_process")
 def test_grade_command_shortens_names_and_can_be_continued(tmp_path, monkeypatch) -> None:
     """Names on one line each, and of an interrupted run that it can go on."""
     import px4fuse.grading.grade as module
@@ -213,7 +213,7 @@ def test_grade_command_shortens_names_and_can_be_continued(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")
     monkeypatch.setattr(module, "grade", lambda *_, **__: GradeOutcome((entry,), (), 0, ()))
-    said = done("grade", "a.pdf", "-o", "out").output
+    said = run_checked("grade", "a.pdf", "-o", "out").output
     assert len(said) < 3000
     assert not any(line.lstrip().startswith("Points 120") for line in said.splitlines())
     monkeypatch.setattr(module, "grade", Mock(side_effect=KeyboardInterrupt))
@@ -242,7 +242,7 @@ def test_grade_command_passes_course_options(tmp_path, monkeypatch) -> None:
         "grade a.pdf -o out --roster sheet.csv --worksheet sheet.csv --column Grade --attempt best "
         "--late 5%/hour --anonymous --title Lab --jobs 3 --due"
     )
-    done(*words.split(), "2026-11-20 23:59 +01:00")
+    run_checked(*words.split(), "2026-11-20 23:59 +01:00")
     course, processes = noted.call_args.args[1], noted.call_args.kwargs["processes"]
     assert (course.title, processes) == ("Lab", 3)
     assert [person.student_id for person in course.roster] == ["0042"]
@@ -254,6 +254,6 @@ def test_grade_command_passes_course_options(tmp_path, monkeypatch) -> None:
 
 def test_grade_write_rubric_writes_default_once(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    done("grade", "--write-rubric", "lab.toml")
+    run_checked("grade", "--write-rubric", "lab.toml")
     assert read_rubric(Path("lab.toml")) == read_rubric(None)
-    assert "not overwritten" in refused("grade", "--write-rubric", "lab.toml")
+    assert "not overwritten" in error_line("grade", "--write-rubric", "lab.toml")

@@ -9,7 +9,7 @@ from conftest import REPOSITORY
 from exchange import replace
 from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
-from trajectory_tools import drifted, square
+from trajectory_tools import noisy_odometry, square
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop
@@ -42,12 +42,12 @@ def sample_loop(sample: LoopSource) -> Loop:
     return analyse(sample, reference=read_source(str(SLAM)).trajectory)
 
 
-def loop_of(source: LoopSource, reference: Trajectory | None = None, **how: Any) -> Loop:
+def analyse_loop(source: LoopSource, reference: Trajectory | None = None, **how: Any) -> Loop:
     return analyse(source, LoopRequest(source="", **how), reference)
 
 
 def close_loop(trajectory: Trajectory, **how: Any) -> Loop:
-    return loop_of(LoopSource(trajectory, None), **how)
+    return analyse_loop(LoopSource(trajectory, None), **how)
 
 
 def path(loop: Loop, way: Any) -> Any:
@@ -63,7 +63,7 @@ def rmse(loop: Loop, way: str, index: int = 0) -> float:
     return score(loop, way, index).ate.translation_m.rmse
 
 
-def missed(loop: Loop) -> np.ndarray:
+def closure_error_vector_m(loop: Loop) -> np.ndarray:
     return np.array(list(loop.closure_error_axes_m.values()))
 
 
@@ -118,7 +118,7 @@ def test_loop_sample_corrections_reduce_ate_and_end_error(sample_loop):
 def test_loop_lesson_example_2_equals_lesson_output() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
-    error, total = missed(found), found.path_length_m
+    error, total = closure_error_vector_m(found), found.path_length_m
     corrected = path(found, "by_distance_plain").trajectory.position_m
     assert list(loop_lines()) == [
         f"loop closure error ({error[0]:.1f}, {error[1]:.1f}) m over {total:.1f} m = "
@@ -134,7 +134,9 @@ def test_by_distance_plain_shifts_positions_linearly(sample_loop) -> None:
     plain, odometry = path(sample_loop, "by_distance_plain"), sample_loop.odometry.trajectory
     share = sample_loop.distance_m / sample_loop.distance_m[-1]
     moved = odometry.position_m - plain.trajectory.position_m
-    np.testing.assert_allclose(moved, np.outer(share, missed(sample_loop)), atol=1e-12)
+    np.testing.assert_allclose(
+        moved, np.outer(share, closure_error_vector_m(sample_loop)), atol=1e-12
+    )
     assert plain.trajectory.rotation is odometry.rotation
 
 
@@ -151,7 +153,7 @@ def test_by_distance_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> None
 
 def test_by_distance_without_heading_has_one_path(sample, sample_loop) -> None:
     assert [part.name for part in sample_loop.reported_paths[1:3]] == [POSITIONS_ONLY, BY_DISTANCE]
-    found = loop_of(sample, landed_at=Landing(0.0, 0.0))
+    found = analyse_loop(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
     names = [part.name for part in found.reported_paths]
     assert POSITIONS_ONLY in names
@@ -163,7 +165,7 @@ def test_by_distance_without_heading_has_one_path(sample, sample_loop) -> None:
 def test_loop_landed_at_option_equals_ground_truth(sample: LoopSource, sample_loop: Loop) -> None:
     forward, right, _ = sample_loop.known_end.displacement  # its nose points along x
     heading = sample_loop.known_end.heading_change_deg
-    taped = loop_of(sample, landed_at=Landing(forward, right, heading))
+    taped = analyse_loop(sample, landed_at=Landing(forward, right, heading))
     # a tape does not see the height, which the truth has 0.16 m lower
     assert taped.closure_error_m == pytest.approx(sample_loop.closure_error_m, abs=0.03)
     assert taped.heading_error_deg == pytest.approx(sample_loop.heading_error_deg, abs=1e-6)
@@ -197,7 +199,7 @@ def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Traje
     heading = np.radians(np.sqrt(turned))
     tilt = noise.tilt_share * heading
     sigma = np.array([np.sqrt(moved)] * 3 + [tilt, tilt, heading])
-    odometry = drifted(truth, sigma, np.random.default_rng(seed))
+    odometry = noisy_odometry(truth, sigma, np.random.default_rng(seed))
     time = np.arange(len(truth)) / RATE_HZ
 
     def flown(name: str, kind: Kind, poses: np.ndarray) -> Trajectory:
@@ -312,7 +314,7 @@ def test_find_loop_assumed_landing_is_reported(sample: LoopSource, sample_loop: 
     (finding,) = find_loop(found)
     assert (finding.id, finding.severity) == ("loop_end_assumed", "info")
     assert "--landed-at" in finding.remedy
-    assert find_loop(loop_of(sample, landed_at=Landing(0.0, 0.0))) == ()
+    assert find_loop(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
 def test_odometry_variances_use_growing_reported_variances() -> None:
@@ -349,15 +351,15 @@ def test_pose_graph_interpolates_between_key_frames(sample_loop: Loop) -> None:
 
 def test_closure_times_are_unix_or_from_first_pose() -> None:
     source = read_source(str(SLAM))
-    relative = loop_of(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
+    relative = analyse_loop(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
     start = float(source.trajectory.time_s[0])
-    stamped = loop_of(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
+    stamped = analyse_loop(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
     assert relative.closures[1] == stamped.closures[1]
 
 
 def test_loop_slam_file_is_levelled_with_small_closure_error() -> None:
     source = read_source(str(SLAM))
-    found = loop_of(source, landed_at=Landing(0.0, 0.0))
+    found = analyse_loop(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"
     assert found.closure_error_m < 0.7  # it truly ended 0.4 m away
     height = found.odometry.trajectory.position_m[:, 2]
@@ -374,7 +376,7 @@ def test_loop_slam_file_is_levelled_with_small_closure_error() -> None:
 ])  # fmt: skip
 def test_loop_invalid_segment_or_closure_is_refused(sample, how, says) -> None:
     with pytest.raises((TrajectoryError, SettingsError), match=says):
-        loop_of(sample, **how)
+        analyse_loop(sample, **how)
 
 
 def test_split_part_separates_log_and_source_at_colon(tmp_path: Path) -> None:

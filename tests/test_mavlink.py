@@ -43,8 +43,8 @@ from mavlink_tools import (
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from pandas.testing import assert_frame_equal
-from patience import patience
 from scipy.spatial.transform import Rotation
+from time_limit import time_limit
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import LogError, MissingDataError
@@ -700,7 +700,7 @@ class FuzzCases:
         """Return True if the content is read as a valid flight, False if it is rejected."""
         self.path.write_bytes(content)
         try:
-            with patience():
+            with time_limit():
                 flight = read_log(self.path)
         except LogError:
             return False

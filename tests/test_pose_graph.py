@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
-from trajectory_tools import GTSAM_ORDER, drifted, gtsam_optimiser, gtsam_problem
+from trajectory_tools import GTSAM_ORDER, gtsam_optimiser, gtsam_problem, noisy_odometry
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
@@ -261,7 +261,7 @@ def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
         Rotation.from_euler("ZYX", angles).as_quat(),
     ])  # fmt: skip
     spread = np.array([0.03] * 3 + [0.02] * 3)  # m and rad per step
-    odometry = drifted(truth, spread, rng)
+    odometry = noisy_odometry(truth, spread, rng)
     steps = lie.between(odometry[:-1], odometry[1:])
     pairs = [(0, lap * per_lap) for lap in range(1, count + 1)]
     while len(pairs) < count + false:

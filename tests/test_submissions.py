@@ -47,12 +47,12 @@ def reason(submission: Submission) -> str:
     return str(refused.value)
 
 
-def who(name: str) -> tuple[str, str]:
+def name_and_number(name: str) -> tuple[str, str]:
     origin = origin_of(name)
     return origin.person.name, "".join(origin.person.numbers.values())
 
 
-def only(path: Path) -> Submission:
+def single_submission(path: Path) -> Submission:
     (submission,), _ = find_submissions([path])
     return submission
 
@@ -90,7 +90,7 @@ def test_find_submissions_searches_folders_and_sorts(tmp_path):
     ],
 )  # fmt: skip
 def test_origin_of_uses_platform_part_of_name(name, is_):
-    assert who(name) == is_
+    assert name_and_number(name) == is_
 
 
 def test_origin_of_reads_login_time_and_late_mark():
@@ -182,7 +182,7 @@ def test_find_submissions_zip_inside_export_is_not_opened(tmp_path):
     export = write(tmp_path / "all.zip", zipped({name: handed_in, "log.ulg": b""}))
     found, notes = find_submissions([export])
     assert [each.name for each in found] == [name]
-    assert who(found[0].name) == ("Roe", "1")
+    assert name_and_number(found[0].name) == ("Roe", "1")
     with pytest.raises(ResultsError) as refused:
         read_report(read(found[0]), found[0].name)
     assert str(refused.value) == f"{name}: not a PDF. Hand in the file that px4fuse wrote."
@@ -284,7 +284,7 @@ def test_read_too_large_file_is_rejected_in_bounded_memory(tmp_path):
     with path.open("wb") as file:
         file.truncate(500_000_000)  # sparse: it takes no space
     tracemalloc.start()
-    said = reason(only(path))
+    said = reason(single_submission(path))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert said == "large.pdf: larger than 25 MB; reports are below 2 MB."
@@ -294,15 +294,15 @@ def test_read_too_large_file_is_rejected_in_bounded_memory(tmp_path):
 def test_read_zip_bomb_or_wrong_size_is_rejected(tmp_path, monkeypatch):
     packed = zipped({"bomb.pdf": bytes(20_000_000)})
     path = write(tmp_path / "x.zip", packed)
-    assert "compressed more than 100 times" in reason(only(path))
+    assert "compressed more than 100 times" in reason(single_submission(path))
     path.write_bytes(zipped({"large.pdf": bytes(MAX_BYTES + 1)}))
-    assert "larger than 25 MB" in reason(only(path))
+    assert "larger than 25 MB" in reason(single_submission(path))
     # a declared size that is smaller than what there is: zipfile stops there, and the sum is off
     path.write_bytes(packed.replace(struct.pack("<I", 20_000_000), struct.pack("<I", 1000)))
-    assert "cannot be read" in reason(only(path))
+    assert "cannot be read" in reason(single_submission(path))
     monkeypatch.setattr(submissions, "MAX_BYTES", len(PDF))
     path.write_bytes(zipped({"just.pdf": PDF}))
-    assert read(only(path)) == PDF
+    assert read(single_submission(path)) == PDF
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from class_tools import at_once, report_of, zipped
-from golden_tools import agrees
+from class_tools import make_report, skip_verification, write_zip
+from golden_tools import assert_matches_golden
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import read_people
@@ -58,7 +58,7 @@ def log(number: int) -> bytes:
 
 def report(number: int) -> bytes:
     made = hashlib.sha256(log(number)).hexdigest()
-    return report_of(name(number), student_id(number), made)
+    return make_report(name(number), student_id(number), made)
 
 
 def table(path: Path, head: list[str], rows: list[list[str]], separator: str = ",") -> Path:
@@ -100,11 +100,11 @@ class Lab:
         with zipfile.ZipFile(inner, "w") as archive:
             archive.writestr(f"{name(1)}_9001_assignsubmission_file_/report.pdf", b"%PDF- none")
         files[f"{name(INTRUDER)}_{9000 + INTRUDER}_assignsubmission_file_/w.zip"] = inner.getvalue()
-        return zipped(self.folder / "moodle.zip", files)
+        return write_zip(self.folder / "moodle.zip", files)
 
     def canvas(self) -> Path:
         self.pdf[COPIED] = self.pdf[3]
-        return zipped(
+        return write_zip(
             self.folder / "canvas.zip",
             {f"{(last(n) + first(n)).lower()}_{'LATE_' if n == 17 else ''}{700 + n}_{n}_r.pdf":
              self.pdf[n] for n in CANVAS},
@@ -114,7 +114,7 @@ class Lab:
         files = {f"Lab_user{n}_attempt_2026-11-{20 if n != LATE else 22}-11-00-00_r.pdf":
                  self.pdf[n] for n in BLACKBOARD}  # fmt: skip
         files[f"Lab_user{RESUBMITTED}_attempt_2026-11-20-11-30-00_r.pdf"] = self.better
-        return zipped(self.folder / "blackboard.zip", files)
+        return write_zip(self.folder / "blackboard.zip", files)
 
     def worksheet(self) -> Path:
         rows = [[f"Participant {9000 + n}", name(n), "", f"s{n}@x.edu", "Submitted for grading", "",
@@ -145,7 +145,7 @@ def lab(tmp_path: Path) -> Lab:
     return Lab(tmp_path)
 
 
-def of(outcome: GradeOutcome, number: int) -> Entry:
+def entry_of(outcome: GradeOutcome, number: int) -> Entry:
     return next(one for one in outcome.entries if one.student_id == student_id(number))
 
 
@@ -154,38 +154,38 @@ def points(outcome: GradeOutcome) -> dict[str, float | None]:
 
 
 def test_grade_term_applies_new_rubric_and_overrides(lab, monkeypatch) -> None:
-    verified = at_once(monkeypatch)
+    verified = skip_verification(monkeypatch)
     outcome = lab.grade()
-    as_it_was_written(lab.output)
+    check_golden_tables(lab.output)
     assert outcome.reused == 2  # the copy, and what was handed in twice
     count = len(verified)
-    another_rubric(lab, outcome)
-    the_instructors_word(lab, outcome)
+    check_other_rubric(lab, outcome)
+    check_overrides(lab, outcome)
     assert len(verified) == count  # points changed, and no report was looked at again
-    anonymous(lab, outcome)
+    check_pseudonyms(lab, outcome)
 
 
-def as_it_was_written(output: Path) -> None:
+def check_golden_tables(output: Path) -> None:
     """Tables, and what some are told, as they were looked at."""
     lines = []
     tables = [output / "class.csv", *sorted((output / "grades").glob("*.csv"))]
     told = [path for path in sorted((output / "feedback").iterdir()) if path.stem in SHOWN]
     for path in (*tables, *told):
         lines += ["", path.name, *path.read_text(encoding="utf-8-sig").splitlines()]
-    agrees("term", lines)
+    assert_matches_golden("term", lines)
 
 
-def another_rubric(lab: Lab, outcome: GradeOutcome) -> None:
+def check_other_rubric(lab: Lab, outcome: GradeOutcome) -> None:
     doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
     (lab.folder / "lab.toml").write_text(doubled, encoding="utf-8")
     second = lab.grade(read_rubric(lab.folder / "lab.toml"))
     assert second.reused == 38  # two of the files are no reports
-    assert of(second, 1).total == pytest.approx(2 * of(outcome, 1).total, abs=0.2)
+    assert entry_of(second, 1).total == pytest.approx(2 * entry_of(outcome, 1).total, abs=0.2)
 
 
-def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> None:
+def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
     """Overrides are read, never written over, and kept by every regrade."""
-    usual = of(outcome, 1)
+    usual = entry_of(outcome, 1)
     item = usual.counting.items[0].title
     said = lab.output / "overrides.csv"
     assert said.read_text(encoding="utf-8-sig") == "id,item,points,comment\n"
@@ -198,8 +198,8 @@ def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> None:
     third = lab.grade()
     assert said.read_bytes() == before
     expected = usual.total - usual.counting.items[0].points + 1.0
-    assert of(third, 1).total == pytest.approx(expected)
-    assert of(third, 40).total == 12.0
+    assert entry_of(third, 1).total == pytest.approx(expected)
+    assert entry_of(third, 40).total == 12.0
     assert "overrides.csv: no student has the id 0099." in third.notes
     changed = {key for key, value in points(third).items() if value != points(outcome)[key]}
     assert changed == {"0001", "0040"}
@@ -212,7 +212,7 @@ def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> None:
     assert (lab.output / "class.csv").read_bytes() == fleet_table
 
 
-def anonymous(lab: Lab, outcome: GradeOutcome) -> None:
+def check_pseudonyms(lab: Lab, outcome: GradeOutcome) -> None:
     """Who is who stands in a file of its own, and stays."""
     text = (lab.output / "names.csv").read_text(encoding="utf-8-sig")
     rows = list(csv.DictReader(io.StringIO(text, newline="")))

@@ -43,7 +43,7 @@ def flight(
     return Trajectory("flight.tum", kind, time, position, rotation, frame)
 
 
-def moved(
+def transformed(
     one: Trajectory, turn: Rotation, shift: np.ndarray, scale: float = 1.0, **changes: Any
 ) -> Trajectory:
     """The same motion in another world."""
@@ -61,7 +61,7 @@ def square(per_leg: int, side_m: float, laps: int = 1) -> tuple[np.ndarray, Rota
     return position, Rotation.from_rotvec(np.outer(leg * np.pi / 2, [0.0, 0.0, 1.0]))
 
 
-def drifted(poses: np.ndarray, sigma: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def noisy_odometry(poses: np.ndarray, sigma: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Poses by odometry whose steps err by so much (m, then rad), shapes (n, 7) and (6,)."""
     steps = lie.between(poses[:-1], poses[1:])
     noise = lie.exp(rng.normal(size=(len(steps), 6)) * sigma)
@@ -73,7 +73,7 @@ TURN = Rotation.from_euler("ZYX", [2.0, 0.4, -0.7])
 
 
 @cache
-def published(name: str) -> Trajectory:
+def read_public(name: str) -> Trajectory:
     return read_trajectory(shared("trajectories") / name)
 
 

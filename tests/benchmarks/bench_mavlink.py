@@ -28,7 +28,7 @@ MINUTES = 10
 RATE_HZ = 200
 
 
-def ours(path: Path) -> int:
+def read_columns(path: Path) -> int:
     """Frames, and every message type into columns."""
     from px4fuse.readers.mavlink_frames import message_name, read_frames
 
@@ -39,7 +39,7 @@ def ours(path: Path) -> int:
     return len(frames)
 
 
-def pymavlinks(path: Path) -> int:
+def read_with_pymavlink(path: Path) -> int:
     from pymavlink import mavutil
 
     link = mavutil.mavlink_connection(str(path), dialect="all", notimestamps=path.suffix != ".tlog")
@@ -81,9 +81,11 @@ def main() -> None:
         files = [Path(name) for name in sys.argv[2:]] or [LOG]
         files.append(synthetic(Path(folder) / f"{MINUTES}_minutes.tlog"))
         for path in files:
-            count, theirs = ours(path), pymavlinks(path)
+            count, theirs = read_columns(path), read_with_pymavlink(path)
             read_log(path)  # tables that are made once
-            readers = [partial(read, path) for read in (pymavlinks, ours, read_log)]
+            readers = [
+                partial(read, path) for read in (read_with_pymavlink, read_columns, read_log)
+            ]
             took = np.array([[seconds(read) for read in readers] for _ in range(runs)])
             a, b, whole = np.median(took, axis=0)
             ratio = np.median(took[:, 0] / took[:, 1])

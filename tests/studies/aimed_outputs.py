@@ -26,8 +26,8 @@ TESTS = Path(__file__).resolve().parents[1]
 if str(TESTS) not in sys.path:
     sys.path.insert(0, str(TESTS))
 
-from aimed import Aim, aims, cleared, hashed, made_desk  # noqa: E402
-from conftest import page_of  # noqa: E402
+from aimed import Aim, aims, file_hashes, make_desk, make_empty_folder  # noqa: E402
+from conftest import blank_page  # noqa: E402
 
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import OutputError  # noqa: E402
@@ -55,14 +55,14 @@ def detoured(typed: str, place: Path, rng: random.Random) -> str:
 
 def outcome(aim: Aim, desk: Path, place: Path, rng: random.Random, before: object) -> str:
     """Run one aim; "" where there is no such way."""
-    arguments = aim.arguments(desk, cleared(place))
+    arguments = aim.arguments(desk, make_empty_folder(place))
     if arguments is None:
         return ""
     *rest, target = arguments
     if not target.endswith(".pdf") or aim.way != "beside":
         target = detoured(target, place, rng)
     result = CliRunner().invoke(cli, [*rest, target])
-    if hashed(desk) != before:
+    if file_hashes(desk) != before:
         return "changed"
     if isinstance(result.exception, OutputError):
         return "refused"
@@ -77,9 +77,12 @@ def main() -> None:
     given = parser.parse_args()
     rng, every, begin = random.Random(given.seed), aims(), time.monotonic()
     counts: dict[str, Counter[str]] = {aim.command: Counter() for aim in every}
-    with tempfile.TemporaryDirectory() as folder, mock.patch("px4fuse.report.pdf.render", page_of):
-        desk = made_desk(Path(folder, "desk"))
-        before = hashed(desk)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        mock.patch("px4fuse.report.pdf.render", blank_page),
+    ):
+        desk = make_desk(Path(folder, "desk"))
+        before = file_hashes(desk)
         os.chdir(desk)
         done = 0
         while done < given.count:

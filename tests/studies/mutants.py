@@ -65,7 +65,7 @@ class Mutant(NamedTuple):
         """Return the file's text with the change."""
         return source[: self.start] + self.new + source[self.end :]
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """Return the change in one line, for the table."""
         source = (ROOT / self.path).read_text(encoding="utf-8")
         before = source.splitlines()[self.line - 1].strip()
@@ -278,7 +278,7 @@ def main() -> None:
 
         def judge(mutant: Mutant) -> str:
             names = cover.of(mutant)
-            after = mutant.told().partition("  ->  ")[2]
+            after = mutant.describe().partition("  ->  ")[2]
             if any(mutant.path == path and part in after for path, part in EQUIVALENT):
                 return "equivalent"
             if not names:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 # What is guarded takes a second at most; no machine is a hundred times slower
-PATIENCE_S = 120.0
+LIMIT_S = 120.0
 
 
 class TookTooLongError(Exception):
@@ -16,17 +16,17 @@ class TookTooLongError(Exception):
 
 
 @contextlib.contextmanager
-def patience() -> Iterator[None]:
+def time_limit() -> Iterator[None]:
     """Interrupt what does not end, where the system can."""
 
-    def give_up(*_: Any) -> None:
-        raise TookTooLongError(f"not done within {PATIENCE_S:g} s")
+    def stop(*_: Any) -> None:
+        raise TookTooLongError(f"not done within {LIMIT_S:g} s")
 
     if not hasattr(signal, "setitimer"):
         yield
         return
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
     try:
         yield
     finally:
