@@ -1,4 +1,4 @@
-"""Classes made up for tests: reports under any name, exports of platforms, and grading at once."""
+"""Artificial classes for tests: reports of any student, exports, grading in one process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VERIFIED = Verdict("verified", ("the log gives every value again",), True, page_
 
 
 def make_report(name: str, student_id: str, log: str = "") -> bytes:
-    """The sample's report on an empty page, with another student and log in its results."""
+    """Return an empty page with the sample's results, for another student and log."""
     results = json.loads(REPORT.with_suffix(".json").read_text(encoding="utf-8"))
     results["student"] = {"name": name, "id": student_id, "notes": ""}
     if log:
@@ -31,9 +31,9 @@ def make_report(name: str, student_id: str, log: str = "") -> bytes:
 
 
 def skip_verification(monkeypatch) -> list[str]:
-    """Grade in this process, and believe every report whose log is there; gives what was verified.
+    """Grade in this process, accept each report with a known log; return the verified ids.
 
-    Bounds and verification have tests of their own, and take seconds per report.
+    Other tests cover limits and verification, which take seconds per report.
     """
     verified_ids: list[str] = []
 
@@ -47,16 +47,16 @@ def skip_verification(monkeypatch) -> list[str]:
 
 
 def run_in_turn(function, jobs, **_):
-    """One job after the other, in this process, whose limits stay as they are."""
+    """Run jobs one after the other in this process, in a copy of its context."""
     for index, job in enumerate(jobs):
         function_, job_ = pickle.loads(pickle.dumps((function, job)))
         yield index, pickle.loads(pickle.dumps(copy_context().run(function_, job_)))
 
 
 def in_this_process(monkeypatch) -> None:
-    """Do without the processes that keep what strangers wrote within bounds: each takes seconds.
+    """Run jobs in this process instead of workers with limits, which take seconds to start.
 
-    What goes to them and what comes back is pickled all the same.
+    Jobs and results are pickled nevertheless.
     """
 
     for module in (grading, workers):
@@ -73,7 +73,7 @@ def write_zip(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 
 def graded_report(
     name: str, *points: float, student: str = "", student_id: str = "", **more
 ) -> GradedReport:
-    """A report with items A, B, … of ten points each."""
+    """Return a graded report with items A, B, … of 10 points each."""
     items = tuple(
         Item(chr(ord("A") + at), each, 10.0, "Because.") for at, each in enumerate(points)
     )

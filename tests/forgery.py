@@ -1,4 +1,4 @@
-"""Reports forged with care: one thing changed, everything else as px4fuse wrote it."""
+"""Forged reports: one change, everything else as px4fuse wrote it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ESCAPED = {0x08: b"\\b", 0x09: b"\\t", 0x0A: b"\\n", 0x0C: b"\\f", 0x0D: b"\\r",
 
 
 def forged(pdf: bytes, *changes: Forge) -> bytes:
-    """The file with something changed in it."""
+    """Return the PDF with changes."""
     writer = PdfWriter(clone_from=io.BytesIO(pdf))
     for change in changes:
         change(writer)
@@ -45,14 +45,14 @@ def forged(pdf: bytes, *changes: Forge) -> bytes:
 
 
 def pdf_bytes(writer: PdfWriter) -> bytes:
-    """The bytes of what was written."""
+    """Return the file that a writer contains."""
     out = io.BytesIO()
     writer.write(out)
     return out.getvalue()
 
 
 def edit_stream(stream: Any, change: Edit) -> DecodedStreamObject:
-    """A stream with other content."""
+    """Return a stream with changed content."""
     before = stream.get_data()
     content = change(before)
     assert content != before, "nothing was forged"
@@ -65,7 +65,7 @@ def edit_stream(stream: Any, change: Edit) -> DecodedStreamObject:
 
 
 def replace_stream(holder: Any, key: str, change: Edit) -> Forge:
-    """Another stream in place of the one that a dictionary holds."""
+    """Replace the stream at a key of a dictionary by a changed one."""
 
     def forge(writer: PdfWriter) -> None:
         held = holder(writer)
@@ -75,12 +75,12 @@ def replace_stream(holder: Any, key: str, change: Edit) -> Forge:
 
 
 def on_page(number: int, change: Edit) -> Forge:
-    """What a page draws, changed."""
+    """Change the content stream of a page."""
     return replace_stream(lambda writer: writer.pages[number - 1], "/Contents", change)
 
 
 def with_results(text: str) -> Forge:
-    """Other results attached."""
+    """Replace the attached results."""
 
     def forge(writer: PdfWriter) -> None:
         files: Any = writer.root_object["/Names"]["/EmbeddedFiles"]["/Names"]  # type: ignore[index]
@@ -93,7 +93,7 @@ def with_results(text: str) -> Forge:
 
 
 def font(name: str) -> Callable[[PdfWriter], Any]:
-    """A font of the first page."""
+    """Return a function that finds a font of the first page."""
 
     def find(writer: PdfWriter) -> Any:
         return writer.pages[0]["/Resources"]["/Font"][name].get_object()  # type: ignore[index]
@@ -102,14 +102,14 @@ def font(name: str) -> Callable[[PdfWriter], Any]:
 
 
 def glyphs(holder: DictionaryObject) -> dict[str, int]:
-    """Numbers of the glyphs by the letters that they stand for."""
+    """Return glyph numbers by their characters."""
     names: Any = holder["/ToUnicode"]
     pairs = re.findall(rb"<([0-9a-fA-F]{4})> <([0-9a-fA-F]{4})>\s", names.get_data())
     return {chr(int(letter, 16)): int(glyph, 16) for glyph, letter in pairs}
 
 
 def text(glyph: int) -> bytes:
-    """A glyph as it is written in a text."""
+    """Encode a glyph number as in a text string."""
     return b"".join(
         ESCAPED.get(byte, bytes([byte]) if 0x20 <= byte < 0x7F else b"\\%03o" % byte)
         for byte in glyph.to_bytes(2, "big")
@@ -149,17 +149,17 @@ def stream(data: bytes, **entries: Any) -> DecodedStreamObject:
 
 
 def catalogue(key: str, value: Any) -> Forge:
-    """An entry of the catalogue."""
+    """Set an entry of the document catalogue."""
     return lambda writer: entry(key, value)(writer.root_object)
 
 
 def document_info(**entries: str) -> Forge:
-    """Entries of the document information."""
+    """Set entries of the document information."""
     return lambda writer: writer.add_metadata({f"/{key}": held for key, held in entries.items()})
 
 
 def append_update(pdf: bytes, change: Forge) -> bytes:
-    """An incremental update, as viewers append one."""
+    """Append an incremental update, as viewers do."""
     writer = PdfWriter(io.BytesIO(pdf), incremental=True)
     change(writer)
     return pdf_bytes(writer)
@@ -169,7 +169,7 @@ def append_update(pdf: bytes, change: Forge) -> bytes:
 
 
 def set_value(value: Any, *path: Any) -> Change:
-    """Another value at a place in the results; behind the end of a list it is added."""
+    """Set the value at a path in the results; the index after the end of a list appends."""
 
     def change(results: dict[str, Any]) -> None:
         part: Any = results
@@ -184,24 +184,24 @@ def set_value(value: Any, *path: Any) -> Change:
 
 
 def attached_results(pdf: bytes) -> Reported:
-    """A report, read without care: tests of reading are elsewhere."""
+    """Read the attached results without the checks of read_report."""
     return read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
 
 
 def to_dict(report: Reported) -> dict[str, Any]:
-    """The results of a report, to be changed."""
+    """Convert results to a dictionary that can be changed."""
     made: dict[str, Any] = json.loads(to_json(report))
     return made
 
 
 def read_again(results: dict[str, Any]) -> Reported:
-    """Changed results, as they are read from a report."""
+    """Decode changed results as from a report."""
     return read_results(to_json(results).encode())
 
 
 @dataclass(frozen=True)
 class VerifiedReport:
-    """A report that is verified, and its analysis, computed once."""
+    """Report that is verified, with its analysis, which is computed once."""
 
     pdf: bytes
     results: dict[str, Any]
@@ -209,9 +209,9 @@ class VerifiedReport:
     files: Mapping[str, Path]
 
     def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdict:
-        """What a new run gives; from memory where everything that it rests on is recorded so."""
+        """Return the analysis; the stored one if request, student, log and versions are equal."""
         ours, theirs = (
-            # the recorded command is made anew from the request
+            # the command is derived from the request
             (held.request, held.student, verification.log_sha256(held),
              msgspec.structs.replace(held.provenance, command=""))
             for held in (self.again[0], results)
@@ -219,15 +219,15 @@ class VerifiedReport:
         return self.again if ours == theirs else verification.recompute(results, logs)
 
     def verified(self, pdf: bytes) -> Verdict:
-        """The verdict on a forged report, with the log."""
+        """Verify a forged report with the log."""
         try:
             report = attached_results(pdf)
-        except ResultsError as error:  # refused before there is anything to verify
+        except ResultsError as error:  # rejected before verification
             return Verdict("cannot verify", (str(error),), with_log=False)
         return verify(report, pdf, self.files, recompute=self.recompute)
 
     def with_results(self, results: dict[str, Any]) -> bytes:
-        """The report with other results attached."""
+        """Return the report with other results attached."""
         return forged(self.pdf, with_results(to_json(results)))
 
 

@@ -1,4 +1,4 @@
-"""External position files placed into flights, against injected clocks, frames and yaws."""
+"""Alignment of external position files with flights, for known clocks, frames and yaws."""
 
 import json
 import re
@@ -27,7 +27,7 @@ from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read
 
 BOOT_S = 2416.25
 OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock
-# x, y, z of the file from north, east, down: written out, not taken from the code
+# x, y, z of the file from north, east, down; independent of the code under test
 FROM_NED: dict[str, Any] = {
     "ned": lambda n, e, d: (n, e, d),
     "enu": lambda n, e, d: (e, n, -d),
@@ -35,19 +35,19 @@ FROM_NED: dict[str, Any] = {
 }
 
 
-# A pass along the aisle begins at each of these times and ends at this share of its length
+# Start time (s) of each pass along the aisle: share of the aisle's length at its end
 PASSES = {6: 1.0, 18: 0.25, 27: 0.8, 41: 0, 52: 0.9, 66: 0.1, 75: 0.7, 90: 0.3, 104: 1, 112: 0.5}
 PASS_S = 6.0
 
 
 def smooth_step(time_s: Array) -> Array:
-    """Go from 0 to 1 with least jerk."""
+    """Minimum-jerk motion from 0 to 1."""
     u = np.clip(time_s / PASS_S, 0.0, 1.0)
     return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
 
 
 def passes(time_s: Array, heading_deg: float, length_m: float, across_m: float = 0.2) -> Array:
-    """Passes along the aisle of which no two are alike; shape (n, 3), NED."""
+    """Return positions of different passes along the aisle; shape (n, 3), NED."""
     along, lever_arm_m = 0.0 * time_s, 0.0
     for start_s, share in PASSES.items():
         along += (share * length_m - lever_arm_m) * smooth_step(time_s - start_s)
@@ -59,7 +59,7 @@ def passes(time_s: Array, heading_deg: float, length_m: float, across_m: float =
 
 
 def flight_along(path: Any = passes, *, boot_s: float = BOOT_S, **parts: Any) -> Flight:
-    """Fly another path than the aisle's, which is periodic."""
+    """Simulate a flight on this path; that of aisle_flight is periodic."""
 
     def motion(time_s: Array, heading_deg: float, length_m: float) -> tuple[Array, Array, Array]:
         h = 1e-3
@@ -88,7 +88,7 @@ def uwb_file(
     flight: Flight, *, offset_s: float = OFFSET_S, frame: str = "enu", yaw_deg: float = 0.0,
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0), **made: Any,
 ) -> PositionRecording:  # fmt: skip
-    """Record the flight's UWB on another clock and in another frame."""
+    """Write the flight's UWB positions with another clock and in another frame."""
     samples = flight.positions[0].samples
     n, e, d = (samples[Columns.POSITION].to_numpy() - origin_m).T
     c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
@@ -106,13 +106,13 @@ def align(
 def clock_error_s(
     alignment: Alignment, true_s: float = OFFSET_S, sigma_s: Span = (0.0, np.inf)
 ) -> float:
-    """How far the clock offset is off (s), with a standard deviation between two bounds."""
+    """Return the error of the clock offset (s); check that its σ is between two bounds."""
     assert sigma_s[0] < alignment.clock_offset_sigma_s < sigma_s[1]
     return abs(alignment.clock_offset_s - true_s)
 
 
 def yaw_difference_deg(one_deg: float, other_deg: float) -> float:
-    """Angle between two yaws."""
+    """Return the absolute difference of two yaws."""
     return abs((one_deg - other_deg + 180.0) % 360.0 - 180.0)
 
 
@@ -133,7 +133,7 @@ def external(sample_log: Path) -> PositionRecording:
 
 @pytest.fixture(scope="module")
 def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
-    """Boot clock minus the file's, from the positions that both hold."""
+    """Boot clock minus the file's clock, from positions that both contain."""
     logged = sample_flight.positions[0].samples
     places = logged[["east_m", "north_m"]].round(3).itertuples(index=False, name=None)
     time_of = dict(zip(places, logged.index, strict=True))
@@ -305,7 +305,7 @@ def test_align_inverted_height_or_other_start_time_warns(flight: Flight) -> None
     assert "file and log differ by 100 s" in day
 
 
-# -- what real files are like ----------------------------------------------------------------------
+# -- outliers, gaps and resets ---------------------------------------------------------------------
 
 
 def test_align_outliers_and_gap_keep_clock_and_yaw() -> None:
@@ -354,14 +354,14 @@ def test_align_without_ekf2_imu_finds_frame_and_misalignment() -> None:
     assert clock_error_s(alignment) < 0.05
     assert "is rotated by 1" in alignment.misplaced[-1]
     assert "shifted" not in alignment.misplaced[-1]
-    # an EKF2 that stands still leaves it to the IMU
+    # with a constant EKF2 position the IMU is the reference
     still = replace(flight, ekf2=replace(flight.ekf2, state=flight.ekf2.state * 0.0))
     alignment, _ = align(still, uwb_file(flight), frame="enu")
     assert alignment.reference == IMU
     assert clock_error_s(alignment) < 0.05
 
 
-# -- what cannot be placed -------------------------------------------------------------------------
+# -- files without alignment -----------------------------------------------------------------------
 
 BOTH_SPANS = r"the log covers 2416\.25 s to 2536\.25 s of the boot clock, the file 1795253666\.45 s"
 
@@ -394,7 +394,7 @@ def test_align_without_ekf2_and_imu_needs_offset_and_frame() -> None:
 
 
 def test_align_no_overlap_long_or_short_file_is_refused(flight: Flight) -> None:
-    """By an offset without overlap, over days, of a few positions."""
+    """No overlap with the log, more than one day, or fewer than 10 positions."""
     file = uwb_file(flight)
     for offset in (0.0, OFFSET_S + 121.0, OFFSET_S - 121.0):
         with pytest.raises(MissingDataError, match="does not overlap the log ." + BOTH_SPANS):
@@ -471,7 +471,7 @@ def test_align_simulated_logs_recovers_clock_and_frame(shared_logs: Path, name: 
     for options in ({"frame": "ned"}, {"yaw_deg": "auto"}):
         alignment, track = align(flight, file, **options)
         assert alignment.frame == "ned"
-        # EKF2 itself lags by about 15 ms
+        # EKF2 lags by about 15 ms
         assert clock_error_s(alignment, true_s) < min(
             0.05, 3.0 * (alignment.clock_offset_sigma_s or 0.0)
         )

@@ -1,4 +1,4 @@
-"""The form: what is filled in is what is read, and nonsense is refused."""
+"""Answer form: values are read as filled in, and invalid forms are refused."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_quantities_depend_on_log_and_match_replay() -> None:
 
 
 def test_quantity_truth_source_gap_matches_closed_form() -> None:
-    """Against the closed form: P grows by F P Fᵀ + Q for each step of DT."""
+    """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(
         q for n in range(99) for q in draw_questions(f"{n:064x}") if q.kind == "silence"
@@ -114,7 +114,7 @@ def test_quantity_truth_source_gap_matches_closed_form() -> None:
                                     "velocity_variance_m2_s2"]]  # fmt: skip
     dt, n = settings.dt_s, round(quantity.extra / settings.dt_s)
     t = n * dt
-    # a step's acceleration moves the position by dt²/2 at once and by dt for each later step
+    # the acceleration of a step moves the position by dt²/2, and by dt² in each later step
     lags = dt * (np.arange(n) + 0.5)
     grown = settings.sigma_a_m_s2**2 * dt**2 * float((lags**2).sum())
     expected = np.sqrt(p0 + 2.0 * t * p1 + t**2 * p2 + grown)
@@ -125,7 +125,7 @@ def test_quantity_truth_source_gap_matches_closed_form() -> None:
 def test_compare_answers_option_adds_form_to_page_and_results(
     tmp_path: Path, sample_log: Path
 ) -> None:
-    """``answers`` writes it, ``compare`` reads it into page and results."""
+    """``answers`` writes the form, ``compare`` reads it."""
     form, report = tmp_path / "f.toml", tmp_path / "r.pdf"
     run_checked("answers", sample_log, "-o", form)
     assert "f.toml exists and was not overwritten" in error_line("answers", sample_log, "-o", form)

@@ -1,4 +1,4 @@
-"""Assignments: a flight for everyone, the roster they come from, and the answer key."""
+"""Assignments: one flight per student, the class list, and the answer key."""
 
 import hashlib
 import json
@@ -37,10 +37,10 @@ from px4fuse.simulation.mistakes import parse
 
 pytestmark = pytest.mark.usefixtures("quick_filter")
 SECRET = b"a secret for tests"
-# What the secret gives student s1: seed, noise and heading, and the mistakes
+# Flight of student s1 with SECRET: seed, noise and heading, and the mistakes
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
-# What names each mistake that is drawn
+# Finding that reports each mistake
 FINDINGS = {
     "clock-offset": "source_clock_offset", "clock-jump": "source_stamps_of_arrival",
     "yaw": "source_frame_turned", "nlos": "source_outliers", "dropout": "source_gap",
@@ -57,7 +57,7 @@ def choices_of(drawn):
 
 @pytest.fixture(autouse=True, scope="module")
 def cached_flights():
-    """Each flight is made once, but for the test that it is made the same again."""
+    """Simulate each flight once, except in the test of equal bytes."""
     made = {}
 
     def from_memory(*given):
@@ -81,13 +81,13 @@ class TestDraw:
     def test_same_secret_and_id_give_same_bytes(self):
         given = SECRET, CLASS[0], "aisle", 2, True
         assert fly(*given) == assignment.fly(*given)
-        # as a platform may spell it in another export
+        # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
     def test_draw_of_pinned_secret_is_unchanged(self):
         drawn = draw(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
-        # a loop does not tell where it landed
+        # a loop contains no ground truth, which would show the landing
         assert scenario.truth
         assert not draw(SECRET, "s1", "loop").scenario.truth
         assert not draw(SECRET, "s1", "aisle", truth=False).scenario.truth
@@ -144,7 +144,7 @@ class TestDraw:
         assert {name for name, positive in signs if not positive} == both
 
     def test_size_limits_are_smallest_detected_sizes(self):
-        """tests/studies/rates.csv: at the limit and beyond in 19 flights of 20, below in fewer."""
+        """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
         for choice in (choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind):
@@ -158,7 +158,7 @@ class TestDraw:
                 continue
             assert choice.limit == (max if choice.less_is_plainer else min)(found)
             assert found[choice.limit].flights >= 20
-            # and no larger one is missed
+            # each larger size is found, too
             larger = [s for s in sizes if (s < choice.limit) == choice.less_is_plainer]
             assert set(larger) <= {choice.limit, *found}
 
@@ -191,7 +191,7 @@ def test_fly_log_has_finding_of_each_mistake_in_key(tmp_path, kind, number, coun
 
 
 class TestAssign:
-    """Two mistakes each, so that the flights are the same everywhere and are made once."""
+    """All tests use flights with two mistakes, which are simulated once."""
 
     @pytest.fixture(autouse=True)
     def fixed_secret(self, monkeypatch):
@@ -227,7 +227,7 @@ class TestAssign:
         key, written = assign(CLASS, folder, key_file, None, "aisle", 2)
         assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
-        # the secret that was made up serves as one that is given
+        # the generated secret can be given later
         assign(CLASS, folder, key_file, key.secret.encode(), "aisle", 2)
         assert read_key(key_file).secret == key.secret
 
@@ -362,7 +362,7 @@ class TestCommand:
             for part in (answer.name, answer.scenario["kind"], *answer.mistakes):
                 assert part in line
             assert line.strip().endswith(f"{answer.difficulty:.2f}")
-        # the key's secret serves where none is given
+        # without a given secret that of the key is used
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = run_checked("simulate", *given).output
         assert "stored in the answers" in kept

@@ -1,8 +1,7 @@
-"""Reports as a clever student would forge or pad them: none earns more than the honest one.
+"""Forged or padded reports: none gets more points than the unchanged report.
 
-Every row of :data:`FILES` is one attack. Words that say nothing
-about the flight earn no more than no words; a file whose numbers nobody can compute again earns
-nothing that counts, and is never called verified.
+Each row of :data:`FILES` is one attack. Notes without content add no points. A report whose
+numbers cannot be recomputed has no points that count, and its status is never "verified".
 """
 
 from __future__ import annotations
@@ -69,7 +68,7 @@ time I would move the anchor at the end of the aisle and log the ranges themselv
 
 @dataclass(frozen=True)
 class Flight:
-    """A flight that was handed out, the honest report on it, and the answer key."""
+    """Assigned flight with an unchanged report and the answer key."""
 
     honest: VerifiedReport
     key: AnswerKey
@@ -84,7 +83,7 @@ class Flight:
         return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
 
     def with_notes(self, text: str, rubric: Rubric) -> GradedReport:
-        """As if the report had been made with these notes, which verifies."""
+        """Grade the report with other notes, as verified."""
         results = copy.deepcopy(self.honest.results)
         results["student"]["notes"] = text
         return self.graded(
@@ -94,7 +93,7 @@ class Flight:
 
 @pytest.fixture
 def _compare_pages_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
+    """Compare pages in this process; test_pages.py tests the separate one."""
     monkeypatch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
 
 
@@ -116,7 +115,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     notes.write_text(HONEST, encoding="utf-8")
     own = "--student", "Ada", "--id", "s01", "--notes", notes, "--answers", folder / "a.toml"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pdf_module, "render", blank_page)  # drawn below, from its results
+        patch.setattr(pdf_module, "render", blank_page)  # drawn below from the results
         run_checked("compare", log, "-o", pdf, *own)
     honest = make_verified_report(pdf.read_bytes(), log)
     (sha256,) = honest.files
@@ -169,7 +168,7 @@ def test_grade_notes_without_content_earn_no_points(
 
 
 def forge_position_file(results: dict[str, Any]) -> None:
-    """The attack that was paid best: numbers at will, and a file that nobody has."""
+    """Set numbers at will, and name a position file that is not available."""
     results["request"]["position"] = {"path": "uwb.csv"}
     results["provenance"]["command"] += " --position uwb.csv"
     for axis in results["axes"].values():
@@ -184,14 +183,14 @@ def forge_joined_file(results: dict[str, Any]) -> None:
     ]
 
 
-# Change of the attached results, what the report is then called, and what pending says
+# Change of the attached results, the status of the report, and the text of pending
 FILES: dict[str, tuple[Change, str, str]] = {
     "--position uwb.csv": (forge_position_file, "cannot verify", "Add uwb.csv to --logs."),
     "--position with a hash": (forge_joined_file, "cannot verify", "Add uwb.csv to --logs."),
-    "--mavlink that nobody has": (
+    "--mavlink file not available": (
         set_value("a.tlog", "request", "mavlink"), "cannot verify", "Add a.tlog to --logs.",
     ),
-    "command for people alone": (
+    "changed printed command": (
         set_value("px4fuse compare s01.ulg --position uwb.csv", "provenance", "command"),
         "numbers differ", "",
     ),
@@ -203,21 +202,21 @@ FILES: dict[str, tuple[Change, str, str]] = {
         set_value("9.9", "schema", "version"), "cannot verify",
         "use the px4fuse version that wrote it",
     ),
-    "libraries left out": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
+    "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
     "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
-    "the log of another": (set_value("b" * 64, "log", "sha256"), "other log", "given to s02"),
-    "a better NIS": (
+    "log of another student": (set_value("b" * 64, "log", "sha256"), "other log", "given to s02"),
+    "better NIS": (
         set_value(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", "",
     ),
-    "no finding": (set_value([], "findings"), "numbers differ", ""),
+    "findings removed": (set_value([], "findings"), "numbers differ", ""),
     "other settings": (set_value(0.3, "request", "sigma_a_m_s2"), "numbers differ", ""),
     "another part of the flight": (set_value(20.0, "request", "start_s"), "numbers differ", ""),
-    "settings that no run can have": (
+    "setting out of range": (
         set_value(1e9, "request", "sigma_a_m_s2"), "cannot verify", "Ask how",
     ),
-    "a path": (set_value("../../etc/passwd", "request", "log"), "cannot verify", "Ask how"),
-    "the folder above": (set_value("..", "request", "log"), "cannot verify", "Ask how"),
-    "a step that fails": (set_value(1e-9, "request", "dt_s"), "cannot verify", "Ask how"),
+    "path as log": (set_value("../../etc/passwd", "request", "log"), "cannot verify", "Ask how"),
+    "log is parent folder": (set_value("..", "request", "log"), "cannot verify", "Ask how"),
+    "DT too small": (set_value(1e-9, "request", "dt_s"), "cannot verify", "Ask how"),
     "ten thousand lines of notes": (
         set_value("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
     ),
@@ -232,11 +231,11 @@ def test_grade_forged_results_are_not_verified(
     flight: Flight, honest: GradedReport, rubric: Rubric, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, status, pending = FILES[name]
-    if status == "numbers differ":  # whatever the pages look like
+    if status == "numbers differ":  # numbers decide, not pages
         monkeypatch.setattr(pdf_module, "render", blank_page)
     results = copy.deepcopy(flight.honest.results)
     change(results)
-    # only where numbers agree are pages compared
+    # pages are compared only if the numbers agree
     text = json.dumps(results)
     pdf = (
         flight.honest.with_results(results) if status == "page differs" else blank_page(None, text)
@@ -259,7 +258,7 @@ def test_grade_forged_results_are_not_verified(
 def test_grade_painted_page_is_scored_from_redrawn_report(
     flight: Flight, honest: GradedReport, rubric: Rubric
 ) -> None:
-    """The numbers are verified, the page is not, and what is scored is the redrawn report."""
+    """The numbers are verified and the page is not; the redrawn report is scored."""
     painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
     pdf = forged(flight.honest.pdf, painted)
     verdict = flight.honest.verified(pdf)
@@ -285,7 +284,7 @@ NO_END: dict[str, Any] = {
 
 
 def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> GradedReport:
-    """Points of the item on the loop."""
+    """Grade the item on the loop."""
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
     results = decode_results(changed_results(LOOP, student__id="s01", **values))
@@ -297,7 +296,7 @@ def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Gra
 
 
 LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}
-# Truth of the answer key, options, what the loop then has, the points of 40, and flags
+# Truth of the answer key, options, fields of the loop, points of 40, number of flags
 LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
     "closed": (CLOSED, {}, {}, 40, 0),
     "closed, without a key": (None, {}, {}, 40, 0),

@@ -1,4 +1,4 @@
-"""The class page in a real browser, and what it may not do with what students wrote."""
+"""Class page in a browser; text of students is never interpreted as HTML or script."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ OF_ENTRY = ("handed_in_at", "late_s", "deduction", "overrides", "comment", "tota
 
 
 def row(name: str, points: float | None, **more: Any) -> Entry:
-    """A student with one report; what Entry has goes there, the rest to the report."""
+    """Make the entry of a student with one report; other arguments are for the report."""
     own = {key: more.pop(key) for key in OF_ENTRY if key in more}
     one = graded(name, points, **more)
     own["handed_in"] = own.pop("handed_in_at", "")
@@ -145,10 +145,10 @@ def test_class_page_pending_points_are_not_averaged() -> None:
     entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0), row("Cy", 12.0, pending="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
     text = html_text(entries, "Class", "px4fuse 1")
-    assert "2 min late" in text  # a minute is not nothing
-    assert "14.3 <small>of 20" in text  # of 10, 20 and 13
+    assert "2 min late" in text  # 61 s are rounded up
+    assert "14.3 <small>of 20" in text  # mean of 10, 20 and 13
     assert "1 <small>12 points, not counted" in text
-    # of 16 points for notes those that count had 6, 16 and 9
+    # mean of 6, 16 and 9 of 16 points for notes
     assert "10.3&nbsp;/&nbsp;16" in text
     cells = [row[0][3] for row in content(text)["rows"]]
     assert cells[2:] == [["pending", "", "12 proposed"],
@@ -207,7 +207,7 @@ def test_class_page_anonymous_contains_no_names() -> None:
     points = [part[3] for part in parts if part[1] == "Points (proposed)"]
     assert {tuple(row) for rows in points for row in rows} == {("Settings", "9", "20", "")}
     assert ["list", "Mistakes of this flight", ["positions that jump: not named"], False] in parts
-    # nothing of a text, no link to a PDF, no boxes for what has no owner
+    # no text of students, no link to a PDF, no input boxes without an owner
     assert not {"boxes", "prose", "links"} & {part[0] for part in parts}
     for there in ("Lovelace", ".pdf", "data:image/png"):
         assert there not in written
@@ -233,7 +233,7 @@ def test_class_page_filters_by_text_and_status(page: Browser) -> None:
     assert page.ask(count) == f"Showing {len(CLASS)} of {len(CLASS)}"
     page.click("#text")
     page.write("zoe")
-    # Her own row, and the one whose flag names her
+    # the row of Zoë, and one with a flag that contains the name
     assert page.names() == ["Zoë", "ada"]
     assert page.ask(count) == f"Showing 2 of {len(CLASS)}"
     page.write(" nobody")
@@ -259,7 +259,7 @@ def test_class_page_row_opens_report_details(page: Browser) -> None:
     assert page.ask("document.querySelector('.unfold').ariaExpanded") == "true"
     assert "There." in page.ask("document.querySelector('.more').innerText")
     assert page.ask("document.querySelector('.beside a').href").endswith("/reports/1007.pdf")
-    # It moves with its row, and hides with it
+    # details are sorted and filtered with their row
     page.click(f".list > thead th:nth-child({HEADS.index('Points') + 1}) button")
     before = "document.querySelector('.more').previousElementSibling.querySelector('.name')"
     assert page.ask(f"{before}.textContent") == "Zoë"
@@ -277,7 +277,7 @@ def test_class_page_keys_step_through_reports(page: Browser) -> None:
         assert page.ask(opened) == [name]
     assert page.ask("document.activeElement.textContent") == "Zoë"
     page.press("Escape")
-    # what is typed into the search is text
+    # in the search field keys are text
     page.press("/", "/")
     page.press("j", "j")
     assert page.ask("document.activeElement.id + document.activeElement.value") == "textj"
@@ -344,7 +344,7 @@ def test_class_page_print_repeats_table_header(browser: Browser, tmp_path: Path)
     assert len(listed) > 1
     assert all("Points" in text for text in listed)
     assert not any("Find" in text for text in pages)
-    # all of them, not those on screen
+    # rows outside the screen are printed, too
     assert "Student 129" in "".join(pages)
 
 
@@ -359,11 +359,11 @@ def test_class_page_points_and_comments_download_as_csv(page: Browser) -> None:
         " words.dispatchEvent(new Event('input')); })()"
     )
     leave = "window.dispatchEvent(new Event('beforeunload', { cancelable: true }))"
-    assert not page.ask(leave)  # the browser asks whether to leave what is not saved
+    assert not page.ask(leave)  # the browser warns of unsaved changes
     page.click("#save")
     made = str(page.ask_later("window.table"))
     rows = list(csv.reader(io.StringIO(made.removeprefix("\ufeff"))))
     assert page.ask(leave)
     assert rows[0] == ["id", "item", "points", "comment"]
     assert ["1007", "total", "7.5", '\'=1+1, "well"'] in rows
-    assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # what was said before stays
+    assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # earlier comments are kept

@@ -1,4 +1,4 @@
-"""The class as CSV, opened by programs that execute what looks like a formula."""
+"""Class table as CSV: no cell is executed as a formula by a spreadsheet program."""
 
 from __future__ import annotations
 
@@ -147,4 +147,6 @@ def test_csv_text_lists_late_pending_and_missing() -> None:
         ["-17", "missing", "", "", "", "", "", "", ""],
     ]
     assert len(cells(csv_text([]))) == 1
-    assert len(neutralise_formulas("=" * 10**6)) <= MAX_CHARACTERS + 1  # what a cell of Excel takes
+    assert (
+        len(neutralise_formulas("=" * 10**6)) <= MAX_CHARACTERS + 1
+    )  # maximum length of a cell in Excel

@@ -1,4 +1,4 @@
-"""Loop closure by distance against closed forms and the lesson's own code."""
+"""Loop closure by distance against closed forms and the code of the lesson."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""Moments over all lags, against sums written out."""
+"""Moments over all lags, against explicit sums."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""One row per student: which attempt counts, what being late costs, what the instructor says."""
+"""One entry per student: counting attempt, deduction if late, overrides by the instructor."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", 
 
 
 def make_entries(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
-    """Entries by id, of reports by the names of their files."""
+    """Make the entries of reports, given by file name."""
     reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
     zipped, times = Path("x.zip"), packed or {}
     found = [Submission(zipped, name, name, times.get(name), origin_of(name)) for name in files]
@@ -68,7 +68,7 @@ def test_class_entries_late_report_has_deduction() -> None:
     (ada, _), _ = make_entries(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
     assert ada.handed_in == "2026-11-22 10:00"
-    # of the best, the loss for being late is part
+    # the best attempt is the one after deduction
     files = {blackboard("ada", "20-11-00-00"): graded_report("", 6.0),
              blackboard("ada", "22-10-00-00"): graded_report("", 7.0)}  # fmt: skip
     (ada, _), _ = make_entries(files, replace(term, attempt="best"))
@@ -78,8 +78,8 @@ def test_class_entries_late_report_has_deduction() -> None:
 @pytest.mark.parametrize(
     ("due", "rule", "late_s", "off"),
     [
-        (DUE, "100%/day", 46 * 3600.0, 10.0),  # nobody has less than nothing
-        # in the night to 25 October Berlin has the hour from 2 to 3 twice
+        (DUE, "100%/day", 46 * 3600.0, 10.0),  # points are never negative
+        # end of summer time: on 25 October the hour from 2 to 3 occurs twice
         (due_time("2026-10-24 23:00:00 Europe/Berlin"), "1%/hour", 683 * 3600.0 + 3600.0, 10.0),
     ],
 )
@@ -97,7 +97,7 @@ def test_class_entries_zip_time_orders_without_deduction() -> None:
     (_, grace), _ = make_entries(files, term, packed=packed)
     assert (grace.total, grace.late_s, grace.handed_in) == (7.0, None, "")
     assert "no points" in grace.flags[0]
-    # nor does a mark without a time
+    # a late mark without a time has no deduction either
     (_, grace), _ = make_entries({"hoppergrace_LATE_7_8_r.pdf": graded_report("", 7.0)}, term)
     assert (grace.late_s, grace.total) == (None, 7.0)
     assert "Canvas marks the file as late" in grace.flags[0]
@@ -122,20 +122,20 @@ def of_form(points: float, kind: str, **more):
 
 
 def test_class_entries_differing_forms_are_pending() -> None:
-    """None of those that came together counts until the instructor says which is meant."""
+    """Of files submitted together, none counts until the instructor selects one."""
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
     (ada, _), _ = make_entries(files)
     assert ada.total is None
     assert ada.counting.pending == "Ask which of 2 reports counts: their forms differ."
     assert len(ada.others) == 1
     assert make_entries(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
-    # the same form twice is no guess
+    # equal forms are not pending
     (ada, _), _ = make_entries({name: of_form(4.0, "yaw") for name in files})
     assert ada.total == 4.0
 
 
 def test_class_entries_pending_report_keeps_counting_report() -> None:
-    """As another's report under this student's id, handed in later."""
+    """For example a later report of another student with this student's id."""
     files = {"a.pdf": of_form(9.0, "yaw"), "z.pdf": of_form(2.0, "nlos", pending="Ask whose.")}
     packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
     for times in (None, packed):
@@ -143,7 +143,9 @@ def test_class_entries_pending_report_keeps_counting_report() -> None:
         assert ada.total == 9.0
         assert [one.submission for one in ada.others] == ["z.pdf"]
         assert ada.flags == ("z.pdf is pending, so another file counts.",)
-    waiting = replace(files["a.pdf"].items[0], awaits_points=True)  # for the points of the text
+    waiting = replace(
+        files["a.pdf"].items[0], awaits_points=True
+    )  # waits for the points of the notes
     files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
     (ada, _), _ = make_entries(files)
     assert ada.counting.submission == "a.pdf"
@@ -248,7 +250,7 @@ def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
         (("1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,"), (15.0, 3.0), (
             "1 has two rows for 'A'", "01 has two rows for 'total'",
         )),
-    ], ids=["more points than there are", "a second row on the same"],
+    ], ids=["points above the maximum", "duplicate row"],
 )  # fmt: skip
 def test_overrides_excess_or_duplicate_row_is_noted(rows, points, told, tmp_path) -> None:
     (ada, _), notes = make_entries(TWO, overrides=write_overrides(tmp_path, *rows))
@@ -257,7 +259,7 @@ def test_overrides_excess_or_duplicate_row_is_noted(rows, points, told, tmp_path
 
 
 def test_overrides_class_page_download_is_complete(tmp_path) -> None:
-    """Also of who handed in nothing: the download replaces the file."""
+    """Includes students without a submission, because the download replaces the file."""
     rows = write_overrides(
         tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."
     )
@@ -324,7 +326,7 @@ BERLIN = "2026-11-20T23:59:59+01:00"
         ("2026-11-20 23:59 Europe/Berlin", BERLIN),
         ("2026-11-20 22:59:59 +0000", BERLIN),
         ("2026-11-20T22:59Z", BERLIN),
-        ("2026-07-20 23:59 Europe/Berlin", "2026-07-20T23:59:59+02:00"),  # summer
+        ("2026-07-20 23:59 Europe/Berlin", "2026-07-20T23:59:59+02:00"),  # summer time
         ("2026-11-20 Europe/Berlin", BERLIN),
     ],
 )
@@ -357,7 +359,7 @@ def test_due_time_and_late_rule_invalid_text_is_one_line(read, said, texts) -> N
 def test_late_rule_counts_started_days_up_to_limit() -> None:
     for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
         assert late_rule("10%/day").deduction(late_s, 120.0) == off
-    # a rule may name its limit and hours
+    # a rule may state a limit, and hours
     assert late_rule("1 % / hour up to 5%").deduction(3600.0 * 3.5, 100.0) == 4.0
     assert late_rule("1%/hour up to 5%").deduction(1e6, 100.0) == 5.0
 

@@ -1,4 +1,4 @@
-"""ATE, RPE, alignment and clocks: against evo, closed forms and what was put in."""
+"""ATE, RPE, alignment and clocks against evo, closed forms and simulated values."""
 
 import copy
 from functools import cache
@@ -96,7 +96,7 @@ def test_rpe_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
         got = evaluate(*map(read_public, pair), alignment=kind, association="nearest", **how)
         for ours in got.rpe:
             if kind != "se3" and ours.unit == "frames":
-                continue  # scale and turn do not change these pairs; evo takes its time
+                continue  # scale and rotation do not change these pairs, and evo is slow
             unit = Unit.frames if ours.unit == "frames" else Unit.meters
             metric = RPE(
                 PoseRelation.translation_part, ours.delta, unit, all_pairs=all_pairs,
@@ -190,14 +190,14 @@ def test_associate_interpolates_uniform_motion_not_gaps() -> None:
     assert got.max_gap_s == pytest.approx(0.15)
     assert (got.poses, got.in_gaps, got.outside) == (300, 100, 0)
     assert associate(whole, torn, max_gap_s=6.0)[2].poses == 400
-    *_, lost = associate(torn, whole)  # the other way round: its time is not covered
+    *_, lost = associate(torn, whole)  # exchanged: the reference is not covered
     assert lost.coverage_estimate == 1.0
     assert lost.coverage_reference == pytest.approx(0.75, abs=0.01)
 
 
 @pytest.mark.parametrize("denser", [False, True], ids=["estimate sparser", "estimate denser"])
 def test_associate_nearest_equals_exhaustive_search(denser: bool) -> None:
-    """Every pair by trying all, with poses before, after and in a gap of the reference."""
+    """Poses before, after and in a gap of the reference."""
     reference = flight(20.0, 10.0)
     reference = reference[(reference.time_s < 8.0) | (reference.time_s > 12.0)]
     rate_hz = 33.0 if denser else 4.0
@@ -296,7 +296,7 @@ def test_pairs_equal_their_definition(steps: list[float], value: float) -> None:
 
 
 def test_relative_error_pairs_follow_reference_distance() -> None:
-    """Also where the estimate's path is twice as long."""
+    """Also if the path of the estimate is twice as long."""
     reference = flight(30.0)
     double = transformed(reference, TURN, SHIFT, 2.0, kind="vio")
     same, other = (relative_error(one, reference, Delta(1.0, "m")) for one in (reference, double))
@@ -320,7 +320,7 @@ def test_evaluate_missing_orientation_or_pairs_give_reason() -> None:
             evaluate(reference, reference, rpe_deltas=[delta])
 
 
-# -- which alignment, and doubts -------------------------------------------------------------------
+# -- choice of alignment, warnings -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("estimate", "reference", "name", "scale", "expected", "why"), [
@@ -379,7 +379,7 @@ def test_evaluate_doubtful_arguments_give_warnings() -> None:
     slam = replace(vio, kind="slam", name="slam")
     large = transformed(truth, TURN, SHIFT, 1.5, kind="vio")
     assert not evaluate(vio, truth).warnings
-    # clocks that fit better apart; less may be the filter's own lag
+    # an offset below 0.1 s may be the lag of the filter
     lag, late = (replace(slam, time_s=slam.time_s - offset_s) for offset_s in (0.08, 0.12))
     flown = replace(truth, name="log:truth")
     assert not evaluate(lag, flown).warnings
@@ -464,7 +464,7 @@ def test_time_offset_periodic_motion_is_undetermined() -> None:
     one = flight(20.0)
     lap = np.tile(np.arange(len(one)), 4)
     time = np.arange(len(lap)) * 0.05
-    # laps that close: the same 20 s four times, out and back
+    # four equal laps of 20 s
     closed = one.position_m * np.sin(np.pi * one.time_s / 20.0)[:, None] ** 2
     laps = Trajectory("laps", "vio", time, closed[lap], None)
     got = estimate_time_offset(replace(laps[:800], unix_offset_s=None), laps)
@@ -477,7 +477,7 @@ def test_time_offset_periodic_motion_is_undetermined() -> None:
 def test_time_offset_shifted_public_data_is_recovered(pair: tuple[str, str]) -> None:
     estimate, reference = map(read_public, pair)
     base = estimate_time_offset(estimate, reference).offset_s
-    assert abs(base) < 0.06  # their own clocks are not perfect
+    assert abs(base) < 0.06  # the published clocks have small offsets
     for shift_s in (0.137, 30.0, 12.5 - estimate.time_s[0]):
         shifted = replace(estimate, time_s=estimate.time_s + shift_s, unix_offset_s=None)
         got = estimate_time_offset(shifted, reference)

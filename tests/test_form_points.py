@@ -1,4 +1,4 @@
-"""Points for forms: against those given by hand, and what a guess is worth."""
+"""Points of answer forms, compared with points given by hand; points of guesses."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ CLEAN = FormTruth(
 
 
 def with_claim(**values: Any) -> Answers:
-    """The right form with another first claim."""
+    """Return the correct form with another first mistake."""
     first, second = RIGHT.mistakes
     return replace(RIGHT, mistakes=(replace(first, **values), second))
 
 
 def with_false(*kinds: str) -> Answers:
-    """The right form with more claims."""
+    """Return the correct form with additional mistakes."""
     return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(ClaimedMistake, kinds)))
 
 
@@ -97,9 +97,9 @@ FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
 DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
 GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
 NO_MISTAKES = {"kinds": 0.0, "sizes": 0.0, "when": 0.0, "cure": 0.0}
-# A form, and the parts of which it does not get all points
+# A form, and its parts with reduced points
 HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
-    # wrong sign: a third of its size and of its cure
+    # wrong sign: a third of the points for size and cure of this mistake
     (with_claim(size=-190.0, value=0.2), {"sizes": 10.0, "cure": 10.0}),
     (with_claim(size=140.0), {"sizes": 11.25}),
     (with_claim(size=900.0, value=-0.9), {"sizes": 7.5, "cure": 11.25}),
@@ -107,9 +107,9 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     (with_claim(when=""), {"when": 7.5}),
     (with_claim(**DELAY), {}),
     (with_claim(**GATE), {"cure": 7.5}),
-    # a neighbour earns 0.4 of the kind, a third of the size, half of when
+    # similar mistake: 0.4 of the kind, a third of the size, half of the time
     (with_claim(kind="ekf2-delay"), {"kinds": 21.0, "sizes": 10.0, "when": 7.5}),
-    # each false claim costs ten; three take all
+    # each wrong mistake costs 10 points
     (with_false("yaw"), {"kinds": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
     (replace(RIGHT, mistakes=(ClaimedMistake("none"),)), NO_MISTAKES),
@@ -151,9 +151,9 @@ def test_form_points_open_end_cure_counts_only_with_size() -> None:
 
 
 def test_form_points_constant_form_on_loops_is_low() -> None:
-    """Of 300 that are drawn, with the closure errors and verdicts that they have.
+    """300 drawn loops with their closure errors and verdicts.
 
-    No update lies outside a gate on most of them: an empty list shows nothing.
+    Most have no update outside the gate, so an empty list is not counted as an answer.
     """
     rng = np.random.default_rng(7)
     truths = []
@@ -171,7 +171,7 @@ def test_form_points_constant_form_on_loops_is_low() -> None:
 
 
 def test_form_truth_open_end_size_includes_odometry_drift() -> None:
-    """The drift in it is nothing that a student could know of."""
+    """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
     assert wrong.size is not None
@@ -184,7 +184,7 @@ def test_form_truth_open_end_size_includes_odometry_drift() -> None:
 
 
 def simulation_of(typed: str) -> flights.Simulation:
-    """The flight that a px4fuse simulate line makes."""
+    """Simulate the flight of a px4fuse simulate command."""
     given = simulate.make_context("simulate", shlex.split(typed)[2:]).params
     names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
     chosen = {name: given[name] for name in names if given.get(name) is not None}
@@ -193,7 +193,7 @@ def simulation_of(typed: str) -> flights.Simulation:
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
-    form = update_values(form)  # the forms were filled in before schema 4
+    form = update_values(form)  # the forms use the values before schema 4
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]
@@ -215,7 +215,7 @@ def answers_of(form: dict[str, Any]) -> Answers:
 
 
 def distance(value: Any) -> Any:
-    """Forward and right as one number."""
+    """Convert forward and right to a distance."""
     if isinstance(value, str):
         value = [float(part) for part in value.split(",")]
     return float(np.linalg.norm(value)) if isinstance(value, list) else value
@@ -245,7 +245,7 @@ def test_form_points_agree_with_points_given_by_hand(shared_logs: Path) -> None:
 
 
 def test_form_points_random_forms_are_at_most_20_percent() -> None:
-    """Of 500 forms filled in at random, on flights with two mistakes, one and none."""
+    """500 random forms on flights with two mistakes, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
     earned = [form_points(at_random(rng), truths[n % 3]).share for n in range(500)]

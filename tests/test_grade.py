@@ -1,4 +1,4 @@
-"""A class graded: outputs, resuming, and hostile files among the others."""
+"""Grading of a class: outputs, repeated runs, and malicious files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def jobs_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def submitted(tmp_path: Path) -> Path:
-    """A folder as a learning platform exports it: one report, and what goes wrong."""
+    """Export folder of a learning platform: a report twice, and invalid files."""
     folder = tmp_path / "handed in"
     for name in ("Lovelace Ada_1_assignsubmission_file_", "Hopper Grace_2_assignsubmission_file_"):
         (folder / name).mkdir(parents=True)
@@ -79,13 +79,13 @@ def test_grade_table_lists_every_submitted_file(submitted, tmp_path) -> None:
     assert not any(row["file"].startswith(("=", "+", "-", "@")) for row in table)
     page = (output / "class.html").read_text(encoding="utf-8")
     assert "<img src=x" not in page
-    assert "<title>Lab: fusion and loop closure</title>" in page  # the rubric's
+    assert "<title>Lab: fusion and loop closure</title>" in page  # title of the rubric
     assert len(list((output / "feedback").glob("*.txt"))) == 6
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
 def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> None:
-    """As where they take more time or memory than there is for them."""
+    """The comparison of pages exceeds its time limit."""
     folder = tmp_path / "in"
     folder.mkdir()
     (folder / "a.pdf").write_bytes(
@@ -121,20 +121,20 @@ def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     assert second.verdict.status == "numbers differ"
     assert second.points == 0.0
     assert any("nis_mean" in difference.path for difference in second.verdict.differences)
-    # what is read is drawn again from the log, for both
+    # each report is redrawn from the log
     redrawn = [path.read_bytes() for path in (output / "reports").glob("*.pdf")]
     assert len(redrawn) == 3
     assert len(set(redrawn)) == 1
     assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 8
     page = (output / "class.html").read_text(encoding="utf-8")
     assert all(f"reports/{name}.pdf" in page for name in ("a", "b", "c"))
-    # a page away is a flag, and costs nothing
+    # a missing page is flagged and costs no points
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
     assert any("Page 8: missing." in flag for flag in third.flags)
     assert first.flags == ()
-    # a second run does nothing again, and says the same
+    # a second run reuses all results
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
     assert again.reused == 3
     assert again.graded == outcome.graded
@@ -152,10 +152,10 @@ def test_grade_again_processes_changed_files_only(submitted, tmp_path) -> None:
             processes=2,
         ).reused
 
-    assert reused() == 2  # of one report there are three copies
-    assert reused("Lab 4") == 3  # what is no report is read again
+    assert reused() == 2  # there are three copies of one report
+    assert reused("Lab 4") == 3  # other files are read again
     assert b"<title>Lab 4</title>" in (output / "class.html").read_bytes()
-    # what is known is known by its content, under any name
+    # cached results are found by content, not by name
     (submitted / "essay.pdf").write_bytes(REPORT.read_bytes())
     assert reused() == 4
     (submitted / "essay.pdf").write_bytes(b"%PDF-1.7\nanother one")
@@ -178,7 +178,7 @@ def test_grade_with_other_logs_verifies_again(tmp_path) -> None:
             [tmp_path / "in"], Course(read_rubric(None), logs=logs), tmp_path / "out", processes=1
         )
         said.append((outcome.graded[0].verdict.status, outcome.reused))
-        # the redrawn report, and nothing of the run before
+        # only the redrawn report of this run
         assert len([*(tmp_path / "out" / "records").glob("*.p*")]) == len(logs)
     assert said == [
         ("cannot verify", 0), ("verified", 0), ("verified", 1), ("cannot verify", 0)
@@ -205,7 +205,7 @@ def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
 
 @pytest.mark.usefixtures("jobs_in_process")
 def test_grade_command_shortens_names_and_can_be_continued(tmp_path, monkeypatch) -> None:
-    """Names on one line each, and of an interrupted run that it can go on."""
+    """Each name is one line; an interrupted run prints how to continue."""
     import px4fuse.grading.grade as module
 
     one = GradedReport("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)

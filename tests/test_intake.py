@@ -1,4 +1,4 @@
-"""Hostile input: whatever is handed in is a report or one sentence, in bounded memory."""
+"""Malicious PDFs: each is read as a report or rejected with one sentence, in bounded memory."""
 
 import io
 import json
@@ -35,7 +35,7 @@ DAMAGED = "the PDF is damaged"
 def small_report(
     attached: bytes | None = JSON, edit=lambda writer: None, name="results.json"
 ) -> bytes:
-    """A PDF of one page with results attached, changed by ``edit``."""
+    """Make a PDF of one page with attached results, changed by ``edit``."""
     writer = PdfWriter()
     writer.add_blank_page(100, 100)
     if attached is not None:
@@ -45,7 +45,7 @@ def small_report(
 
 
 def raw_pdf(*objects: bytes, trailer: bytes = b"/Root 1 0 R") -> bytes:
-    """A PDF of objects as they stand, numbered from 1."""
+    """Make a PDF of raw objects, numbered from 1."""
     out, places = bytearray(b"%PDF-1.4\n"), []
     for number, content in enumerate(objects, start=1):
         places.append(len(out))
@@ -153,7 +153,7 @@ def test_read_report_encrypted_is_rejected(algorithm):
             edit=lambda writer, p=password: writer.encrypt(p, algorithm=algorithm)
         )
         assert "encrypted" in reason(encrypted)
-    for key in (b"/Encrypt", b"/#45ncrypt"):  # the second is damaged: nobody would write it so
+    for key in (b"/Encrypt", b"/#45ncrypt"):  # the second one is a damaged key
         trailer = b"/Root 1 0 R %b << /Filter /X >>" % key
         said = reason(raw_pdf(CATALOG, PAGES, PAGE, stream(b""), trailer=trailer))
         assert "encrypted" in said or DAMAGED in said
@@ -170,7 +170,7 @@ def test_read_report_too_many_pages_are_rejected(count):
     assert reason(pdf_bytes(writer))
 
 
-# ------------------------------------------------------------------ what acts
+# ------------------------------------------------------------------ actions
 
 
 def on_root(key: str, value: object):
@@ -193,7 +193,7 @@ OPENS = dictionary(S=NameObject("/URI"), URI=TextStringObject("http://x"))
 
 
 def link_and_page_action(writer: PdfWriter) -> None:
-    """One action, of a link and of a page that is opened."""
+    """Use one action for a link and for opening a page."""
     opens = writer._add_object(OPENS)
     annotation(Subtype=NameObject("/Link"), A=opens)(writer)
     turned = dictionary(O=opens)
@@ -237,7 +237,7 @@ def test_read_report_with_action_is_rejected(edit, said):
     annotation(Subtype=NameObject("/FreeText")),
 ], ids=range(5))  # fmt: skip
 def test_read_report_harmless_additions_are_ignored(edit):
-    """Nothing of it is followed, and the pages are drawn again."""
+    """Other programs add these entries when they save a report."""
     report = read_report(small_report(edit=edit), "r.pdf")
     assert to_json(report).encode() == JSON
 
@@ -246,7 +246,7 @@ def test_read_report_harmless_additions_are_ignored(edit):
 
 
 def bomb(size: int, entries: bytes = b"/Type /EmbeddedFile ") -> bytes:
-    """Zeros, of which a million is packed once: to pack a gigabyte takes seconds."""
+    """Make a compressed stream of zeros by repeating one compressed megabyte."""
     count = size // 1_000_000
     squeeze = zlib.compressobj(9, wbits=-zlib.MAX_WBITS)
     million = squeeze.compress(bytes(1_000_000)) + squeeze.flush(zlib.Z_FULL_FLUSH)
@@ -260,7 +260,7 @@ def content_bomb(size: int) -> bytes:
 
 
 def stream_bomb(kind: bytes) -> bytes:
-    """A bomb in a stream that pypdf inflates before anybody asks."""
+    """Make a bomb in a stream that pypdf decompresses when it opens the file."""
     body = b"%PDF-1.5\n1 0 obj\n" + bomb(
         1_000_000_000, b"/Type /%b /Size 9 /W [1 2 1] /N 9 /First 9 /Root 2 0 R " % kind
     )
@@ -297,7 +297,7 @@ def test_read_report_other_compression_is_rejected(filters):
 
 
 def test_read_report_many_stream_keywords_are_rejected():
-    # each try inflates what follows; all of them pay from one purse
+    # each keyword starts a decompression; all share one limit
     stored = b"".join(b"stream\x78\x01\x00" + b"\x00\x00\xff\xff\x00" * 3 for _ in range(200_000))
     assert reason(b"%PDF-1.4\n" + stored + b"%%EOF")
 
@@ -323,7 +323,7 @@ def test_read_report_broken_structure_is_rejected(pdf):
 
 
 def test_read_report_invalid_object_stream_is_rejected():
-    """An object stream that holds itself, or what it does not say."""
+    """Object streams that contain themselves or have wrong offsets."""
     for offsets in (b"1 0 2 9 ", b"5 0 5 3 ", b"1 99 ", b"x y "):
         packed = stream(offsets + CATALOG + PAGES, b"/Type /ObjStm /N 2 /First 8")
         body = b"%PDF-1.5\n5 0 obj\n" + packed + b"\nendobj\n"
@@ -359,11 +359,11 @@ def test_read_report_removes_control_characters():
     assert report.student == Student("Zoë evil 李[31m", "=1+1", "a\n\tb")
 
 
-# ------------------------------------------------------------------ anything at all
+# ------------------------------------------------------------------ other types
 
 
 def test_read_report_unexpected_types_are_read_or_rejected():
-    """Values of a kind that no reader expects, at every key that intake looks at."""
+    """Values of unexpected types at each key that read_report uses."""
     odd = [NumberObject(7), TEXT, ArrayObject(), dictionary(), DecodedStreamObject()]
     for key in ("/Names", "/Pages", "/Outlines", "/Metadata", "/S", "/Filter", "/EF", "/Annots"):
         for value in odd:

@@ -1,4 +1,4 @@
-"""Two recordings of one flight become one; recordings of two flights do not."""
+"""Joining of two recordings of one flight; recordings of two flights are refused."""
 
 import numpy as np
 import pandas as pd
@@ -23,7 +23,7 @@ def tlog_flight(sample_log) -> Flight:
 
 @pytest.fixture(scope="module")
 def stripped(sample_log, tmp_path_factory) -> Flight:
-    """The sample ULog as SDLOG_PROFILE 1 on v1.15 would have left it: no position topics."""
+    """Sample ULog without position topics, as with SDLOG_PROFILE 1 on v1.15."""
     log = load(sample_log)
     log.drop(*(name for name in log.names() if name.startswith(POSITION_TOPICS)))
     path = tmp_path_factory.mktemp("stripped") / "stripped.ulg"
@@ -84,7 +84,7 @@ def test_join_in_either_order_gives_equal_boot_times(sample_flight, tlog_flight)
     for name in ("vehicle_visual_odometry", "VISION_POSITION_ESTIMATE"):
         first, second = track_of(one, name).samples, track_of(other, name).samples
         np.testing.assert_allclose(boot(one, first), boot(other, second), atol=1e-6)
-    # MAVLink does not carry innovations, and only a lacking estimator is replaced
+    # MAVLink contains no innovations, and an existing EKF2 is not replaced
     assert isinstance(other.ekf2.innovations["north"], Unavailable)
 
 
@@ -92,7 +92,7 @@ def test_join_in_either_order_gives_equal_boot_times(sample_flight, tlog_flight)
 
 
 def test_join_missing_parts_are_copied_with_time_shift(record):
-    """The other recording began five seconds later."""
+    """The second recording starts 5 s later."""
     left_out = "HIGHRES_IMU", "ATTITUDE_QUATERNION", "EXTENDED_SYS_STATE", "ODOMETRY"
     bare = record(Aisle(uwb=None), "bare.tlog", *left_out)
     assert bare.log.duration_s == 0.0 or isinstance(bare.imu, Unavailable)
@@ -122,7 +122,7 @@ def test_shift_times_moves_times_inside_records(sample_flight):
 
 
 def test_join_missing_lists_remaining_parts_only(record):
-    """An estimator that was taken brings what it lacks with it."""
+    """Parts that the copied EKF2 lacks are listed."""
     bare = record(Aisle(uwb=None), "bare.tlog", "ODOMETRY", "HIGHRES_IMU")
     full = record(Aisle(), "full.tlog")
     assert {"EKF2", "IMU"} <= {part.what for part in bare.missing}

@@ -1,4 +1,4 @@
-"""Rigid motions and their tangents, against closed forms, differences and series."""
+"""SE(2) and SE(3) operations against matrix exponentials and finite differences."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def tangents(dimension: int, angle: float, count: int = 20) -> np.ndarray:
 
 
 def generator(tangent: np.ndarray) -> np.ndarray:
-    """Matrix whose exponential is the pose's homogeneous matrix."""
+    """Return the matrix whose exponential is the homogeneous matrix of the pose."""
     if len(tangent) == 3:
         x, y, theta = tangent
         return np.array([[0.0, -theta, x], [theta, 0.0, y], [0.0, 0.0, 0.0]])
@@ -50,7 +50,7 @@ class TestTangents:
         np.testing.assert_allclose(lie.log(lie.exp(xi)), xi, atol=3e-11, rtol=0)
 
     def test_right_jacobian_inverse_equals_finite_difference(self, dimension, angle) -> None:
-        xi, step = tangents(dimension, min(angle, 3.0)), 1e-5  # log jumps at a half turn
+        xi, step = tangents(dimension, min(angle, 3.0)), 1e-5  # log is discontinuous at π
         jacobian, pose = lie.right_jacobian_inverse(xi), lie.exp(xi)
         for k, axis in enumerate(np.eye(SIZES[dimension][0])):
             up, down = (lie.log(lie.compose(pose, lie.exp(s * step * axis))) for s in (1.0, -1.0))

@@ -1,4 +1,4 @@
-"""Loops: the sample flight against its truth, and laps with known drift and false closures."""
+"""Loops: the sample flight against ground truth, and laps with known drift and closures."""
 
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,7 @@ def close_loop(trajectory: Trajectory, **how: Any) -> Loop:
 
 
 def path(loop: Loop, way: Any) -> Any:
-    """The path that was corrected in this way; a pose graph's by the name of its solution."""
+    """Return the corrected path by the name of the correction or of the pose graph solution."""
     return loop.corrections.get(way) or loop.corrections[f"pose_graph_{way}"]  # type: ignore[index]
 
 
@@ -71,7 +71,7 @@ def closure_error_vector_m(loop: Loop) -> np.ndarray:
 
 
 def true_closure_error_m() -> float:
-    """How far the odometry is from the vehicle at its landing, straight from the log's topics."""
+    """Return the odometry error at landing, computed from the topics of the log."""
     topics = {topic.name: topic.data for topic in ULog(str(SAMPLE)).data_list}
     landed = topics["vehicle_land_detected"]
     changes = np.diff(landed["landed"].astype(int))
@@ -101,7 +101,7 @@ def test_loop_sample_closure_error_equals_ground_truth(sample_loop: Loop) -> Non
 
 
 def test_loop_sample_corrections_reduce_ate_and_end_error(sample_loop):
-    for reference in (0, 1):  # truth and SLAM
+    for reference in (0, 1):  # ground truth and SLAM
         before = rmse(sample_loop, "uncorrected", reference)
         for way in ("by_distance", "gated"):
             assert rmse(sample_loop, way, reference) < 0.8 * before
@@ -141,7 +141,7 @@ def test_by_distance_plain_shifts_positions_linearly(sample_loop) -> None:
 
 
 def test_by_distance_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> None:
-    """The sample's heading drifts: over 10 m only the one that turns is as good as the odometry."""
+    """The sample's heading drifts, so a correction of positions only increases the RPE."""
     over = [
         next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_words == "10 m")
         for way in ("uncorrected", "by_distance", "by_distance_plain")
@@ -163,10 +163,10 @@ def test_by_distance_without_heading_has_one_path(sample, sample_loop) -> None:
 
 
 def test_loop_landed_at_option_equals_ground_truth(sample: LoopSource, sample_loop: Loop) -> None:
-    forward, right, _ = sample_loop.known_end.displacement  # its nose points along x
+    forward, right, _ = sample_loop.known_end.displacement  # the vehicle heads along x
     heading = sample_loop.known_end.heading_change_deg
     taped = analyse_loop(sample, landed_at=Landing(forward, right, heading))
-    # a tape does not see the height, which the truth has 0.16 m lower
+    # --landed-at has no height; ground truth is 0.16 m lower
     assert taped.closure_error_m == pytest.approx(sample_loop.closure_error_m, abs=0.03)
     assert taped.heading_error_deg == pytest.approx(sample_loop.heading_error_deg, abs=1e-6)
 
@@ -190,7 +190,7 @@ def test_loop_absolute_track_has_finding() -> None:
 
 
 def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Trajectory]:
-    """Truth and odometry of laps around a square, nose first, with drift as the noise says."""
+    """Return ground truth and odometry of laps around a square, with drift by the noise."""
     position, rotation = square(int(SIDE_M / SPEED_M_S * RATE_HZ), SIDE_M, count)
     truth = np.column_stack([position, rotation.as_quat()])
     length, duration = SPEED_M_S / RATE_HZ, 1.0 / RATE_HZ
@@ -209,7 +209,7 @@ def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Traje
 
 
 LAP_S = 4 * SIDE_M / SPEED_M_S
-# on the second and third laps the vehicle passes where it was on the first
+# the second and third lap pass the positions of the first
 TRUE = tuple(
     GivenClosure(t, t + lap * LAP_S, 0.05) for lap in (1, 2) for t in (5.0, 14.0, 23.0, 32.0)
 )
@@ -228,7 +228,7 @@ def test_loop_false_closure_is_rejected_among_true_ones() -> None:
     assert all(judged.accepted for judged in true)
     without = rmse(clean, "all")
     assert without < 0.6 * rmse(clean, "uncorrected")
-    # trusting it warps the path; the gate and both ways of robust solving do not
+    # used without a gate it deforms the path; gate, DCS and GNC exclude it
     assert rmse(fooled, "all") > 3.0 * without
     for name in ("gated", "dcs", "gnc"):
         assert rmse(fooled, name) == pytest.approx(without, rel=0.05), name
@@ -241,7 +241,7 @@ def test_loop_false_closure_is_rejected_among_true_ones() -> None:
 
 
 def test_gate_p_value_of_true_landings_is_uniform() -> None:
-    """With the noise that the laps have, p is uniform: a third below a third, and so on."""
+    """The gate assumes the noise with which the laps are simulated."""
     p = []
     for seed in range(60):
         _, odometry = laps(1, 100 + seed, OdometryNoise())
@@ -274,7 +274,7 @@ def test_loop_open_end_is_rejected_and_not_corrected() -> None:
 
 def test_loop_heading_is_closed_only_if_similar() -> None:
     _, odometry = laps(1, 4, OdometryNoise())
-    turned = close_loop(odometry)  # it ends facing west
+    turned = close_loop(odometry)  # the vehicle lands with another heading
     assert isinstance(turned.heading_error_deg, Unavailable)
     assert turned.closures[0].degrees_of_freedom == 3
     quaternions = odometry.rotation.as_quat()
@@ -286,7 +286,7 @@ def test_loop_heading_is_closed_only_if_similar() -> None:
 
 
 def test_find_loop_contradicting_closure_is_doubtful() -> None:
-    """Off by less than the drift could explain, but the others know better."""
+    """The error is within the drift, but contradicts the other closures."""
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
     found = close_loop(odometry, closures=(*TRUE, wrong))
@@ -297,7 +297,7 @@ def test_find_loop_contradicting_closure_is_doubtful() -> None:
 
 
 def test_find_loop_too_small_stated_drift_is_reported() -> None:
-    """An odometry with a turn in every step, which is said to be almost perfect."""
+    """The odometry has a heading error in every step; the stated drift is small."""
     _, odometry = laps(3, 7, OdometryNoise())
     turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
     steps = turn[:-1].apply(np.diff(odometry.position_m, axis=0))
@@ -308,7 +308,7 @@ def test_find_loop_too_small_stated_drift_is_reported() -> None:
 
 
 def test_find_loop_assumed_landing_is_reported(sample: LoopSource, sample_loop: Loop) -> None:
-    assert find_loop(sample_loop) == ()  # the log has the truth
+    assert find_loop(sample_loop) == ()  # the log contains ground truth
     blind = Unavailable("ground truth", "left out", "")
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
     (finding,) = find_loop(found)
@@ -337,7 +337,7 @@ def test_pose_graph_interpolates_between_key_frames(sample_loop: Loop) -> None:
     after, nodes = solved.trajectory, sample_loop.nodes
     poses = solved.solution.poses
     np.testing.assert_allclose(after.position_m[nodes], poses[:, :3], atol=1e-9)
-    # and no jump between them that the odometry does not have
+    # no additional jumps between them
     jumps = [np.linalg.norm(np.diff(one.position_m, axis=0), axis=1) for one in (after, before)]
     assert np.max(np.abs(jumps[0] - jumps[1])) < 0.02
     # orientations are corrected along the geodesic of their neighbours' corrections
@@ -346,7 +346,7 @@ def test_pose_graph_interpolates_between_key_frames(sample_loop: Loop) -> None:
     assert np.max((turn[a:b] * expected.inv()).magnitude()) < 1e-9
 
 
-# ------------------------------------------------------------------ what is given
+# ------------------------------------------------------------------ options and files
 
 
 def test_closure_times_are_unix_or_from_first_pose() -> None:
@@ -361,7 +361,7 @@ def test_loop_slam_file_is_levelled_with_small_closure_error() -> None:
     source = read_source(str(SLAM))
     found = analyse_loop(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"
-    assert found.closure_error_m < 0.7  # it truly ended 0.4 m away
+    assert found.closure_error_m < 0.7  # the vehicle landed 0.4 m from its start
     height = found.odometry.trajectory.position_m[:, 2]
     assert np.ptp(height) < 2.5
     assert found.path_length_m == pytest.approx(86.0, abs=5.0)

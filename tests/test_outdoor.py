@@ -1,4 +1,4 @@
-"""Outdoor flights: simulated GNSS against the truth, its EKF2, and the findings."""
+"""Outdoor flights: simulated GNSS against ground truth, EKF2, and the findings."""
 
 from __future__ import annotations
 

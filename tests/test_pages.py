@@ -1,4 +1,4 @@
-"""Handed-in PDFs compared with the redrawn report: forged ones are found, re-saved ones are not."""
+"""Submitted PDFs compared with the redrawn report: forged differ, re-saved do not."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ ON = BooleanObject(True)
 
 @pytest.fixture(scope="module")
 def pdf(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A report of three pages with tables and figures."""
+    """Report of three pages with tables and figures."""
     target = tmp_path_factory.mktemp("loop") / "loop.pdf"
     run_checked("loop", f"{SAMPLES / 'loop_vio.ulg'}:ekf2", "-o", target)
     return target.read_bytes()
@@ -97,7 +97,7 @@ def resource(kind: str, key: str, value: Any) -> Forge:
 
 
 def draw_on_page(add: bytes, *forges: Forge) -> Forge:
-    """Add something to the content of page 1, besides resources that it uses."""
+    """Append drawing operations to page 1, with the resources that they use."""
 
     def forge(writer: PdfWriter) -> None:
         for one in (*forges, on_page(1, lambda content: content + b"\n" + add)):
@@ -171,7 +171,7 @@ def descriptor(writer: PdfWriter) -> Any:
 
 
 def exchanged_glyphs(writer: PdfWriter) -> None:
-    """A map by which the font draws a 9 for a 1: the extracted text is unchanged."""
+    """Map glyphs so that the font draws 9 instead of 1; the extracted text is unchanged."""
     letters = glyphs(font("/f0")(writer))
     numbers = list(range(max(letters.values()) + 1))
     one, nine = letters["1"], letters["9"]
@@ -181,7 +181,7 @@ def exchanged_glyphs(writer: PdfWriter) -> None:
 
 
 def exchanged_outlines(data: bytes) -> bytes:
-    """A TrueType font whose glyphs 3 and 5 have exchanged outlines."""
+    """Return a TrueType font with exchanged outlines of glyphs 3 and 5."""
     count = int.from_bytes(data[4:6], "big")
     tables = {data[12 + 16 * at : 16 + 16 * at]: data[20 + 16 * at : 24 + 16 * at]
               for at in range(count)}  # fmt: skip
@@ -195,7 +195,7 @@ def exchanged_outlines(data: bytes) -> bytes:
 
 
 def structure(change: Callable[[Any], None]) -> Forge:
-    """Change the first figure's element of the structure tree."""
+    """Change the element of the first figure in the structure tree."""
 
     def forge(writer: PdfWriter) -> None:
         left: list[Any] = [writer.root_object["/StructTreeRoot"]["/K"]]  # type: ignore[index]
@@ -226,7 +226,7 @@ def kids(change: Callable[[list[Any]], list[Any]]) -> Forge:
 
 
 def rotated_parent(writer: PdfWriter) -> None:
-    """A page whose parent is another one than the tree's: some viewers inherit from it."""
+    """Give a page another parent with a rotation, which some viewers apply."""
     other = writer._add_object(
         dictionary(Type=name("Pages"), Kids=array(), Count=N(0), Rotate=N(180))
     )
@@ -265,7 +265,7 @@ def another_file(writer: PdfWriter) -> None:
 
 
 def jpeg_content(writer: PdfWriter) -> None:
-    """Content that viewers take for a JPEG, and pypdf leaves as it is: the page is empty."""
+    """Mark the content as JPEG: the page is empty in viewers, and unchanged in pypdf."""
     held = edit_stream(writer.pages[0]["/Contents"].get_object(), lambda data: data + b" ")
     held.set_data(writer.pages[0]["/Contents"].get_object().get_data())
     held[NameObject("/Filter")] = name("DCTDecode")
@@ -279,14 +279,14 @@ def bookmark(writer: PdfWriter) -> None:
 
 
 def spread_text(content: bytes, writer: PdfWriter) -> bytes:
-    """A 2 for the first 1 on page 1, far from the letters before it."""
+    """Replace the first 1 on page 1 by a 2 far from the letters before it."""
     letters = glyphs(font("/f0")(writer))
     one, two = (text(letters[digit]) for digit in "12")
     return content.replace(one, b")-9000(" + two, 1)
 
 
 def other_digit(writer: PdfWriter) -> None:
-    """A 2 for the first 1 on page 1."""
+    """Replace the first 1 on page 1 by a 2."""
     letters = glyphs(font("/f0")(writer))
     one, two = (text(letters[digit]) for digit in "12")
     content(once(re.escape(one), lambda _: two))(writer)
@@ -355,7 +355,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "another font under the name": (another_font, "/BaseFont is", True),
     "a Type3 font": (type3, "an entry /CharProcs", True),
     "one font more": (resource("/Font", "/f9", dictionary()), "an entry /f9", True),
-    # what a page draws
+    # content of a page
     "the colour of the verdict": (
         content(once(rb"/c0 cs [\d. ]+ scn", b"/c0 cs 0 0.6 0 scn")), "drawing operation", False,
     ),
@@ -537,7 +537,7 @@ def test_compare_pages_forged_report_is_found(pdf: bytes, kind: str) -> None:
 
 
 def later_generation(pdf: bytes) -> bytes:
-    """An object with another generation, which some programs ignore."""
+    """Replace an object by one of another generation, which some programs ignore."""
     number = int(re.findall(rb"/Contents (\d+) 0 R", pdf)[0])
     made = pdf.replace(b"/Contents %d 0 R" % number, b"/Contents %d 1 R" % number)
     made = made.replace(b"\n%d 0 obj" % number, b"\n%d 1 obj" % number)
@@ -548,12 +548,12 @@ def later_generation(pdf: bytes) -> bytes:
 
 
 def shadowed(pdf: bytes) -> bytes:
-    """A table of objects behind the end, which PDFium takes for the last one."""
+    """Append an object table after the end, which PDFium uses."""
     return pdf + b"\nstartxref\n9\n"
 
 
 def linearised(pdf: bytes) -> bytes:
-    """A table of objects at the beginning, which viewers that know linearised files use."""
+    """Add an object table at the beginning, which viewers of linearised files use."""
     first = pdf.find(b"\n", 10) + 1
     begin = b"9999 0 obj\n<</Linearized 1/L 9>>\nendobj\nxref\n0 0\ntrailer<<>>\n"
     offset = len(begin)
@@ -572,13 +572,13 @@ def linearised(pdf: bytes) -> bytes:
 
 
 def hybrid(pdf: bytes) -> bytes:
-    """A second table of objects, which older programs do not read."""
+    """Add a second object table, which older programs do not read."""
     at = pdf.rfind(b"trailer")
     return pdf[:at] + pdf[at:].replace(b"<<", b"<<\n/XRefStm 15\n", 1)
 
 
 def empty_first_page(writer: PdfWriter) -> None:
-    """The first page without what it draws."""
+    """Remove the content of the first page."""
     held = edit_stream(writer.pages[0]["/Contents"].get_object(), lambda _: b" ")
     writer.pages[0][NameObject("/Contents")] = writer._add_object(held)
 
@@ -619,11 +619,11 @@ def test_compare_pages_pattern_is_compared() -> None:
     assert (found.page, found.structural) == (at, False)
 
 
-# -- honest files -------------------------------------------------------------------------------
+# -- unforged files -----------------------------------------------------------------------------
 
 
 def recompress(writer: PdfWriter) -> None:
-    """As programs pack a file again: identical objects once, content spelt otherwise."""
+    """Merge identical objects and compress again, as other programs do."""
     writer.compress_identical_objects(remove_duplicates=True)
     for sheet in writer.pages:
         sheet.compress_content_streams(level=9)
@@ -638,7 +638,7 @@ def decompress(writer: PdfWriter) -> None:
 
 
 def save_metadata(writer: PdfWriter) -> None:
-    """As programs say when they saved it, and which they are."""
+    """Set producer and dates, as programs do when they save a file."""
     document_info(Producer="Another program", ModDate="D:20260101000000Z")(writer)
     dates = rb"<xmp:ModifyDate>[^<]*</xmp:ModifyDate>"
     new = (
@@ -649,7 +649,7 @@ def save_metadata(writer: PdfWriter) -> None:
 
 
 def rewrite_tokens(content: bytes) -> bytes:
-    """Strings in hexadecimal, numbers with more digits, other blanks."""
+    """Write strings in hexadecimal, numbers with more digits, and other blanks."""
     text = rb"(?<=\[)\((?:[^\\()]|\\.)*\)(?=\]TJ)"
     content = re.sub(text, _hexadecimal, content, flags=re.DOTALL)
     return re.sub(rb"(?<= )(\d+)\.(\d+)(?= [ml]\b)", rb"\1.\g<2>0 ", content)
@@ -714,7 +714,7 @@ def test_compare_pages_coordinates_within_tolerance(pdf: bytes, factor: float, e
 
 
 def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
-    """A number that is rounded otherwise on another processor."""
+    """One number is rounded differently, as on another processor."""
     made = forged(pdf, other_digit)
     asked: list[tuple[str, str]] = []
 
@@ -726,7 +726,7 @@ def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
     ((theirs, ours),) = [pair for pair in asked if pair[0] != pair[1]]
     assert same_words(theirs, ours, lambda *_: True)
     assert not same_words(theirs, ours, Rounding(()))
-    # its letters stand where they stood
+    # the positions of the letters are unchanged
     digit = once(rb"(?<=\))(-?[\d.]+)(?=\()", b"-9000")
     assert compare(forged(made, on_page(1, digit)), made, alike=alike) != ()
     spread = forged(pdf, lambda w: on_page(1, lambda c: spread_text(c, w))(w))
@@ -737,7 +737,7 @@ def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
 
 
 def within_figure(add: bytes) -> Edit:
-    """Draw something inside the clip of the first figure."""
+    """Add drawing operations inside the clip of the first figure."""
     return once(rb"(/Alt\(.*?\sW\sn)", lambda m: m[1] + b" " + add)
 
 
@@ -774,7 +774,7 @@ def test_compare_pages_other_libraries_structure_is_compared(pdf: bytes) -> None
 def test_compare_pages_beyond_limits_is_a_difference(
     pdf: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a process of its own."""
+    """Pages are compared in a separate process."""
     monkeypatch.setattr(pages, "TIMEOUT_S", 0.001)
     (found,) = compare(pdf, pdf)
     assert found.structural

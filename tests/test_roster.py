@@ -1,4 +1,4 @@
-"""Tables of platforms: class lists, whose a file is, and the grades that are put into them."""
+"""Tables of learning platforms: class lists, owners of files, and returned grades."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from px4fuse.grading.model import ExportOrigin
 from px4fuse.grading.outputs import fill_grades, grade_column
 
 SUBMITTED = "Friday, 20 November 2026, 11:58 PM"
-# As mod/assign/gradingtable.php of Moodle writes it
+# format of mod/assign/gradingtable.php of Moodle
 MOODLE = (
     'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade",'
     '"Grade can be changed","Last modified (submission)","Last modified (grade)",'
@@ -111,9 +111,9 @@ BAD_ROSTERS = {
     "header alone": ("id,name\n", "0 students"),
     "empty id": ("id,name\n1,A\n,B\n", "the id of 'B'"),
     "same id": ("id\n1\n2\n1\n", "rows 2 and 4 have the same id '1'"),
-    "same but for case": ("id\nab\nAB\n", "rows 2 and 3"),
+    "ids equal except for case": ("id\nab\nAB\n", "rows 2 and 3"),
     "same file": ("id\na/b\na:b\n", "the id of 'a:b' cannot be used as a file name"),
-    "nothing left": ("id\n///\n", "letters or digits"),
+    "no usable characters": ("id\n///\n", "letters or digits"),
     "binary": (b"\x00\x01\x02id", "not a text file"),
     "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
     "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students"),
@@ -131,7 +131,7 @@ def test_read_roster_invalid_list_raises_one_line(tmp_path, content, said) -> No
     assert "\n" not in str(error.value)
 
 
-# -- whose a file is -------------------------------------------------------------------------------
+# -- owner of a file -------------------------------------------------------------------------------
 
 
 CLASS = Register(
@@ -144,7 +144,7 @@ CLASS = Register(
 
 
 def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOrigin:
-    """A file of a student whom a platform knows by its number."""
+    """Make the origin of a file: platform and number of the student there."""
     person = Person(more.pop("student_id", ""), name, numbers={platform: number}, **more)
     return ExportOrigin(platform, person)
 
@@ -152,18 +152,18 @@ def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOr
 @pytest.mark.parametrize(
     ("origin", "place"),
     [
-        # the participant, not the student of that id
+        # participant number, not student id
         (at("moodle", "4711", "Nobody"), 0),
         (at("moodle", "42", "Nobody"), 1),
         (at("moodle", "99", "doe JANE"), 0),
         (at("canvas", "12345", "x"), 0),
         (at("canvas", "99", "roemax"), 1),
-        (at("moodle", "99", "Zoe\u0308 Doe"), 2),  # the same letter, written as two
+        (at("moodle", "99", "Zoe\u0308 Doe"), 2),  # decomposed letter
         (at("blackboard", login="JDoe"), 0),
         (at("ilias", "7", "?", login="45"), 4),
         (at("gradescope", "7", student_id="42"), 0),
         (at("gradescope", "7", email="Jane@X.edu"), 0),
-        (at("moodle", "99", "Kim Min"), None),  # two of that name
+        (at("moodle", "99", "Kim Min"), None),  # the name is ambiguous
         (at("moodle", "99", "Jane"), None),
     ],
 )
@@ -174,7 +174,7 @@ def test_student_index_uses_platform_number_then_name(origin, place) -> None:
 def test_student_index_uses_id_before_name() -> None:
     said = (("42", "Max Roe"), ("", "Roe, Max"), ("99", "Jane Doe"), ("", ""))
     assert [CLASS.student_index(Person(*each)) for each in said] == [0, 1, 0, None]
-    # of two ids that differ by zeros the exact one is meant
+    # an exact id has priority over one with leading zeros
     register = Register([Person("042"), Person("42")])
     assert [register.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
 
@@ -225,7 +225,7 @@ def test_fill_grades_changes_grade_and_feedback_only(
         assert {key for key in old if old[key] != new[key]} <= {title, feedback}
     grades = [row[title] for row in people]
     assert grades[:2] == ["87.5", "104"]
-    # who has no grade keeps what is there: an empty cell would delete, a zero would count
+    # without a grade the cell is unchanged: an empty one would delete, a zero would count
     assert after[-1] == before[-1]
     if text is MOODLE:
         assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"

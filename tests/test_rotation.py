@@ -1,4 +1,4 @@
-"""Rotations as quaternions, against closed forms and SciPy."""
+"""Quaternion rotations against closed forms and SciPy."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The rubric: the one that ships, and those that an instructor spoils."""
+"""Default rubric, and errors of edited rubrics."""
 
 import tomllib
 
@@ -57,18 +57,24 @@ BAD = {
     "title of two lines": (NOTES.replace('"T"', '"a\\nb"'), "at item 1, title"),
     "negative points": (NOTES.replace("5", "-5"), "Expected `float` >= 0.0 - at item 1, points"),
     "unknown parameter": (NOTES + "min_letters = 3", "unknown field `min_letters` - at item 1"),
-    "the third": (NOTES + NOTES.replace("T", "U") + NUMBER + "at_most = 'x'", "at item 3, at_most"),
+    "invalid value in item 3": (
+        NOTES + NOTES.replace("T", "U") + NUMBER + "at_most = 'x'",
+        "at item 3, at_most",
+    ),
     "a check of an earlier rubric": (ITEM + 'check = "sections"', "Invalid value 'sections'"),
     "number without bound": (NUMBER, "give at_least, at_most or both"),
     "bounds exchanged": (NUMBER + "at_least = 2\nat_most = 1", "at_least <= at_most"),
-    "zero on the good side": (NUMBER + "at_most = 2\nzero_at = 1", "zero_at outside"),
-    "zero on the other good side": (NUMBER + "at_least = 0\nzero_at = 1", "zero_at outside"),
+    "zero_at below at_most": (NUMBER + "at_most = 2\nzero_at = 1", "zero_at outside"),
+    "zero_at above at_least": (NUMBER + "at_least = 0\nzero_at = 1", "zero_at outside"),
     "a parameter of an earlier rubric": (ITEM + 'check = "consistent"\naxes = []', "field `axes`"),
-    "but for capitals": (NOTES + NOTES.replace("T", "t"), "the title 't' is used by another item"),
-    "as the sum": (NOTES.replace("T", "Total"), "the title 'Total' is used by the sum"),
-    "two alike": (NOTES + NOTES, "the title 'T' is used by another item"),
+    "titles equal except for case": (
+        NOTES + NOTES.replace("T", "t"),
+        "the title 't' is used by another item",
+    ),
+    "title of the sum": (NOTES.replace("T", "Total"), "the title 'Total' is used by the sum"),
+    "duplicate title": (NOTES + NOTES, "the title 'T' is used by another item"),
     "too many": (NOTES * 101, "length <= 100"),
-    "others' log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
+    "invalid others_log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
     "too large": ("#" * 1_000_001, "the limit is"),
     "no text": (b"\xff\xfe\x00", "not a UTF-8 text file"),
 }

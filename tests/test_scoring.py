@@ -1,4 +1,4 @@
-"""Points, comments, feedback and flags, on the example report with parts of it changed."""
+"""Points, comments, feedback and flags of the example report with changed results."""
 
 import copy
 import json
@@ -44,7 +44,7 @@ def assess_results(results=EXAMPLE, verdict=VERIFIED, key=None, rubric=None, own
 
 
 def check_points(check, results=EXAMPLE, /, verdict=VERIFIED, key=None, **parameters):
-    """Share of the points and comment of one check."""
+    """Return points (of 1) and comment of one check."""
     given = "\n".join(f"{name} = {json.dumps(value)}" for name, value in parameters.items())
     rubric = parse_rubric(f'[[item]]\ntitle = "T"\npoints = 1\ncheck = "{check}"\n{given}', "x")
     (item,) = assess_results(results, verdict, key, rubric).items
@@ -58,7 +58,7 @@ def with_notes(text, results=EXAMPLE, **values):
 
 
 def with_form(kinds, results=EXAMPLE, **values):
-    """Results with a form that names these mistakes."""
+    """Return results with an answer form that contains these mistakes."""
     sha256 = (results.get("log") or results["track"])["sha256"]
     form = {"log_sha256": sha256, "mistakes": [{"kind": kind} for kind in kinds]}
     return changed_results(results, student__answers=form, **values)
@@ -89,7 +89,7 @@ WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
 REJECTED = changed_results(
     LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}]
 )
-# Check, results, parameters, the points of 1, and what the comment says
+# Check, results, parameters, points of 1, part of the comment
 CHECKED = [
     ("verified", EXAMPLE, {}, 1.0, "verified (all 900"),
     ("tuning", EXAMPLE, {"setting": "sigma_z_m"}, 1.0, "within"),
@@ -106,7 +106,7 @@ CHECKED = [
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
     ("number", EXAMPLE, {"path": RMSE, "at_least": 0.07, "zero_at": 0.06}, 0.5, ""),
     ("number", EXAMPLE, {"path": "axes.*.filters.kf.nis_mean", "at_least": 0.82}, 0.0,
-     "axes.north"),  # the worst of several
+     "axes.north"),  # worst of several values
     ("number", LOOP, {"path": 'loop.corrections.by_distance.scores."slam.tum".ate.translation_m.'
                               "rmse", "at_most": 0.3}, 1.0, ""),
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
@@ -218,7 +218,7 @@ class TestForm:
             )
 
 
-# ------------------------------------------------------------------ the whole
+# ------------------------------------------------------------------ whole reports
 
 
 class TestScore:
@@ -248,7 +248,7 @@ class TestScore:
             rubric = replace(read_rubric(None), others_log=rule)
             made = assess_results(given, key=key(), rubric=rubric)
             assert (made.pending, any(item.points for item in made.items)) == ("", earns)
-        # the platform says whose it is
+        # with the owner from the platform
         assert assess_results(given, key=key(), owner_id="s01").pending == ""
 
     def test_log_outside_answer_key_is_pending(self):
@@ -257,7 +257,7 @@ class TestScore:
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_any_valid_results_can_be_scored(self, results):
-        """Extreme values, and parts that are absent, wherever the contract allows them."""
+        """Extreme values and missing parts, as far as the schema allows."""
         rng = random.Random(0)
         numbers, others = [1e308, -1e308, 5e-324, 0.0, -1, 10**19], [NONE, ..., "x" * 2000, "\0"]
         rubric, read = read_rubric(None), 0
@@ -289,7 +289,7 @@ class TestScore:
 
 
 def feedback_words(one, title=""):
-    """What the student reads, its line ends left out."""
+    """Return the feedback text without line ends."""
     text = feedback_text(Entry(one.student, one.student_id, one), title)
     assert all(len(line) <= 100 for line in text.splitlines())
     return " ".join(text.split())
@@ -320,7 +320,7 @@ class TestFeedback:
         assert absent not in text
 
     def test_comments_contain_no_ids_or_paths(self):
-        """Whatever is missing is told in words; paths and ids are the program's own."""
+        """Ids of findings and paths in results are internal names."""
         wrong = [finding(name, "error") for name in NAMES]
         spoilt = [
             changed_results(findings=wrong, student__notes="It is a flight of 5 s.", tuning={},
@@ -422,7 +422,7 @@ class TestClassFlags:
         made = class_flags([report(1, form=mine), report(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}
         assert "The answer form has the same numbers as" in made["1.pdf"][0]
-        # two may be by chance
+        # two equal numbers are not enough
         theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
         apart = replace(mine, quantities=(0.123, None, 0.3))
         assert class_flags([report(1, form=apart), report(2, form=theirs)]) == {}

@@ -1,4 +1,4 @@
-"""Simulated flights against their truth: motion, sensors, mistakes, ULog and command."""
+"""Simulated flights against ground truth: motion, sensors, mistakes, ULog and command."""
 
 import json
 from dataclasses import fields

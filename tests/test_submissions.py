@@ -1,4 +1,4 @@
-"""Submissions in folders and zip files: found, named, read within bounds, never unpacked."""
+"""Submissions in folders and zip files: search, names, limits; zip files are not unpacked."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def single_submission(path: Path) -> Submission:
     return submission
 
 
-# ------------------------------------------------------------------ what is found
+# ------------------------------------------------------------------ search
 
 
 def test_find_submissions_searches_folders_and_sorts(tmp_path):
@@ -81,7 +81,7 @@ def test_find_submissions_searches_folders_and_sorts(tmp_path):
         ("doejane_12345_67890_report-1.pdf", ("doejane", "12345")),
         ("roejo_LATE_5_6_r.pdf", ("roejo", "5")),
         ("assignment_7_export/submission_31/report.pdf", ("", "31")),
-        # what a student puts into a zip file or a name stands behind the platform's own part
+        # the part of the platform comes first, then names that a student chose
         ("Roe Max_1_assignsubmission_file_/Doe Jane_2_assignsubmission_file_/r.pdf",
          ("Roe Max", "1")),
         ("roemax_5_6_doejane_7_8_report.pdf", ("roemax", "5")),
@@ -121,7 +121,7 @@ submission_31:
 
 
 def test_with_origins_forged_name_keeps_platform_and_time():
-    """Blackboard's export, with a second time and with Moodle's way in the student's own part."""
+    """The student's part of the name contains a second time, or a name as from Moodle."""
     usual = [f"Lab_user{n}_attempt_2026-11-20-11-00-0{n}_r.pdf" for n in range(3)]
     forged = [
         "Lab_eve_attempt_2026-11-23-10-00-00_x_attempt_2026-11-19-10-00-00_r.pdf",
@@ -190,7 +190,7 @@ def test_find_submissions_zip_inside_export_is_not_opened(tmp_path):
         "Ignored files (not PDF): 1.",
         "Zip files not opened: 1. Name the export of a platform on the command line.",
     )
-    # the same where the export was unpacked
+    # the same for an unpacked export
     write(tmp_path / "unpacked" / name, handed_in)
     ((again,), _) = find_submissions([tmp_path / "unpacked"])
     assert (again.name, again.entry) == (name, "")
@@ -238,7 +238,7 @@ def test_find_submissions_ignores_links_and_special_files(tmp_path):
 
 
 def test_find_submissions_1500_nested_folders_are_searched(tmp_path):
-    """More than functions may call themselves."""
+    """Deeper than Python's recursion limit."""
     folders = [tmp_path / "in" / ("d/" * depth) for depth in range(1_500)]
     for folder in folders:
         folder.mkdir()
@@ -246,14 +246,14 @@ def test_find_submissions_1500_nested_folders_are_searched(tmp_path):
     try:
         found, notes = find_submissions([tmp_path / "in"])
         known = files_by_sha256([tmp_path / "in"])
-    finally:  # shutil.rmtree, which clears the tests' folders, calls itself
+    finally:  # shutil.rmtree, which removes temporary folders, is recursive
         for path in paths:
             path.unlink()
         for folder in reversed(folders):
             folder.rmdir()
     assert [each.file for each in found] == paths
     assert notes == ()
-    assert [*known.values()] == paths[:1]  # both have the same content
+    assert [*known.values()] == paths[:1]  # equal content
 
 
 # ------------------------------------------------------------------ names
@@ -282,7 +282,7 @@ def test_find_submissions_cleans_names_and_writes_nothing(tmp_path):
 def test_read_too_large_file_is_rejected_in_bounded_memory(tmp_path):
     path = tmp_path / "large.pdf"
     with path.open("wb") as file:
-        file.truncate(500_000_000)  # sparse: it takes no space
+        file.truncate(500_000_000)  # sparse file
     tracemalloc.start()
     said = reason(single_submission(path))
     peak = tracemalloc.get_traced_memory()[1]
@@ -297,7 +297,7 @@ def test_read_zip_bomb_or_wrong_size_is_rejected(tmp_path, monkeypatch):
     assert "compressed more than 100 times" in reason(single_submission(path))
     path.write_bytes(zipped({"large.pdf": bytes(MAX_BYTES + 1)}))
     assert "larger than 25 MB" in reason(single_submission(path))
-    # a declared size that is smaller than what there is: zipfile stops there, and the sum is off
+    # declared size below the actual one: zipfile stops there, and the checksum is wrong
     path.write_bytes(packed.replace(struct.pack("<I", 20_000_000), struct.pack("<I", 1000)))
     assert "cannot be read" in reason(single_submission(path))
     monkeypatch.setattr(submissions, "MAX_BYTES", len(PDF))
@@ -355,7 +355,7 @@ def test_find_submissions_equal_names_are_numbered(tmp_path):
     found, _ = find_submissions([*folders, *folders])
     assert [each.name for each in found] == ["Report.pdf", "Report.pdf (2)", "Report.pdf (3)"]
     assert [read(each) for each in found] == [b"a", b"b", b"c"]
-    # of an unmarked code page
+    # names without the UTF-8 flag
     content = zipped({"M_ller.pdf": PDF, "Zo__.pdf": PDF})
     content = content.replace(b"M_ller", b"M\x81ller").replace(b"Zo__", "Zoë".encode())
     found, _ = find_submissions([write(tmp_path / "x.zip", content)])

@@ -1,4 +1,4 @@
-"""A term: forty students on three platforms, graded, edited, overridden, regraded, imported."""
+"""Grading of 40 students on three platforms, with a new rubric, overrides and grade tables."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from px4fuse.grading.model import Entry
 from px4fuse.grading.rubric import read_rubric, rubric_text
 
 STUDENTS = range(1, 41)
-MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 hand in nothing
+MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 submit nothing
 LATE, RESUBMITTED, COPIED, HOSTILE, INTRUDER = 30, 31, 20, 5, 9
-# Whose feedback is kept
+# Students whose feedback is in the golden file
 SHOWN = ("0001", "0005", "0009", "0020", "0030", "0031", "0039")
 HEADS = {
     "moodle": ["Identifier", "Full name", "ID number", "Email address", "Status", "Grade",
@@ -69,7 +69,7 @@ def table(path: Path, head: list[str], rows: list[list[str]], separator: str = "
 
 
 class Lab:
-    """The folder of an instructor in the middle of a term."""
+    """Folder of an instructor: logs, exports of platforms, class list and grade tables."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.output, self.logs = folder, folder / "class", folder / "logs"
@@ -95,7 +95,7 @@ class Lab:
                  for n in MOODLE}  # fmt: skip
         own = f"{name(HOSTILE)}_{9000 + HOSTILE}_assignsubmission_file_"
         files[f"{own}/report.pdf"] = b"%PDF-1.7 /JavaScript %%EOF"
-        # a zip file with another student's folder in it
+        # zip file that contains the folder of another student
         inner = io.BytesIO()
         with zipfile.ZipFile(inner, "w") as archive:
             archive.writestr(f"{name(1)}_9001_assignsubmission_file_/report.pdf", b"%PDF- none")
@@ -157,16 +157,16 @@ def test_grade_term_applies_new_rubric_and_overrides(lab, monkeypatch) -> None:
     verified = skip_verification(monkeypatch)
     outcome = lab.grade()
     check_golden_tables(lab.output)
-    assert outcome.reused == 2  # the copy, and what was handed in twice
+    assert outcome.reused == 2  # the copied and the repeated report
     count = len(verified)
     check_other_rubric(lab, outcome)
     check_overrides(lab, outcome)
-    assert len(verified) == count  # points changed, and no report was looked at again
+    assert len(verified) == count  # points changed without a new verification
     check_pseudonyms(lab, outcome)
 
 
 def check_golden_tables(output: Path) -> None:
-    """Tables, and what some are told, as they were looked at."""
+    """Compare tables and some feedback with the golden file."""
     lines = []
     tables = [output / "class.csv", *sorted((output / "grades").glob("*.csv"))]
     told = [path for path in sorted((output / "feedback").iterdir()) if path.stem in SHOWN]
@@ -179,12 +179,12 @@ def check_other_rubric(lab: Lab, outcome: GradeOutcome) -> None:
     doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
     (lab.folder / "lab.toml").write_text(doubled, encoding="utf-8")
     second = lab.grade(read_rubric(lab.folder / "lab.toml"))
-    assert second.reused == 38  # two of the files are no reports
+    assert second.reused == 38  # two files are not reports
     assert entry_of(second, 1).total == pytest.approx(2 * entry_of(outcome, 1).total, abs=0.2)
 
 
 def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
-    """Overrides are read, never written over, and kept by every regrade."""
+    """Check that overrides are applied, not overwritten, and kept when grading again."""
     usual = entry_of(outcome, 1)
     item = usual.counting.items[0].title
     said = lab.output / "overrides.csv"
@@ -213,7 +213,7 @@ def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
 
 
 def check_pseudonyms(lab: Lab, outcome: GradeOutcome) -> None:
-    """Who is who stands in a file of its own, and stays."""
+    """Check the table of pseudonyms."""
     text = (lab.output / "names.csv").read_text(encoding="utf-8-sig")
     rows = list(csv.DictReader(io.StringIO(text, newline="")))
     assert {row["id"] for row in rows} == {one.student_id for one in outcome.entries}

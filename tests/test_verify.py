@@ -1,4 +1,4 @@
-"""Reports that prove themselves: no change of one reaches what an instructor then looks at."""
+"""Verification: a changed report is detected, and the redrawn report does not contain it."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ LOOP_LOG = SAMPLES / "loop_vio.ulg"
 
 @pytest.fixture(autouse=True, scope="module")
 def _compare_pages_in_process() -> Iterator[None]:
-    """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
+    """Compare pages in this process; test_pages.py tests the separate one."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
         yield
@@ -88,7 +88,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> VerifiedReport:
     return make_verified_report(target.read_bytes(), LOOP_LOG)
 
 
-# -- what is untouched -----------------------------------------------------------------------------
+# -- unchanged reports -----------------------------------------------------------------------------
 
 
 def test_verify_example_report_is_verified(aisle: VerifiedReport) -> None:
@@ -126,7 +126,7 @@ def scaled(value: Any, share: float) -> Any:
 
 
 def move_lines(pdf: bytes, by: float) -> bytes:
-    """All lines and marks a little aside."""
+    """Move all lines and marks by a distance."""
     ends = re.compile(rb"(\d[\d.]*) (\d[\d.]*) ([ml])\b")
 
     def moved(match: re.Match[bytes]) -> bytes:
@@ -169,7 +169,7 @@ def test_verify_numbers_1e_12_apart_are_verified(aisle: VerifiedReport) -> None:
 
 
 def test_compare_results_numbers_1e_4_apart_differ(aisle: VerifiedReport) -> None:
-    """Every number but those with the tolerance of an estimate, and those near zero."""
+    """All numbers, except estimates, which have another tolerance, and those near zero."""
     ours = json.loads(to_json(aisle.again[0]))
     for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
         theirs = scaled(ours, share)
@@ -202,7 +202,7 @@ def test_compare_results_applies_each_tolerance(aisle: VerifiedReport) -> None:
         assert (not compare_results(theirs, ours)[0]) == alike, path
 
 
-# -- what is changed in the results ----------------------------------------------------------------
+# -- changed results -------------------------------------------------------------------------------
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -216,9 +216,9 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def leaf_of_each_name() -> list[tuple[Any, ...]]:
-    """A leaf of every name in the results."""
+    """Return one path to a value for each name in the results."""
     results = to_dict(attached_results(REPORT.read_bytes()))
-    # what another test is for: the log, the version, and what is printed anew
+    # other tests cover the log, the version, and texts that are printed
     apart = ("schema", "student", "provenance")
     kinds = {
         path[-1]: path
@@ -256,7 +256,7 @@ def test_compare_results_finds_each_changed_value(
     aisle: VerifiedReport, path: tuple[Any, ...]
 ) -> None:
     found, *_ = compare_results(change_value(aisle.results, path), to_plain(aisle.again[0]))
-    difference = found[0]  # where there was none, a list has places of its own
+    difference = found[0]  # an additional list has paths below this one
     assert difference.path.startswith(".".join(map(str, path)))
 
 
@@ -301,11 +301,13 @@ def test_verify_forged_results_are_not_verified(
     aisle: VerifiedReport, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, expected = STRUCTURE[name]
-    monkeypatch.setattr(verification, "compare_pages", lambda *_, **__: ())  # they are as drawn
+    monkeypatch.setattr(
+        verification, "compare_pages", lambda *_, **__: ()
+    )  # the pages are unchanged
     results = copy.deepcopy(aisle.results)
     change(results)
     verdict = aisle.verified(aisle.with_results(results))
-    if verdict.reasons[0].startswith("results.json"):  # no such results are read at all
+    if verdict.reasons[0].startswith("results.json"):  # rejected by the schema
         expected = "cannot verify"
     assert verdict.status == verdict.outcome == expected, verdict
 
@@ -328,7 +330,7 @@ def test_verify_changed_printed_record_is_not_verified(
     assert named == (path[-1] == "matplotlib")
 
 
-# -- what is changed on the pages ------------------------------------------------------------------
+# -- changed pages ---------------------------------------------------------------------------------
 
 
 def replace_last(pattern: bytes, replacement: Any) -> Callable[[bytes], bytes]:
@@ -342,12 +344,12 @@ def replace_last(pattern: bytes, replacement: Any) -> Callable[[bytes], bytes]:
     return change
 
 
-LETTERS = glyphs(font("/f0")(PdfWriter(clone_from=REPORT)))  # nearly all text; /f1 is bold
+LETTERS = glyphs(font("/f0")(PdfWriter(clone_from=REPORT)))  # regular font; /f1 is bold
 DIGITS = [LETTERS[digit] for digit in "0123456789"]
 
 
 def last_digit(replacement: Callable[[int], bytes]) -> Edit:
-    """The last digit on a page in its usual font, as something else."""
+    """Replace the last digit of a page in the regular font."""
 
     def change(content: bytes) -> bytes:
         line = list(re.finditer(rb"/f0 [^\[]*\[(.*?)\]TJ", content, re.DOTALL))[-1]
@@ -381,7 +383,7 @@ DRAWING: dict[str, Edit] = {
 }
 PAGES = 8
 
-# Every page in one way, and each of the others on one page
+# One change on every page, each other change on one page
 PAGE_CASES = [
     (page, name)
     for place, name in enumerate(DRAWING)
@@ -393,7 +395,7 @@ PAGE_CASES = [
 @pytest.mark.parametrize(("page", "name"), PAGE_CASES)
 def test_verify_changed_page_differs(aisle: VerifiedReport, page: int, name: str) -> None:
     verdict = aisle.verified(forged(aisle.pdf, on_page(page, DRAWING[name])))
-    assert verdict.redrawn == aisle.pdf  # what is redrawn is never touched by a forgery
+    assert verdict.redrawn == aisle.pdf  # the redrawn report does not contain the forgery
     assert verdict.status == "verified"
     assert verdict.outcome == "page differs", verdict
     assert [one.page for one in verdict.pages] == [page]
@@ -421,7 +423,7 @@ def test_verify_changed_document_states_reason(aisle: VerifiedReport, name: str)
     assert verdict.outcome == expected, verdict
     assert verdict.status == ("verified" if expected == "page differs" else expected)
     assert any(said in reason for reason in verdict.reasons), verdict
-    # the reason that a class table shows is the one that counts
+    # the class table prints the first reason
     if expected == "cannot verify":
         assert said in verdict.reasons[0]
         assert verdict.remedy.startswith("Ask for the PDF")
@@ -446,13 +448,13 @@ def test_verify_lists_differing_numbers_first(aisle: VerifiedReport) -> None:
 
 
 def empty_first_page(writer: PdfWriter) -> None:
-    """The first page without what it draws."""
+    """Remove the content of the first page."""
     stream = edit_stream(writer.pages[0]["/Contents"].get_object(), lambda _: b" ")
     writer.pages[0][NameObject("/Contents")] = writer._add_object(stream)
 
 
 def pages_of_another(one: VerifiedReport, other: VerifiedReport) -> bytes:
-    """A report with the last page of another."""
+    """Return a report with the last page of another one."""
     writer = PdfWriter(clone_from=io.BytesIO(one.pdf))
     writer.remove_page(PAGES - 1)
     writer.add_page(PdfReader(io.BytesIO(other.pdf)).pages[-1])
@@ -460,7 +462,7 @@ def pages_of_another(one: VerifiedReport, other: VerifiedReport) -> bytes:
 
 
 def recompress(writer: PdfWriter) -> None:
-    """As programs that save a PDF again pack it: object streams, other compression."""
+    """Compress again, as programs do when they save a PDF."""
     writer.compress_identical_objects(remove_duplicates=True)
     for page in writer.pages:
         page.compress_content_streams(level=9)
@@ -508,7 +510,7 @@ def test_verify_other_log_is_reported(aisle: VerifiedReport) -> None:
 
 @pytest.mark.usefixtures("cached_pages")
 def test_verify_finds_joined_recording_by_hash(tmp_path: Path) -> None:
-    """And what it is called here does not show."""
+    """The file names differ from those of the report."""
     positions, target = SAMPLES / "aisle_uwb_external.csv", tmp_path / "joined.pdf"
     run_checked("compare", LOG, "--position", positions, "--axis", "down", "-o", target)
     pdf = target.read_bytes()
@@ -528,7 +530,7 @@ def test_verify_finds_joined_recording_by_hash(tmp_path: Path) -> None:
 def test_verify_command_prints_and_writes_verdict(
     tmp_path: Path, aisle: VerifiedReport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    in_this_process(monkeypatch)  # the next one takes one of its own
+    in_this_process(monkeypatch)  # the next test uses a worker process
     target = tmp_path / "verdict.json"
     output = run_checked("verify", REPORT, LOOP_LOG, "--json", target, code=1).output
     assert "other log" in output

@@ -1,4 +1,4 @@
-"""Outputs: each complete or not at all; what is not a regular file stays; messages name files."""
+"""Outputs are complete or absent, special files are kept, and messages name files."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def start(desk: Path, *arguments: str, **kwargs) -> subprocess.Popen[bytes]:
 
 LOOP = ("loop", "s.tum", "--tum", "c.tum")
 
-# --- what is no regular file ---
+# --- special files -------------
 
 
 @posix
@@ -74,7 +74,7 @@ def test_write_named_pipe_is_written_and_kept(desk) -> None:
 
 @posix
 def test_write_device_is_written_and_kept(desk) -> None:
-    """By a link, so that a failure replaces the link and not the machine's device."""
+    """Use a link, so that a failure replaces the link and not the device."""
     link = desk / "null"
     link.symlink_to(os.devnull)
     write_all({link: b"gone"})
@@ -109,7 +109,7 @@ def test_write_symbolic_link_replaces_its_target(tmp_path) -> None:
 
 @posix
 def test_write_dev_stdout_appends_to_redirected_file(desk) -> None:
-    """By a link, so that a failure replaces the link and not the machine's /dev/stdout."""
+    """Use a link, so that a failure replaces the link and not /dev/stdout."""
     out = desk / "out.txt"
     out.write_bytes(b"before\n")
     (desk / "stdout").symlink_to("/dev/stdout")

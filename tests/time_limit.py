@@ -1,4 +1,4 @@
-"""A guard against what does not end; not a measure of speed."""
+"""Time limit for work that may not end; not a measurement of speed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 from collections.abc import Iterator
 from typing import Any
 
-# What is guarded takes a second at most; no machine is a hundred times slower
+# s; the limited work takes 1 s at most, and no computer is 100 times slower
 LIMIT_S = 120.0
 
 
@@ -17,7 +17,7 @@ class TookTooLongError(Exception):
 
 @contextlib.contextmanager
 def time_limit() -> Iterator[None]:
-    """Interrupt what does not end, where the system can."""
+    """Raise TookTooLongError after LIMIT_S, on systems with interval timers."""
 
     def stop(*_: Any) -> None:
         raise TookTooLongError(f"not done within {LIMIT_S:g} s")

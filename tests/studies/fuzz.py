@@ -63,7 +63,7 @@ from px4fuse.verification.pdf_input import read_report  # noqa: E402
 REPOSITORY = TESTS.parent
 REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
 SLOW_S, COMMAND_S = 5.0, 15.0
-# Numbers and words that parsers may handle incorrectly
+# Numbers and texts that parsers may handle incorrectly
 ODD = (
     b"nan", b"-inf", b"1e999", b"-1e-400", b"1.8e308", b"0", b"-0", b"", b"9" * 400, b"0x1p3",
     "١٢".encode(), "−1".encode(), b"1,5", b"1_0", b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"#",
