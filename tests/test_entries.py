@@ -122,7 +122,7 @@ def of_form(points: float, kind: str, **more):
 
 
 def test_class_entries_differing_forms_are_pending() -> None:
-    """Of files submitted together, none counts until the instructor selects one."""
+    """None of the files submitted together counts until the instructor selects one."""
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
     (ada, _), _ = make_entries(files)
     assert ada.total is None

@@ -611,7 +611,7 @@ def assert_same_flight(tlog: Flight, ulog: Flight) -> None:
     assert np.degrees(np.median((one.inv() * other).magnitude())) < 0.5
     truth = differences(tlog, ulog, tlog.truth.samples, ulog.truth.samples, Columns.POSITION)
     assert len(truth) > 1000
-    # the projection origins are the first samples of the two files, some millimetres apart
+    # the projection origins are the first samples of the two files, which differ by millimetres
     assert np.abs(np.median(truth, axis=0)).max() < 0.015
     assert truth.std(axis=0).max() < 0.01
 

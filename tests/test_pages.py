@@ -383,7 +383,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
         content(once(rb"1 0 0 -1 0 0 Tm", b"0.8 0 0 -1 0 0 Tm")), "drawing operation", False,
     ),
     "a text invisible": (content(once(rb"BT 0 Tr", b"BT 3 Tr")), "drawing operation", False),
-    "a letter far aside": (
+    "letter moved": (
         content(once(rb"\)(-?[\d.]+)\(", rb")-9000(")), "text ", False,
     ),
     "a letter a little aside": (
@@ -480,7 +480,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
         catalogue("/PageLabels", dictionary(Nums=array(N(0), dictionary(P=STRING("verified"))))),
         "an entry /PageLabels", True,
     ),
-    "what a viewer shows": (
+    "viewer preferences": (
         catalogue("/ViewerPreferences", dictionary(HideMenubar=ON)), "an entry /HideMenubar", True,
     ),
     "a bookmark": (bookmark, "/Title is 'consistent'", False),

@@ -23,7 +23,7 @@ ROWS = [line for line in SLAM.read_text().splitlines() if not line.startswith("#
 
 
 def results(*arguments: str | Path) -> dict[str, Any]:
-    """What a command prints with ``--json -``."""
+    """Return the JSON that a command prints with ``--json -``."""
     result = run(*arguments, "--json", "-")
     assert result.exit_code == 0, result.output
     assert result.stderr == ""

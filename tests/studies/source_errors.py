@@ -4,18 +4,18 @@
 EKF2 and the ground truth of the JSON file next to each, adds simulated errors of a positioning
 system at several rates, and prints for each model of errors the frequency of each finding, and the
 causes in the summary. ``--pairs`` combines two models. The study is independent of
-``px4fuse.simulation``. EKF2's states are left out, because EKF2 fused other positions. Logs need the
-positions as received (``vehicle_visual_odometry``); positions reconstructed from EKF2 are excluded
-from some findings.
+``px4fuse.simulation``. EKF2's states are left out, because EKF2 fused other positions. Logs need
+the positions as received (``vehicle_visual_odometry``); positions reconstructed from EKF2 are
+excluded from some findings.
 
-Ground truth stays in the flight; ``--no-truth`` removes it, as on an outdoor flight. A flight counts
-as correct if its first finding, except the missing EKF2, is that of the model, and for white noise
-if there is none. The timestamps are correct: the ground truth of JSON files and logs agrees at
-0.000 s. The estimated clock offset is 10 to 20 ms late on average at 0.1 m, which is half its σ; it
-is the same with an IMU simulated from ground truth with other noise, and within 5 ms of zero without
-IMU noise. Several logs of PX4's simulation share one seeded sequence of IMU noise, so their IMU
-errors are not independent. At 2 Hz errors with a time constant of 0.2 s are practically white: their
-correlation between positions is 8 %.
+Ground truth stays in the flight; ``--no-truth`` removes it, as on an outdoor flight. A flight
+counts as correct if its first finding, except the missing EKF2, is that of the model, and for white
+noise if there is none. The timestamps are correct: the ground truth of JSON files and logs agrees
+at 0.000 s. The estimated clock offset is 10 to 20 ms late on average at 0.1 m, which is half its σ;
+it is the same with an IMU simulated from ground truth with other noise, and within 5 ms of zero
+without IMU noise. Several logs of PX4's simulation share one seeded sequence of IMU noise, so their
+IMU errors are not independent. At 2 Hz errors with a time constant of 0.2 s are practically white:
+their correlation between positions is 8 %.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def laid_over(
     flight: Flight, known: CubicSpline, model: Model, rate_hz: float, seed: int,
     sigma_m: float = SIGMA_M,
 ) -> Flight:  # fmt: skip
-    """Return the flight with a position source of such errors, and without EKF2."""
+    """Return the flight with simulated position errors, and without EKF2."""
     rng = np.random.default_rng(seed)
     first = next(track for track in flight.positions if track.origin.is_automatic)
     start, end = max(known.x[0], 0.0), known.x[-1]
