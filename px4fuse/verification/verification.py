@@ -282,7 +282,7 @@ def _verify_with_log(
         page_status = "not compared" if foreign else "differ"
     status: Status = "numbers differ" if mismatches else "cannot verify" if foreign else "verified"
     sentences = [difference.sentence for difference in pages[:SHOWN_PAGES]]
-    sentences += [f"{len(pages) - SHOWN_PAGES} more differences"] * (len(pages) > SHOWN_PAGES)
+    sentences += [f"further differences: {len(pages) - SHOWN_PAGES}"] * (len(pages) > SHOWN_PAGES)
     # the class table shows the first reason
     reasons = [*sentences, *reasons] if status == "cannot verify" else [*reasons, *sentences]
     reasons += [f"made with {others}: only place and texts of figures were compared"] * bool(others)
