@@ -29,6 +29,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from threading import Event
 from typing import Any
 from unittest import mock
 
@@ -569,9 +570,11 @@ def run_logs(
 ) -> dict[str, Outcome]:
     """Return outcomes by kind of change; the same seed gives the same logs."""
     outcomes: dict[str, Outcome] = {}
+    stopped = Event()  # a terminated study prints the table of the logs so far
+    signal.signal(signal.SIGTERM, lambda *_: stopped.set())
     end = time.monotonic() + seconds
     for number in range(first, first + count):
-        if time.monotonic() > end:
+        if stopped.is_set() or time.monotonic() > end:
             break
         rng = random.Random(f"{seed} {number}")
         tlog = rng.random() < 0.2
