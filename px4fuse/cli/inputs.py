@@ -259,7 +259,7 @@ max_size_option = option(
 #: Option --json
 json_option = option(
     "--json FILE",
-    "Write the results as JSON; - prints them to standard output. With --json and without -o, no "
+    "Write the results as JSON; - prints them to standard output. With --json - and without -o, no "
     "report is written.  [default: beside the report]",
     name="json_path",
 )
