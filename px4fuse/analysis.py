@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from px4fuse.comparison.causal_replays import Intervention, interventions, planned_variants
+from px4fuse.comparison.causal_replays import (
+    Intervention,
+    Trial,
+    interventions,
+    planned_variants,
+)
 from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.difference_steps import explain_ekf2_difference, explanation_variants
 from px4fuse.comparison.estimates import (
@@ -110,9 +115,18 @@ class Analysis(Comparison):
         """All axes except the main one."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
-    @cached_property
+    @property
     def causes(self) -> tuple[Intervention, ...]:
         """Re-runs with one change each, and the share of a discrepancy that each explains."""
+        return self._reruns[0]
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """Re-runs along the main axis, with all statistics before and after."""
+        return self._reruns[1]
+
+    @cached_property
+    def _reruns(self) -> tuple[tuple[Intervention, ...], tuple[Trial, ...]]:
         model = self.ekf2_model
         tried = interventions(
             self, self.tuning, self.clock, self.heading, self.bias_scale_jump_fit, model

@@ -73,8 +73,8 @@ class Effect(Record, frozen=True, kw_only=True):
     """
 
     axis: str
-    position_rmse_m: dict[FilterName, NotNegative] = {}
-    horizontal_rmse_m: dict[FilterName, NotNegative] = {}
+    position_rmse_m: Mapping[FilterName, NotNegative] = {}
+    horizontal_rmse_m: Mapping[FilterName, NotNegative] = {}
     difference_rms_m: NotNegative | None = None
     rejected_fraction: Share | None = None
     horizontal_resets: Count | None = None
@@ -257,5 +257,5 @@ class Card(Record, frozen=True, kw_only=True):
     more_causes: Count = 0
     notes: tuple[Note, ...] = ()
     aids: tuple[AidRow, ...] = ()
-    facts: dict[str, str] = {}
+    facts: Mapping[str, str] = {}
     identity: Identity

@@ -5,13 +5,11 @@ segment, and √(mean NEES) at the times of EKF2's published position. One defin
 each reference.
 """
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from px4fuse.arrays import Array
 from px4fuse.card.model import BANDS, FilterName, Reference, Verdict, VerdictWord
-from px4fuse.comparison.comparison import normalised_errors
+from px4fuse.comparison.comparison import normalised_position_errors
 from px4fuse.comparison.model import AxisComparison, FilterSummary
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.flight import Unavailable
@@ -67,7 +65,7 @@ def _against_truth(result: AxisComparison, owner: FilterName) -> Verdict:
     truth = result.filters[owner].truth
     if isinstance(truth, Unavailable):
         return _not_evaluated(owner, "truth", truth)
-    errors = normalised_errors(result, owner)
+    errors = normalised_position_errors(result, owner)
     if isinstance(errors, Unavailable):
         return _not_evaluated(owner, "truth", errors)
     time_s, normalised = errors
@@ -110,8 +108,3 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
     count = (ends - starts)[drawn].sum(axis=1)
     low, high = np.percentile(np.sqrt(total / count), (2.5, 97.5))
     return float(low), float(high)
-
-
-def distance_from_band(verdicts: Iterable[Verdict]) -> float:
-    """Return the sum of |ln ratio| of all evaluated verdicts; 0 for perfect filters."""
-    return sum(abs(float(np.log(each.ratio))) for each in verdicts if each.ratio is not None)

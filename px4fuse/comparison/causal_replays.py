@@ -27,6 +27,7 @@ from px4fuse.comparison.model import (
     AgainstTruth,
     AxisComparison,
     Comparison,
+    Difference,
     FilterName,
     FilterSummary,
     UnjudgedFilter,
@@ -43,8 +44,6 @@ from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, nis_band
 from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.hypotheses import BiasScaleJumpFit
-from px4fuse.filter.kalman import Replay
-from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
@@ -56,7 +55,7 @@ from px4fuse.filter.signals import (
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Columns, Unavailable
-from px4fuse.record import Positive, Record
+from px4fuse.record import Count, NotNegative, Positive, Record, Share
 
 Statistic = Literal["nis", "nees", "difference"]
 Change = Mapping[str, float]
@@ -79,6 +78,16 @@ SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK, TURN, FORWARD))
 # m; smallest SIGMA_Z of a re-run: accuracy of motion capture in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
+# Kind of a change by its name
+KF_KINDS = {
+    SIGMA_A: "noises",
+    SIGMA_Z: "noises",
+    OUTLIERS: "outliers",
+    CLOCK: "time offset",
+    TURN: "rotation",
+    FORWARD: "bias",
+    RIGHT: "bias",
+}
 # Parts of a change that do not count as separate changes
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT))
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
@@ -97,8 +106,74 @@ PARAMETERS_OF_EKF2 = (
 # Columns of north and east
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in LEVEL]
+OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in LEVEL]
+NO_DIFFERENCE = Unavailable(
+    "difference KF - EKF2", "the filters use different frames after the change", ""
+)
+# Ratio of replay and log as flown within which a prediction of EKF2 is printed
+MAX_REPLAY_FACTOR = 1.10
+# Further changes that are combined with the best one
+MAX_PAIRS = 4
 # Misalignments within this many σ are not significant
 HEADING_SIGMAS = 3.0
+
+
+class Outcome(Record, frozen=True, kw_only=True):
+    """Statistics of one filter along one axis in one run.
+
+    Attributes
+    ----------
+    innovations : int
+    nis_mean : float or None
+    position_rmse_m, nees_mean : float or None
+        Against ground truth, at the times of EKF2's published state.
+    difference_rms_m : float or None
+        RMS of KF - EKF2 in position.
+    rejected_fraction : float or None
+        Of EKF2; None for KF, which has no gate.
+    """
+
+    innovations: Count = 0
+    nis_mean: Positive | None = None
+    position_rmse_m: NotNegative | None = None
+    nees_mean: NotNegative | None = None
+    difference_rms_m: NotNegative | None = None
+    rejected_fraction: Share | None = None
+
+    def value(self, statistic: Statistic) -> float | None:
+        """Return one of the three statistics."""
+        return {
+            "nis": self.nis_mean,
+            "nees": self.nees_mean,
+            "difference": self.difference_rms_m,
+        }[statistic]
+
+
+class Trial(Record, frozen=True, kw_only=True):
+    """Re-run of one filter along the main axis with one or two changes.
+
+    Attributes
+    ----------
+    filter : {"kf", "ekf2"}
+    kinds : tuple of str
+        Kind of each change: noises, defaults, outliers, time offset, delay, rotation, bias, noise,
+        gate or process noise.
+    change : mapping from name to value
+        See :class:`Intervention`.
+    before : Outcome
+        As flown, of the same samples: KF as run, EKF2 from the log.
+    after : Outcome
+        With the change; EKF2 by its replay.
+    from_s : float or None
+        Start of the replay.
+    """
+
+    filter: FilterName
+    kinds: tuple[str, ...]
+    change: Change
+    before: Outcome
+    after: Outcome
+    from_s: float | None = None
 
 
 class Intervention(Record, frozen=True, kw_only=True):
@@ -220,8 +295,8 @@ def interventions(
     heading: HeadingError | Unavailable,
     bias_scale_jump_fit: BiasScaleJumpFit | Unavailable,
     model: Model | Unavailable,
-) -> tuple[Intervention, ...]:
-    """Re-run every candidate change for every discrepancy.
+) -> tuple[tuple[Intervention, ...], tuple[Trial, ...]]:
+    """Re-run every candidate change for every discrepancy, and along the main axis.
 
     Parameters
     ----------
@@ -249,7 +324,7 @@ def interventions(
             rows += tried_changes
             if cause := cause_of(tried_changes, changed.owner, result.axis.name, statistic):
                 rows += _difference_reduction(cause, result, changed)
-    return tuple(rows)
+    return tuple(rows), tuple(trial for changed in filters for trial in _try_on_main_axis(changed))
 
 
 def planned_variants(
@@ -271,6 +346,8 @@ def planned_variants(
         for discrepancy in ekf2_changes.discrepancies()
         for change in ekf2_changes.candidates(*discrepancy)
     ]
+    if isinstance(comparison.main.filters["ekf2"], FilterSummary):
+        changes += ekf2_changes.main_axis_candidates(comparison.main)
     return [Variant({**flown, **change}) for change in changes if change.keys() <= flown.keys()]
 
 
@@ -279,17 +356,17 @@ def _difference_reduction(
 ) -> list[Intervention]:
     """Compute the RMS difference KF - EKF2 (m) with and without a cause."""
     before, after = (
-        changed.statistic_after(result, "difference", change) for change in ({}, cause.change)
+        changed.outcome(result, change).difference_rms_m for change in ({}, cause.change)
     )
-    if before is None or after is None:
+    if not before or not after:
         return []
-    explained_share = 1.0 - (after[0] / before[0]) ** 2
+    explained_share = 1.0 - (after / before) ** 2
     return [
         structs.replace(
             cause,
             statistic="difference",
-            before=before[0],
-            after=after[0],
+            before=before,
+            after=after,
             explained_fraction=explained_share,
             is_sufficient=False,
         )
@@ -325,14 +402,13 @@ def _try_candidates(
     )
 
     def rerun(change: Change) -> list[Intervention]:
-        after_change = changed.statistic_after(result, statistic, change)
-        if after_change is None or after_change[0] <= 0.0:
+        outcome = changed.outcome(result, change)
+        after = outcome.value(statistic)
+        if not after:
             return []
-        after, count = after_change
-        low, high = nis_band(count) if statistic == "nis" else (0.0, MIN_NEES_FINDING)
-        nees_after = (
-            changed.statistic_after(result, "nees", change) if is_checked_by_truth else None
-        )
+        is_nis = statistic == "nis"
+        low, high = nis_band(outcome.innovations) if is_nis else (0.0, MIN_NEES_FINDING)
+        nees_after = outcome.nees_mean if is_checked_by_truth else None
         max_nees = MAX_NEES_AFTER_CHANGE if nees is not None and nees > 1.0 else MIN_NEES_FINDING
         return [
             Intervention(
@@ -344,7 +420,7 @@ def _try_candidates(
                 after=after,
                 explained_fraction=1.0 - float(np.log(after) / np.log(before)),
                 is_sufficient=low <= after <= high,
-                contradicts_truth=nees_after is not None and nees_after[0] >= max_nees,
+                contradicts_truth=nees_after is not None and nees_after >= max_nees,
             )
         ]
 
@@ -367,19 +443,80 @@ def _try_candidates(
     ]
 
 
-def _rms_difference(run: Replay, state: pd.DataFrame) -> tuple[float, int] | None:
-    """Return the RMS of KF - EKF2 in position (m) and the number of samples."""
-    kf_minus_ekf2 = difference(run, state)
-    if isinstance(kf_minus_ekf2, Unavailable):
-        return None
-    return kf_minus_ekf2.position_rms_m, kf_minus_ekf2.count
+def _outcome(
+    innovation_m: Array,
+    variance_m2: Array,
+    errors: AgainstTruth | Unavailable,
+    kf_minus_ekf2: Difference | Unavailable,
+    rejected_fraction: float | None = None,
+) -> Outcome:
+    """Collect the statistics of one run; those that cannot be computed are None."""
+    truth = errors if isinstance(errors, AgainstTruth) else None
+    has_innovations = len(innovation_m) > 0
+    return Outcome(
+        innovations=len(innovation_m),
+        nis_mean=float(np.mean(innovation_m**2 / variance_m2)) if has_innovations else None,
+        position_rmse_m=None if truth is None else truth.position_rmse_m,
+        nees_mean=None if truth is None else truth.nees_position_mean,
+        difference_rms_m=None
+        if isinstance(kf_minus_ekf2, Unavailable)
+        else kf_minus_ekf2.position_rms_m,
+        rejected_fraction=rejected_fraction,
+    )
 
 
-def _mean_nees(errors: AgainstTruth | Unavailable) -> tuple[float, int] | None:
-    """Return the mean NEES of position and the number of samples."""
-    if isinstance(errors, Unavailable) or errors.nees_position_mean is None:
-        return None
-    return errors.nees_position_mean, errors.count
+def _try_on_main_axis(changed: _FilterChanges) -> list[Trial]:
+    """Run all candidate changes along the main axis, and the best one with each other one."""
+    result, owner = changed.comparison.main, changed.owner
+    if not isinstance(result.filters[owner], FilterSummary):
+        return []
+    candidates = changed.main_axis_candidates(result)
+    if not candidates:
+        return []
+    before = changed.flown_outcome(result)
+    if before is None:
+        return []
+
+    def run(change: Change) -> Trial:
+        return Trial(
+            filter=owner,
+            kinds=tuple(
+                dict.fromkeys(
+                    changed.kind_of(name) for name in change if name not in ACCOMPANYING_CHANGES
+                )
+            ),
+            change=change,
+            before=before,
+            after=changed.outcome(result, change),
+            from_s=changed.replay_start_s,
+        )
+
+    singles = [run(change) for change in candidates]
+    best = min(singles, key=lambda trial: distance_from_one(trial.after))
+    if distance_from_one(best.after) >= distance_from_one(before):
+        return singles
+    others = [trial for trial in singles if best.change.keys().isdisjoint(trial.change)]
+    return singles + [run({**best.change, **other.change}) for other in others[:MAX_PAIRS]]
+
+
+def distance_from_one(outcome: Outcome) -> float:
+    """Return the sum of |ln ratio| of actual to reported σ, against source and ground truth."""
+    means = [mean for mean in (outcome.nis_mean, outcome.nees_mean) if mean]
+    return sum(0.5 * abs(float(np.log(mean))) for mean in means)
+
+
+def _agrees(logged: Outcome, replayed: Outcome) -> bool:
+    """Return True if a replay as flown has the RMSE and the ratios of the log within 10 %."""
+    pairs = (
+        (logged.position_rmse_m, replayed.position_rmse_m, MAX_REPLAY_FACTOR),
+        (logged.nis_mean, replayed.nis_mean, MAX_REPLAY_FACTOR**2),
+        (logged.nees_mean, replayed.nees_mean, MAX_REPLAY_FACTOR**2),
+    )
+    return all(
+        one and other and 1.0 / factor <= one / other <= factor
+        for one, other, factor in pairs
+        if one is not None
+    )
 
 
 def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
@@ -423,10 +560,33 @@ class _FilterChanges:
         """Return further candidates; ``tuned`` is None if the reported σ is too large."""
 
     @abstractmethod
-    def statistic_after(
-        self, result: AxisComparison, statistic: Statistic, change: Change
-    ) -> tuple[float, int] | None:
-        """Return a statistic along an axis after a change, and the number of its samples."""
+    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
+        """Run the filter along an axis with a change; without one, as flown."""
+
+    @abstractmethod
+    def kind_of(self, name: str) -> str:
+        """Return the kind of a change by the name of its setting or parameter."""
+
+    @property
+    def replay_start_s(self) -> float | None:
+        """Time (s) from which a re-run is evaluated; None for the whole segment."""
+        return None
+
+    def flown_outcome(self, result: AxisComparison) -> Outcome | None:
+        """Return the statistics as flown, of the same samples as a re-run.
+
+        None if a re-run without a change has other statistics, so that nothing is comparable.
+        """
+        return self.outcome(result, {})
+
+    def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
+        """Return the candidate changes along the main axis, each once."""
+        changes: list[Change] = []
+        for statistic in ("nis", "nees"):
+            changes += [
+                change for change in self.candidates(result, statistic) if change not in changes
+            ]
+        return changes
 
     def candidates(self, result: AxisComparison, statistic: Statistic) -> list[Change]:
         """Return the candidate changes for a discrepancy along an axis."""
@@ -466,6 +626,25 @@ class _KfChanges(_FilterChanges):
     bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
 
     owner = "kf"
+
+    def kind_of(self, name: str) -> str:
+        """Return the kind of a change of KF."""
+        return KF_KINDS[name]
+
+    def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
+        """Return the candidates, both noises together, and the default settings."""
+        changes = super().main_axis_candidates(result)
+        noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
+        if len(noises) > 1:
+            changes.append({name: value for change in noises for name, value in change.items()})
+        chosen, default = self.comparison.settings, Settings()
+        names = (SIGMA_A,) if self.comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
+        defaults = {
+            name: getattr(default, name)
+            for name in names
+            if getattr(chosen, name) != getattr(default, name)
+        }
+        return [*changes, *([defaults] if defaults and noises else [])]
 
     def noise_candidates(
         self, statement: FilterSummary, tuned: AxisTuning, over: bool
@@ -510,10 +689,8 @@ class _KfChanges(_FilterChanges):
             return corrected_ned
         return project_acceleration(corrected_ned, direction, self.comparison.segment)
 
-    def statistic_after(
-        self, result: AxisComparison, statistic: Statistic, change: Change
-    ) -> tuple[float, int] | None:
-        """Re-run KF with the change."""
+    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
+        """Run KF with the change."""
         source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
         kf_settings: dict[str, Any] = {
             name: change[name] for name in change if name in vars(Settings())
@@ -543,19 +720,15 @@ class _KfChanges(_FilterChanges):
             measurement_time_s=time_s[is_used] + shift_s,
             measurement_m=axis.measurement_m[is_used],
         )
-        if statistic == "nis":
-            legs = preintegrate(axis, settings)
-            nu, s = innovations(legs, settings.sigma_a_m_s2, settings.sigma_z_m)
-            return float(np.mean(nu**2 / s)), len(nu)
-        run = quick_replay(axis, settings)
-        if statistic == "difference":
-            state = result.ekf2_state
-            return (
-                None
-                if is_gnss_rotation or isinstance(state, Unavailable)
-                else _rms_difference(run, state)
-            )
-        return _mean_nees(kf_error_statistics(run, truth, run.steps))
+        run, state = quick_replay(axis, settings), result.ekf2_state
+        return _outcome(
+            run.updates["innovation_m"].to_numpy(),
+            run.updates["innovation_variance_m2"].to_numpy(),
+            kf_error_statistics(run, truth, state),
+            NO_DIFFERENCE
+            if is_gnss_rotation or isinstance(state, Unavailable)
+            else difference(run, state),
+        )
 
 
 @dataclass(frozen=True)
@@ -570,6 +743,43 @@ class _Ekf2Changes(_FilterChanges):
     replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
     owner = "ekf2"
+
+    def kind_of(self, name: str) -> str:
+        """Return the kind of a change of EKF2."""
+        aid = self.inputs.aid
+        kinds = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
+        return KF_KINDS.get(name) or kinds.get(name, "process noise")
+
+    @property
+    def replay_start_s(self) -> float | None:
+        """Time (s) from which the replay is evaluated."""
+        return None if self.model is None else self.model.flown.evaluated_s[0][0]
+
+    def flown_outcome(self, result: AxisComparison) -> Outcome | None:
+        """Return the statistics of the log in the replayed spans; None if the replay differs."""
+        logged, innovations = result.ekf2_state, result.ekf2_innovations
+        if self.model is None or isinstance(logged, Unavailable):
+            return None
+        assert not isinstance(innovations, Unavailable)  # a FilterSummary needs them
+        compared_s = self.model.flown.evaluated_s
+        state = logged[inside_spans(logged.index, compared_s)]
+        innovations = innovations[inside_spans(innovations.index, compared_s)]
+        rejected = innovations["rejected"].dropna()
+        in_log = _outcome(
+            innovations["innovation_m"].to_numpy(),
+            innovations["innovation_variance_m2"].to_numpy(),
+            error_statistics(state, result.ekf2_variance, result.truth),
+            difference(result.replay, state),
+            float((rejected > 0.0).mean()) if len(rejected) else None,
+        )
+        return in_log if _agrees(in_log, self.outcome(result, {})) else None
+
+    def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
+        """Return the candidates; a delay also as a shift of the timestamps by the sender."""
+        changes = super().main_axis_candidates(result)
+        delays = [change for change in changes if self.inputs.aid.delay in change]
+        offsets = super().time_offset_candidates() if delays else []
+        return [*changes, *(offset for offset in offsets if offset not in changes)]
 
     @property
     def used_m(self) -> float:
@@ -625,37 +835,45 @@ class _Ekf2Changes(_FilterChanges):
             ml_noise_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
         return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, ml_noise_m)]
 
-    def statistic_after(
-        self, result: AxisComparison, statistic: Statistic, change: Change
-    ) -> tuple[float, int] | None:
+    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
         """Replay EKF2 with the change; the difference without a change is from the log."""
         assert self.model is not None
-        compared_s, axis = self.model.flown.evaluated_s, result.axis
+        compared_s, axis, segment = (
+            self.model.flown.evaluated_s,
+            result.axis,
+            self.comparison.segment,
+        )
         ekf2_replay = self._replay_with(self.model, change)
         if TURN in change and self.comparison.source.origin.is_gnss:
             # the change corrects the attitude: only its frame rotates, north stays
             axis = replace(axis, direction=_rotate_direction(axis.direction, -change[TURN]))
         weights = axis.direction[:2]
-        updates = ekf2_replay.updates[inside_spans(ekf2_replay.updates.index, compared_s)]
-        if statistic == "nis":
-            nu = along(updates, INNOVATION_COLUMNS, weights)
-            s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
-            return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
-        state = project(ekf2_replay.published, axis, self.comparison.segment)
-        if statistic == "difference":
-            logged = result.ekf2_state
-            state = state if change or isinstance(logged, Unavailable) else logged
-            return _rms_difference(result.replay, state[inside_spans(state.index, compared_s)])
-        at_s, track = (
-            updates["fused_at_s"],
-            along(ekf2_replay.delayed, Columns.POSITION, axis.direction),
+        updates = ekf2_replay.updates
+        updates = updates[inside_spans(updates.index, compared_s)]
+        innovation_variance_m2 = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
+        prior_m2 = innovation_variance_m2 - along(updates, OBSERVATION_VARIANCES, weights**2)
+        posterior_m2 = along(updates, POSITION_VARIANCES, weights**2)
+        variance = pd.DataFrame(
+            {
+                "position_variance_m2": 0.5 * (prior_m2 + posterior_m2),
+                "velocity_variance_m2_s2": np.nan,
+            },
+            index=pd.Index(updates["fused_at_s"].to_numpy()),
         )
-        horizon_columns = {
-            "position_m": np.interp(at_s, ekf2_replay.delayed.index, track),
-            "position_variance_m2": along(updates, POSITION_VARIANCES, weights**2),
-        }
-        horizon = pd.DataFrame(horizon_columns, index=pd.Index(at_s))
-        return _mean_nees(error_statistics(state, result.ekf2_variance, result.truth, horizon))
+        published = project(ekf2_replay.published, axis, segment)
+        published = published[inside_spans(published.index, compared_s)]
+        logged = result.ekf2_state
+        if not change and not isinstance(logged, Unavailable):
+            compared = logged[inside_spans(logged.index, compared_s)]
+        else:
+            compared = published
+        return _outcome(
+            along(updates, INNOVATION_COLUMNS, weights),
+            innovation_variance_m2,
+            error_statistics(published, variance, result.truth),
+            difference(result.replay, compared),
+            float((updates["rejected"] > 0.0).mean()) if len(updates) else None,
+        )
 
     def _replay_with(self, model: Model, change: Change) -> Ekf2Replay:
         """Return the replay of EKF2 with a change, from the cache if available."""

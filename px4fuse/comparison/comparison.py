@@ -88,13 +88,12 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
     variance: Frame
     innovations: Frame
     axis_difference: Difference | Unavailable
-    horizon, gate = None, GATE_SIGMA if isinstance(ekf2, Unavailable) else ekf2.gate
+    gate = GATE_SIGMA if isinstance(ekf2, Unavailable) else ekf2.gate
     if isinstance(ekf2, Unavailable):
         state = variance = innovations = axis_difference = ekf2
     else:
         state = projection.project(ekf2.state, axis, segment)
         variance = projection.project_variance(ekf2, axis, segment)
-        horizon = projection.project_horizon(ekf2, axis, segment)
         innovations = projection.project_innovations(flight, ekf2, prepared.source, axis, segment)
         axis_difference = difference(kf_run, state)
     updates = kf_run.updates.assign(
@@ -118,7 +117,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
                 updates, kf_run.steps, kf_error_statistics(kf_run, truth, state), GATE_SIGMA
             ),
             "ekf2": _summarise_filter(
-                innovations, variance, error_statistics(state, variance, truth, horizon), gate
+                innovations, variance, error_statistics(state, variance, truth), gate
             ),
         },
         difference=axis_difference,
@@ -183,68 +182,106 @@ def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailabl
 
 
 def _rmse(error: Array) -> float:
-    return float(np.sqrt(np.mean(error**2)))
+    """Return the root mean square of the known errors."""
+    return float(np.sqrt(np.nanmean(error**2)))
 
 
 def kf_error_statistics(run: Replay, truth: Frame, ekf2_state: Frame) -> AgainstTruth | Unavailable:
     """Compute KF's errors against ground truth at EKF2's sample times, else at KF's steps."""
     times = (run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index.to_numpy()
+    return error_statistics(*kf_state_and_variance(run, times), truth)
+
+
+def kf_state_and_variance(run: Replay, times: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return state and variances of KF at other times (s)."""
     state, variance = (
         pd.DataFrame(dict(zip(columns, state_function(run, times), strict=True)), index=times)
         for columns, state_function in ((STATE, state_at), (VARIANCES, variance_at))
     )
-    return error_statistics(state, variance, truth)
+    return state, variance
 
 
-def error_statistics(
-    state: Frame, variance: Frame, truth: Frame, horizon: pd.DataFrame | None = None
-) -> AgainstTruth | Unavailable:
-    """Compute errors of a filter against ground truth along one axis, and its NEES.
+def error_statistics(state: Frame, variance: Frame, truth: Frame) -> AgainstTruth | Unavailable:
+    """Compute errors of a filter against ground truth along one axis, and its mean NEES.
 
-    NEES is computed at the timestamps of ``variance``. If the variances do not belong to ``state``,
-    ``horizon`` contains the positions with their variances.
+    All numbers are of the times of ``state``. Variances are interpolated to them, because EKF2's
+    are logged at a tenth of the rate.
     """
     if isinstance(state, Unavailable):
         return state
     if isinstance(truth, Unavailable):
         return truth
-    time_s = state.index.to_numpy()
-    errors = [
-        state[column].to_numpy() - np.interp(time_s, truth.index, truth[column], np.nan, np.nan)
-        for column in STATE
-    ]
-    position, velocity = (error[np.isfinite(error)] for error in errors)
-    if len(position) < projection.MIN_COMMON_SAMPLES:
+    position_m, velocity_m_s = (_errors(state, truth, column) for column in STATE)
+    if np.isfinite(position_m).sum() < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "error against ground truth", "no common samples", "Choose a segment with ground truth."
         )
-    # EKF2's variances are logged at a tenth of the state's rate: NEES uses their timestamps
-    nees = {
-        variance_column: _mean_nees(time_s, error, variance[variance_column])
-        for variance_column, error in zip(VARIANCES, errors, strict=True)
-        if not isinstance(variance, Unavailable)
-    }
-    if horizon is not None:
-        true_m = np.interp(horizon.index, truth.index, truth["position_m"], np.nan, np.nan)
-        error = horizon["position_m"].to_numpy() - true_m
-        variance_column = horizon["position_variance_m2"]
-        nees[VARIANCES[0]] = _mean_nees(horizon.index.to_numpy(), error, variance_column)
+    nees_position, nees_velocity = (
+        _mean_nees(normalise_errors(state.index.to_numpy(), error, variance, column))
+        for error, column in zip((position_m, velocity_m_s), VARIANCES, strict=True)
+    )
     return AgainstTruth(
-        count=len(position),
-        position_rmse_m=_rmse(position),
-        velocity_rmse_m_s=_rmse(velocity) if len(velocity) else None,
-        nees_position_mean=nees.get(VARIANCES[0]),
-        nees_velocity_mean=nees.get(VARIANCES[1]),
+        count=int(np.isfinite(position_m).sum()),
+        position_rmse_m=_rmse(position_m),
+        velocity_rmse_m_s=_rmse(velocity_m_s) if np.isfinite(velocity_m_s).any() else None,
+        nees_position_mean=nees_position,
+        nees_velocity_mean=nees_velocity,
     )
 
 
-def _mean_nees(at_s: Array, error: Array, variance: pd.Series) -> float | None:
-    is_known = np.isfinite(error)
+def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
+    """Return state minus ground truth at the times of the state; NaN where one is unknown."""
+    true = np.interp(state.index, truth.index, truth[column], np.nan, np.nan)
+    return np.asarray(state[column].to_numpy() - true)
+
+
+def normalise_errors(time_s: Array, error: Array, variance: Frame, column: str) -> Array:
+    """Return errors over the reported σ, interpolated to their times; NaN where unknown."""
+    if isinstance(variance, Unavailable):
+        return np.full(len(time_s), np.nan)
+    known = variance[column].dropna()
+    if known.empty:
+        return np.full(len(time_s), np.nan)
+    reported = np.interp(time_s, known.index, known, np.nan, np.nan)
+    return np.asarray(error / np.sqrt(np.where(reported > 0.0, reported, np.nan)))
+
+
+def _mean_nees(normalised: Array) -> float | None:
+    return float(np.nanmean(np.square(normalised))) if np.isfinite(normalised).any() else None
+
+
+def normalised_position_errors(
+    result: AxisComparison, owner: FilterName
+) -> tuple[Array, Array] | Unavailable:
+    """Return times (s) and position errors over the reported σ of one filter along an axis.
+
+    Times are those of EKF2's published state, or KF's steps without EKF2.
+    """
+    if isinstance(result.truth, Unavailable):
+        return result.truth
+    if owner == "kf":
+        times = (
+            result.replay.steps if isinstance(result.ekf2_state, Unavailable) else result.ekf2_state
+        ).index.to_numpy()
+        state, variance = kf_state_and_variance(result.replay, times)
+    elif isinstance(result.ekf2_state, Unavailable):
+        return result.ekf2_state
+    elif isinstance(result.ekf2_variance, Unavailable):
+        return result.ekf2_variance
+    else:
+        state, variance = result.ekf2_state, result.ekf2_variance
+    time_s = state.index.to_numpy()
+    normalised = normalise_errors(
+        time_s, _errors(state, result.truth, STATE[0]), variance, VARIANCES[0]
+    )
+    is_known = np.isfinite(normalised)
     if not is_known.any():
-        return None
-    error_at_variance = np.interp(variance.index, at_s[is_known], error[is_known], np.nan, np.nan)
-    normalised = np.square(error_at_variance) / variance.to_numpy()
-    return float(np.nanmean(normalised)) if np.isfinite(normalised).any() else None
+        return Unavailable(
+            "error against ground truth",
+            "no sample has both a reported σ and ground truth",
+            "Choose a segment with both.",
+        )
+    return time_s[is_known], normalised[is_known]
 
 
 def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:

@@ -32,10 +32,9 @@ FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 class AgainstTruth(Record, frozen=True, kw_only=True):
     """Errors of one filter against ground truth, which no filter used.
 
-    NEES is per component (expected 1). It has no band, because it is strongly autocorrelated within
-    one flight. EKF2's position NEES uses the position at the fusion horizon, to which the variance
-    belongs, if that is logged; errors use EKF2's published state. None if the variance or the true
-    velocity is not available.
+    NEES is per component (expected 1), of the same samples as the errors: at the times of EKF2's
+    published state. It has no chi-square band, because errors are correlated within one flight.
+    None if the variance or the true velocity is not available.
     """
 
     count: Count

@@ -192,7 +192,7 @@ def _action(label: str, width: int, action: Action) -> Iterator[Line]:
 def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
     if not reruns:
         return
-    columns = [
+    columns: list[tuple[str, list[str]]] = [
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
             "position RMSE",
