@@ -1,0 +1,402 @@
+"""Diagnosis card of an analysis."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from px4fuse.analysis import Analysis
+from px4fuse.card.causes import FILTER_NAMES, RankedCause, is_default, make_cause, rank_causes
+from px4fuse.card.model import (
+    MAX_CAUSES,
+    MAX_HEADLINE_LENGTH,
+    Action,
+    Card,
+    CardSeverity,
+    Cause,
+    Effect,
+    FilterName,
+    Identity,
+    Note,
+    Verdict,
+)
+from px4fuse.card.numbers import format_metres, format_ratio
+from px4fuse.card.verdicts import verdicts as make_verdicts
+from px4fuse.comparison.model import AgainstTruth, AxisComparison, FilterSummary
+from px4fuse.comparison.remedy import aid_of
+from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.model import Finding, by_root
+from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.request import OPTIONS, ComparisonRequest, command_line
+from px4fuse.results.model import NO_STUDENT, Student
+
+MAX_NOTES = 3
+MAX_ACTIONS = 3
+# Rejected fraction and resets from which the effect names them
+MIN_NAMED_REJECTION = 0.01
+NO_FAULT = "No fault found: KF and EKF2 are consistent"
+# Findings of a source whose errors the innovations cannot show
+SHIFTED_SOURCE = frozenset(
+    {"source_time_offset", "source_scale_error", "source_frame_misaligned", "source_position_jump"}
+)
+DRIFTING_SOURCE = frozenset({"source_drift", "source_may_drift", "loop_drift_too_small"})
+
+
+def build_card(
+    analysis: Analysis,
+    findings: Sequence[Finding],
+    request: ComparisonRequest,
+    student: Student = NO_STUDENT,
+) -> Card:
+    """Return the diagnosis card of a comparison.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    findings : sequence of Finding
+        Most severe first, consequences behind their cause.
+    request : ComparisonRequest
+        Makes the commands; without paths, they are for the folder of the log.
+    student : Student
+    """
+    result = analysis.main
+    roots = [group[0] for group in by_root(findings)]
+    verdicts = make_verdicts(result)
+    ranked = rank_causes(analysis, roots)
+    causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
+    verdicts = _mark_explained(verdicts, causes)
+    effect = _effect(analysis)
+    severity: CardSeverity = causes[0].severity if causes else _severity_without_cause(verdicts)
+    return Card(
+        severity=severity,
+        id=causes[0].id if causes else "",
+        headline=_headline(causes, verdicts),
+        effect=effect,
+        effect_text=_effect_text(analysis, effect, verdicts),
+        do_this=_do_this(causes),
+        verdicts=verdicts,
+        reconcile=_reconcile(analysis, verdicts, [one.id for one in findings]),
+        difference=_difference(effect, ranked),
+        causes=causes,
+        more_causes=max(len(ranked) - MAX_CAUSES, 0),
+        notes=_notes(roots),
+        identity=_identity(analysis, request, student),
+    )
+
+
+def _severity_without_cause(verdicts: Sequence[Verdict]) -> CardSeverity:
+    words = {verdict.word for verdict in verdicts}
+    return "note" if words & {"overconfident", "underconfident"} else "clean"
+
+
+def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
+    """Return fault and size of the first cause; a second error follows if there is room."""
+    if causes:
+        first, *others = causes
+        for other in others:
+            both = f"{first.title}; {other.title[0].lower()}{other.title[1:]}"
+            if other.severity == "error" and len(both) <= MAX_HEADLINE_LENGTH:
+                return both
+        return first.title
+    faulty = [each for each in verdicts if each.word in ("overconfident", "underconfident")]
+    if faulty:
+        worst = max(faulty, key=lambda each: abs(math.log(each.ratio or 1.0)))
+        size = worst.ratio or 1.0
+        direction = "small" if size > 1.0 else "large"
+        factor = format_ratio(max(size, 1.0 / size))
+        return (
+            f"{FILTER_NAMES[worst.filter]} {worst.word}: σ {factor} times too {direction} against "
+            f"{'the source' if worst.against == 'source' else 'ground truth'}"
+        )
+    if all(each.word == "not evaluated" for each in verdicts):
+        return "No fault found; KF and EKF2 could not be evaluated"
+    tested = {each.filter for each in verdicts if each.word == "consistent"}
+    return (
+        NO_FAULT
+        if len(tested) == 2
+        else f"No fault found: {FILTER_NAMES[tested.pop()]} is consistent"
+    )
+
+
+def _effect(analysis: Analysis) -> Effect:
+    result = analysis.main
+    ekf2, segment = analysis.flight.ekf2, analysis.segment
+    resets = None
+    if isinstance(ekf2, Ekf2):
+        resets = sum(
+            reset.quantity == "position"
+            and any(reset.delta[:2])
+            and segment.start_s < reset.time_s <= segment.end_s
+            for reset in ekf2.resets
+        )
+    difference = result.difference
+    return Effect(
+        axis=describe_axis(analysis, result),
+        position_rmse_m={
+            owner: truth.position_rmse_m
+            for owner, statement in result.filters.items()
+            if isinstance(truth := statement.truth, AgainstTruth)
+        },
+        horizontal_rmse_m=_horizontal_rmse_m(analysis),
+        difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
+        rejected_fraction=result.rejected_fraction,
+        horizontal_resets=resets,
+    )
+
+
+def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
+    """Format the axis with its reference: "along the aisle, 30° from north"."""
+    called, heading = result.axis.called, result.heading_deg
+    if result.axis.name != "aisle" or heading is None:
+        return f"along {called}"
+    reference = "north"
+    if analysis.source.frame == "FRD":
+        reference = f"the x axis of {analysis.source.name}"
+    return f"along {called}, {heading % 180.0:.0f}° from {reference}"
+
+
+def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
+    found: dict[FilterName, float] = {}
+    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
+    for owner in FILTER_NAMES:
+        truths = [axis.filters[owner].truth for axis in axes]
+        known = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
+        if len(known) == 2:
+            found[owner] = math.hypot(*known)
+    return found
+
+
+def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
+    """Make the sentences about errors, their ratios to σ, rejections and resets."""
+    sentences = []
+    if effect.position_rmse_m:
+        sentences.append(
+            f"Position RMSE against ground truth along {analysis.main.axis.called}: "
+            f"{_by_filter(effect.position_rmse_m)}"
+            f"{_in_brackets('horizontal', effect.horizontal_rmse_m)}."
+        )
+        for verdict in verdicts:
+            if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent":
+                sentences.append(
+                    f"The error of {FILTER_NAMES[verdict.filter]} is {format_ratio(verdict.ratio)} "
+                    "times its reported σ."
+                )
+    if effect.difference_rms_m is not None and (
+        not effect.position_rmse_m or all(each.word == "consistent" for each in verdicts)
+    ):
+        sentences.append(f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS.")
+    if not effect.position_rmse_m:
+        sentences.append(
+            "The log has no ground truth, so it does not show which filter is more accurate."
+        )
+    if (rejected := effect.rejected_fraction) is not None and rejected >= MIN_NAMED_REJECTION:
+        sentences.append(f"EKF2 rejected {100.0 * rejected:.0f} % of the positions.")
+    if effect.horizontal_resets:
+        times = "once" if effect.horizontal_resets == 1 else f"{effect.horizontal_resets} times"
+        sentences.append(f"EKF2 reset its horizontal position {times}.")
+    return " ".join(sentences)
+
+
+def _by_filter(lengths_m: Mapping[FilterName, float]) -> str:
+    return ", ".join(
+        f"{FILTER_NAMES[owner]} {format_metres(length_m)} m"
+        for owner, length_m in lengths_m.items()
+    )
+
+
+def _in_brackets(label: str, lengths_m: Mapping[FilterName, float]) -> str:
+    return f" ({label}: {_by_filter(lengths_m)})" if lengths_m else ""
+
+
+def _do_this(causes: Sequence[Cause]) -> tuple[str, ...]:
+    """Return the first actions of the causes, at most three."""
+    texts: list[str] = []
+    for cause in causes:
+        for alternative in cause.alternatives[:1]:
+            texts += [_sentence(action) for action in alternative]
+        texts += [_sentence(action) for action in cause.actions if _is_change(action)]
+    return tuple(dict.fromkeys(texts))[:MAX_ACTIONS] if causes else ("Change nothing.",)
+
+
+def _is_change(action: Action) -> bool:
+    return bool(action.commands) or not action.sentence.startswith("no ")
+
+
+def _sentence(action: Action) -> str:
+    if action.where == "console":
+        return f"EKF2: set {action.sentence}."
+    if action.where == "shell":
+        options = action.commands[0].partition(" --")[2]
+        return f"KF: run again with --{options}." if options else f"Run {action.commands[0]}."
+    text = action.sentence.rstrip(".")
+    return f"{action.target[0].upper()}{action.target[1:]}: {text[0].lower()}{text[1:]}."
+
+
+def _mark_explained(verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> tuple[Verdict, ...]:
+    """Mark verdicts that are not consistent, but for which nothing has to be changed."""
+    from msgspec.structs import replace
+
+    unchanged = {
+        action.target
+        for cause in causes
+        for action in cause.actions
+        if action.sentence.startswith("no change")
+    }
+    truth_is_right = {
+        verdict.filter
+        for verdict in verdicts
+        if verdict.against == "truth" and verdict.word == "consistent"
+    }
+    return tuple(
+        replace(verdict, is_explained=True)
+        if verdict.word in ("overconfident", "underconfident")
+        and (FILTER_NAMES[verdict.filter] in unchanged or verdict.filter in truth_is_right)
+        else verdict
+        for verdict in verdicts
+    )
+
+
+def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], ids: Sequence[str]) -> str:
+    """Explain two verdicts of one filter that differ."""
+    differing = [
+        owner
+        for owner in FILTER_NAMES
+        if _differ(*(verdict for verdict in verdicts if verdict.filter == owner))
+    ]
+    if not differing:
+        return ""
+    if not SHIFTED_SOURCE.isdisjoint(ids):
+        return (
+            "The two verdicts of each filter differ: both filters follow the wrong positions, so "
+            "the innovations stay small and cannot show it. Ground truth does."
+        )
+    tuned = analysis.tuning.get(HORIZONTAL)
+    if analysis.source.origin.may_drift:
+        noise = ""
+        if isinstance(tuned, AxisTuning) and (sigma := tuned.sigma_z.value or tuned.sigma_z.high):
+            noise = f" of {format_metres(sigma)} m"
+        return (
+            f"Source: the noise{noise} from sample to sample is less than both filters assume. "
+            "Ground truth: the source as a whole drifts, which no innovation can show."
+        )
+    if "source_noise_time_correlated" in ids:
+        return (
+            "Innovations show only the error that changes from sample to sample. Both filters "
+            "follow the slow part, so it shows against ground truth alone."
+        )
+    if "source_outliers" in ids and "ekf2" in differing:
+        return _gate_sentence(analysis)
+    return "The two verdicts differ, and no tested change explains it."
+
+
+def _differ(source: Verdict, truth: Verdict) -> bool:
+    if source.ratio is None or truth.ratio is None:
+        return False
+    return source.word != truth.word or truth.ratio > 2.0 * source.ratio
+
+
+def _gate_sentence(analysis: Analysis) -> str:
+    """State that EKF2's gate rejected the outliers, with the ratio of the accepted positions."""
+    innovations = analysis.main.ekf2_innovations
+    assert not isinstance(innovations, Unavailable)  # EKF2's verdict needs them
+    accepted = innovations[~(innovations["rejected"] > 0.0)]
+    ratio = math.sqrt(
+        float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
+    )
+    rejected = int((innovations["rejected"] > 0.0).sum())
+    return (
+        f"EKF2's gate rejected {rejected} of {len(innovations)} positions. They count among the "
+        f"innovations, but did not move its state. Over the accepted positions its innovation ÷ √S "
+        f"is {format_ratio(ratio)}."
+    )
+
+
+def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
+    """State the difference KF - EKF2 before and after the fix of the first cause."""
+    if effect.difference_rms_m is None or not ranked:
+        return ""
+    text = f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
+    trials = ranked[0].trials
+    owners = {trial.filter for trial in trials}
+    if len(owners) == 2:
+        return f"{text}. Both filters have the fault, so this difference does not show it."
+    after = [trial.after.difference_rms_m for trial in trials]
+    if not after or after[0] is None:
+        return f"{text}."
+    predicted = "predicted " if owners == {"ekf2"} else ""
+    return f"{text}; {format_metres(after[0])} m {predicted}after the fix."
+
+
+def _notes(roots: Sequence[Finding]) -> tuple[Note, ...]:
+    notes = [one for one in roots if one.severity == "note"]
+    return tuple(Note(one.id, f"{one.title}.", one.remedy) for one in notes[:MAX_NOTES])
+
+
+def _identity(analysis: Analysis, request: ComparisonRequest, student: Student) -> Identity:
+    log, source, segment = analysis.flight.log, analysis.source, analysis.segment
+    from importlib import metadata
+
+    return Identity(
+        file=log.name,
+        firmware=log.firmware,
+        hardware=log.hardware,
+        duration_s=log.duration_s,
+        source=f"{source.origin.kind.upper()} {source.rate_hz:.1f} Hz",
+        settings=_settings(analysis, request),
+        changed=_changed_settings(request),
+        parameters=_changed_parameters(analysis),
+        segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
+        command=command_line(request.without_paths()),
+        student=student.name,
+        student_id=student.id,
+        version=f"px4fuse {metadata.version('px4fuse')}",
+    )
+
+
+def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
+    """Format the three settings of KF with their origin."""
+    chosen = analysis.settings
+    texts = []
+    for name, label, unit in (
+        ("sigma_a_m_s2", "SIGMA_A", "m/s²"),
+        ("sigma_z_m", "SIGMA_Z", "m"),
+        ("dt_s", "DT", "s"),
+    ):
+        origin = "default" if is_default(chosen, name) else "set by option"
+        if name == "sigma_z_m" and request.sigma_z_m is None and not is_default(chosen, name):
+            origin = f"from {aid_of(analysis).noise}"
+        texts.append(f"{label} {getattr(chosen, name):g} {unit} ({origin})")
+    return ", ".join(texts)
+
+
+def _changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
+    defaults = Settings()
+    return tuple(
+        f"{OPTIONS[name].name} {value:g} (default {getattr(defaults, name):g})"
+        for name in ("sigma_a_m_s2", "sigma_z_m", "dt_s")
+        if (value := getattr(request, name)) is not None and value != getattr(defaults, name)
+    )
+
+
+def _changed_parameters(analysis: Analysis) -> tuple[str, ...]:
+    """Format noise, delay and gate of EKF2 for the source that differ from PX4's default."""
+    if analysis.source.origin.aid is None:
+        return ()
+    aid, logged = analysis.source.origin.aid, analysis.flight.log.parameters
+    texts = []
+    for name in (aid.noise, aid.delay, aid.gate):
+        parameter, value = PARAMETERS.get(name), logged.get(name)
+        if (
+            parameter is None
+            or value is None
+            or math.isclose(value, parameter.default, rel_tol=1e-3)
+        ):
+            continue
+        unit = f" {parameter.unit}" if parameter.unit else ""
+        texts.append(f"{name} {value:.4g}{unit} (PX4 default {parameter.default:g})")
+    return tuple(texts)
+
+
+def has_summary(result: AxisComparison, owner: FilterName) -> bool:
+    """Return True if a filter has a consistency result along an axis."""
+    return isinstance(result.filters[owner], FilterSummary)

@@ -1,0 +1,394 @@
+"""Order of the causes on the card, their actions, and the re-runs that confirm them.
+
+A finding is a numbered cause only if its re-run moves a verdict or the error, or if nothing can be
+re-run for it. An action on a filter is printed only if its re-run improves that filter.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from px4fuse.analysis import Analysis
+from px4fuse.card.model import BANDS, Action, Cause, FilterName, Improvement, Rerun, Target, Verdict
+from px4fuse.card.numbers import format_metres
+from px4fuse.card.verdicts import word_of
+from px4fuse.comparison.causal_replays import (
+    CLOCK,
+    OUTLIERS,
+    SIGMA_A,
+    SIGMA_Z,
+    Outcome,
+    Trial,
+    distance_from_one,
+)
+from px4fuse.comparison.remedy import aid_of
+from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.settings import Settings
+from px4fuse.findings.model import Finding
+from px4fuse.flight import Unavailable
+from px4fuse.request import OPTIONS, ComparisonRequest, command_line
+
+# Kinds of change that re-run a finding, by its id
+RERUN_KINDS: Mapping[str, frozenset[str]] = {
+    "source_time_offset": frozenset({"time offset", "delay"}),
+    "ekf2_ev_delay_wrong": frozenset({"delay", "time offset"}),
+    "source_outliers": frozenset({"outliers"}),
+    "source_frame_misaligned": frozenset({"rotation"}),
+    "ekf2_heading_error": frozenset({"rotation"}),
+    "accelerometer_bias": frozenset({"bias"}),
+    "sigma_a_too_small": frozenset({"noises"}),
+    "sigma_a_too_large": frozenset({"noises"}),
+    "sigma_z_too_small": frozenset({"noises"}),
+    "sigma_z_too_large": frozenset({"noises"}),
+    "process_noise_near_zero": frozenset({"noises"}),
+    "ekf2_gate_too_small": frozenset({"gate"}),
+    "ekf2_rejects_positions": frozenset({"noise", "gate"}),
+    "ekf2_noise_too_small": frozenset({"noise", "noises"}),
+    "ekf2_noise_too_large": frozenset({"noise", "noises"}),
+}
+# Findings without which the rest of the card is meaningless; they come first
+MEANINGLESS = (
+    "log_damaged",
+    "not_px4",
+    "autopilot_restarted",
+    "imu_samples_missing",
+    "ekf2_not_fusing",
+)
+# Findings that only state a verdict; they are no cause if one is known
+VERDICT_FINDINGS = frozenset(
+    {
+        "error_exceeds_reported_sigma",
+        "kf_overconfident",
+        "kf_underconfident",
+        "ekf2_overconfident",
+        "ekf2_underconfident",
+    }
+)
+SETTING_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
+# A re-run that changes ratios and error by less has no effect
+MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
+# Reduction of the position RMSE from which a re-run improves the position
+POSITION_IMPROVEMENT = 0.20
+TARGETS: Mapping[str, Target] = {
+    "position source": "sender",
+    "time": "sender",
+    "IMU": "flight",
+    "tuning": "KF",
+    "EKF2": "EKF2",
+    "loops": "source",
+    "logging": "logging",
+}
+FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
+
+
+class RankedCause(NamedTuple):
+    """Finding with the re-runs that confirm it, by filter."""
+
+    finding: Finding
+    tier: int
+    reduction: float
+    trials: tuple[Trial, ...]
+
+
+def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCause]:
+    """Return the causes of a flight in the order of the card.
+
+    First what makes the rest meaningless; then what brings a verdict into its band; then what moves
+    one at least half of the way; then other errors, and warnings. Within the second and third, a
+    fault of the source comes before a setting that would only hide it.
+    """
+    ranked = []
+    for finding in roots:
+        if finding.severity == "note":
+            continue
+        trials = confirming_trials(analysis.trials, finding)
+        reduction = sum(_reduction(trial) for trial in trials)
+        if trials and not any(has_effect(trial) for trial in trials):
+            continue
+        ranked.append(RankedCause(finding, _tier(finding, trials), reduction, trials))
+    has_cause = any(each.finding.id not in VERDICT_FINDINGS for each in ranked)
+    ranked = [each for each in ranked if not (has_cause and each.finding.id in VERDICT_FINDINGS)]
+    return sorted(
+        ranked,
+        key=lambda each: (
+            each.tier,
+            each.tier in (1, 2) and _is_setting(each.finding),
+            -each.reduction,
+        ),
+    )
+
+
+def _is_setting(finding: Finding) -> bool:
+    kinds = RERUN_KINDS.get(finding.id, frozenset())
+    return bool(kinds) and kinds <= SETTING_KINDS
+
+
+def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
+    if finding.id in MEANINGLESS:
+        return 0
+    if any(_enters_band(trial) for trial in trials):
+        return 1
+    if any(_halves(trial) for trial in trials):
+        return 2
+    return 3 if finding.severity == "error" else 4
+
+
+def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
+    """Return the best re-run of each kind and filter that corrects a finding."""
+    kinds = RERUN_KINDS.get(finding.id, frozenset())
+    best: dict[tuple[FilterName, str], Trial] = {}
+    for trial in trials:
+        if len(trial.kinds) != 1 or trial.kinds[0] not in kinds:
+            continue
+        key = trial.filter, trial.kinds[0]
+        if key not in best or distance_from_one(trial.after) < distance_from_one(best[key].after):
+            best[key] = trial
+    return tuple(best.values())
+
+
+def ratios(outcome: Outcome) -> dict[str, float]:
+    """Return the ratios of actual to reported σ, against source and ground truth."""
+    means = {"source": outcome.nis_mean, "truth": outcome.nees_mean}
+    return {against: math.sqrt(mean) for against, mean in means.items() if mean}
+
+
+def _reduction(trial: Trial) -> float:
+    return distance_from_one(trial.before) - distance_from_one(trial.after)
+
+
+def _pairs(trial: Trial) -> list[tuple[str, float, float]]:
+    before, after = ratios(trial.before), ratios(trial.after)
+    return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
+
+
+def _enters_band(trial: Trial) -> bool:
+    return any(
+        word_of(before, name) != "consistent" and word_of(after, name) == "consistent"
+        for name, before, after in _pairs(trial)
+    )
+
+
+def _halves(trial: Trial) -> bool:
+    return any(
+        word_of(before, name) != "consistent"
+        and abs(math.log(after)) <= 0.5 * abs(math.log(before))
+        for name, before, after in _pairs(trial)
+    )
+
+
+def has_effect(trial: Trial) -> bool:
+    """Return True if a re-run changes a ratio by 10 % or the position RMSE by 5 %."""
+    if any(
+        not 1.0 / MIN_RATIO_CHANGE <= after / before <= MIN_RATIO_CHANGE
+        for _, before, after in _pairs(trial)
+    ):
+        return True
+    before, after = trial.before.position_rmse_m, trial.after.position_rmse_m
+    return bool(before and after and abs(after / before - 1.0) > MIN_RMSE_CHANGE)
+
+
+def improvement(trial: Trial) -> Improvement:
+    """Return which numbers a re-run improves.
+
+    Position: RMSE lower by 20 %. σ: |ln ratio| halves or enters the band, against ground truth if
+    it is available.
+    """
+    before_m, after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
+    is_position_better = bool(
+        before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
+    )
+    before, after = ratios(trial.before), ratios(trial.after)
+    against = "truth" if before.keys() & after.keys() & {"truth"} else "source"
+    is_sigma_better = False
+    if against in before and against in after:
+        was, becomes = before[against], after[against]
+        low, high = BANDS[against]
+        is_sigma_better = not low <= was <= high and (
+            low <= becomes <= high or abs(math.log(becomes)) <= 0.5 * abs(math.log(was))
+        )
+    if is_position_better:
+        return "position and σ" if is_sigma_better else "position"
+    return "σ only" if is_sigma_better else "nothing"
+
+
+def make_cause(
+    analysis: Analysis, ranked: RankedCause, verdicts: Sequence[Verdict], request: ComparisonRequest
+) -> Cause:
+    """Make the numbered cause of a finding, with actions for sender, KF and EKF2."""
+    finding, trials = ranked.finding, ranked.trials
+    useful = [trial for trial in trials if improvement(trial) != "nothing"]
+    alternatives, actions = _actions(analysis, finding, useful, verdicts, request)
+    return Cause(
+        id=finding.id,
+        severity="error" if finding.severity == "error" else "warning",
+        title=finding.title,
+        why=_reason(finding),
+        spans_s=finding.spans_s,
+        alternatives=alternatives,
+        actions=actions,
+        reruns=tuple(_rerun(trial, trials) for trial in trials),
+        after=_closing_sentence(analysis, useful, alternatives),
+    )
+
+
+def _reason(finding: Finding) -> str:
+    """Return the message without its first sentence, which is the title."""
+    return finding.message.removeprefix(finding.title).lstrip(". ")
+
+
+def _actions(
+    analysis: Analysis,
+    finding: Finding,
+    useful: Sequence[Trial],
+    verdicts: Sequence[Verdict],
+    request: ComparisonRequest,
+) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
+    """Return alternatives that exclude each other, and the actions that are done in any case."""
+    by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful}
+    alternatives: tuple[tuple[Action, ...], ...] = ()
+    actions: list[Action] = []
+    general = Action(_target(finding), finding.remedy) if finding.remedy else None
+    delay = by_kind.get(("ekf2", "delay"))
+    if offset := by_kind.get(("ekf2", "time offset")) or by_kind.get(("kf", "time offset")):
+        shift = offset.change[CLOCK] - analysis.settings.clock_offset_s * (offset.filter == "kf")
+        verb = f"subtract {-shift:.3f} s from" if shift < 0 else f"add {shift:.3f} s to"
+        sender = Action("sender", f"{verb} the timestamp (usec) of each position")
+        if delay is not None:
+            alternatives = ((sender,), (set_parameters(analysis, delay.change),))
+        else:
+            actions.append(sender)
+    elif delay is not None:
+        actions.append(set_parameters(analysis, delay.change))
+    elif general is not None and not _is_setting(finding):
+        actions.append(general)
+    for (owner, kind), trial in by_kind.items():
+        if owner == "kf" and trial.change.keys() <= OPTIONS.keys():
+            actions.append(run_again(request, trial.change))
+        elif (
+            owner == "ekf2"
+            and kind not in ("delay", "time offset")
+            and trial.change.keys() <= PARAMETERS.keys()
+        ):
+            actions.append(set_parameters(analysis, trial.change))
+    named = {action.target for action in actions}
+    named |= {action.target for alternative in alternatives for action in alternative}
+    for owner, name in FILTER_NAMES.items():
+        if name not in named and (text := _no_change(owner, name, verdicts)):
+            actions.append(Action(name, text))
+    return alternatives, tuple(actions)
+
+
+def _no_change(owner: FilterName, name: str, verdicts: Sequence[Verdict]) -> str:
+    """Return the reason why a filter needs no change, or "" if it is not evaluated."""
+    own = [verdict for verdict in verdicts if verdict.filter == owner and verdict.ratio is not None]
+    if not own:
+        return ""
+    if all(verdict.word == "consistent" for verdict in own):
+        return "no change: consistent"
+    return "no setting corrects this" if owner == "kf" else "no parameter corrects this"
+
+
+def _target(finding: Finding) -> Target:
+    from px4fuse.findings.model import CATALOGUE
+
+    return TARGETS[CATALOGUE[finding.id].group]
+
+
+def run_again(request: ComparisonRequest, change: Mapping[str, float]) -> Action:
+    """Return the command that runs KF again with changed settings."""
+    import msgspec
+
+    changed = msgspec.structs.replace(request, **change)
+    return Action("KF", commands=(command_line(changed),), where="shell")
+
+
+def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
+    """Return the console lines that set parameters of EKF2, with old and new values."""
+    model = analysis.ekf2_model
+    flown = {} if isinstance(model, Unavailable) else model.inputs.settings
+    texts, commands, needs_reboot = [], [], False
+    for name, value in change.items():
+        parameter = PARAMETERS[name]
+        unit = f" {parameter.unit}" if parameter.unit else ""
+        texts.append(f"{name} {flown.get(name, math.nan):g} → {value:g}{unit}")
+        commands.append(f"param set {name} {value:g}")
+        needs_reboot |= name.endswith(REBOOT_SUFFIXES)
+    return Action(
+        "EKF2",
+        ", ".join(texts),
+        (*commands, *(("reboot",) if needs_reboot else ())),
+        "console",
+    )
+
+
+# Endings of the parameters that PX4 reads at its start only (reboot_required in its metadata)
+REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
+
+
+def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
+    before, after = ratios(trial.before), ratios(trial.after)
+
+    def pair(name: str) -> tuple[float, float] | None:
+        return (before[name], after[name]) if name in before and name in after else None
+
+    rmse = trial.before.position_rmse_m, trial.after.position_rmse_m
+    rejected = trial.before.rejected_fraction, trial.after.rejected_fraction
+    return Rerun(
+        label=_label(trial, trials),
+        is_prediction=trial.filter == "ekf2",
+        from_s=trial.from_s,
+        position_rmse_m=None if None in rmse else rmse,  # type: ignore[arg-type]
+        source_ratio=pair("source"),
+        truth_ratio=pair("truth"),
+        rejected_fraction=None
+        if None in rejected or max(rejected) < MIN_SHOWN_REJECTION  # type: ignore[type-var]
+        else rejected,  # type: ignore[arg-type]
+        improves=improvement(trial),
+    )
+
+
+# Rejected fraction from which a re-run table lists it
+MIN_SHOWN_REJECTION = 0.005
+
+
+def _label(trial: Trial, trials: Sequence[Trial]) -> str:
+    kind = trial.kinds[0]
+    if OUTLIERS in trial.change:
+        name = "KF" if trial.filter == "kf" else "EKF2 (replay)"
+        return f"{name} without the {trial.change[OUTLIERS]:.0f}"
+    if trial.filter == "kf":
+        options = " ".join(
+            f"{OPTIONS[name].name} {value:g}"
+            for name, value in trial.change.items()
+            if name in (SIGMA_A, SIGMA_Z)
+        )
+        return f"KF, {options}" if options else "KF"
+    others = [each for each in trials if each.filter == "ekf2"]
+    if len(others) < 2:
+        return "EKF2 (replay)"
+    return f"EKF2 (replay), {'sender' if kind == 'time offset' else 'parameters'}"
+
+
+def _closing_sentence(
+    analysis: Analysis, useful: Sequence[Trial], alternatives: Sequence[object]
+) -> str:
+    """Return the sentence below the re-runs: exclusive actions, signs, or an equal default."""
+    if alternatives:
+        return (
+            "Not both: the offset would be corrected twice. One offset, two signs: --clock-offset "
+            "(this log only) is added to the timestamps (s), the delay parameter is the age of a "
+            "position (ms)."
+        )
+    return ""
+
+
+def format_parameter(analysis: Analysis, axis: str) -> str:
+    """Format EKF2's measurement noise of the source: "EKF2_EVP_NOISE 0.1 m"."""
+    name = aid_of(analysis, axis).noise
+    value = analysis.flight.log.parameters.get(name)
+    return "" if value is None else f"{name} {format_metres(value)} m"
+
+
+def is_default(settings: Settings, name: str) -> bool:
+    """Return True if a setting of KF has its default."""
+    return bool(getattr(settings, name) == getattr(Settings(), name))
