@@ -229,10 +229,16 @@ def _open_streams() -> None:
 
 def _with_option_names(text: str, command: str | None) -> str:
     """Replace the argument names in an error by the options of the command."""
-    from px4fuse.request import EVALUATION_OPTIONS, LOOP_OPTIONS, OPTIONS, with_options
+    from px4fuse.request import (
+        COMPARISON_OPTIONS,
+        OPTION_NAMES,
+        EvaluationRequest,
+        LoopRequest,
+        with_options,
+    )
 
-    tables = {"loop": LOOP_OPTIONS, "evaluate": EVALUATION_OPTIONS}
-    return with_options(text, tables.get(command or "", OPTIONS))
+    option_names = {"loop": OPTION_NAMES[LoopRequest], "evaluate": OPTION_NAMES[EvaluationRequest]}
+    return with_options(text, option_names.get(command or "", COMPARISON_OPTIONS))
 
 
 def _print_error(text: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
@@ -22,18 +22,49 @@ CLUSTERS = ("slurm", "kubernetes")
 
 @click.command()
 @click.argument("logs", nargs=-1, metavar="LOGS...")
-@inputs.options("batch")
-@inputs.settings_options
-@inputs.options("batch-ends")
-@inputs.open_option
+@options.output_option("DIR", "Output folder for the table and the results of each log.")
+@click.option("--reports", is_flag=True, help="Also write a PDF report for each log.")
+@click.option(
+    "--timeout",
+    type=click.FloatRange(1.0),
+    metavar="SECONDS",
+    default=TIMEOUT_S,
+    help="Time limit for each log.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Number of logs processed in parallel on this computer.  [default: number of cores]",
+)
+@click.option(
+    "--memory",
+    type=click.FloatRange(1.0),
+    metavar="GB",
+    default=4.0,
+    help="Memory limit for each log, in GB (Linux only).",
+)
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Address of a running Dask scheduler (tcp://host:8786). slurm or kubernetes prints how to "
+    "start one.",
+)
+@options.settings_options
+@options.fail_option(
+    (FAILED, *SEVERITIES),
+    "Exit with 1 if a log failed, is worse than the baseline, or has a finding of at least this "
+    "severity.",
+)
+@options.open_option
 def batch(
     logs: tuple[str, ...],
     *,
     output: Path | None,
     reports: bool,
-    timeout: float = TIMEOUT_S,
+    timeout: float,
     workers: int | None,
-    memory: float = 4.0,
+    memory: float,
     scheduler: str | None,
     fail_on: Literal["failed", Severity] | None,
     **option_values: Any,

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -15,14 +15,19 @@ SEVERITIES = get_args(Severity)
 
 
 @click.command()
-@click.argument("log", type=inputs.InputPath())
-@inputs.analysis_options
-@inputs.person_options
-@inputs.report_options(
+@click.argument("log", type=options.InputPath())
+@options.analysis_options
+@options.person_options
+@options.report_options(
     "Output report.  [default: reports/LOG.pdf; changed settings are part of the name]"
 )
-@inputs.options("compare")
-@inputs.open_option
+@options.fail_option(SEVERITIES, "Exit with 1 on a finding of at least this severity.")
+@click.option(
+    "--checks",
+    is_flag=True,
+    help="Exit with 1 if an EKF2 aid is overconfident, biased or not fused for a long time.",
+)
+@options.open_option
 def compare(
     log: Path,
     output: Path | None,
@@ -43,8 +48,8 @@ def compare(
     from px4fuse.report.terminal import summary
     from px4fuse.results.build import outcome_results
 
-    person = inputs.read_student(option_values)
-    request = inputs.comparison_request(log, option_values)
+    person = options.read_student(option_values)
+    request = options.comparison_request(log, option_values)
     outputs.report_paths(output, json_path)  # fail early if the output cannot be written
     with outputs.progress(json_path) as step:
         outcome = run_or_evaluate_aids(request, step)

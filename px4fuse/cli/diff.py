@@ -5,14 +5,14 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 
 
 @click.command()
-@click.argument("a", type=inputs.InputPath())
-@click.argument("b", type=inputs.InputPath())
-@inputs.max_size_option
-@inputs.json_option
+@click.argument("a", type=options.InputPath())
+@click.argument("b", type=options.InputPath())
+@options.max_size_option
+@options.json_option
 def diff(a: Path, b: Path, json_path: Path | None) -> None:
     """List the settings, numbers and findings that differ from A to B.
 

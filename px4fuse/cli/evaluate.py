@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, settings_name
+from px4fuse.request import EvaluationRequest, settings_name
 
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
@@ -35,13 +35,51 @@ def delta(text: str) -> Delta:
 
 
 @click.command()
-@click.argument("estimate", type=inputs.InputPath())
-@click.argument("reference", type=inputs.InputPath())
-@inputs.options("evaluate", rpe={"type": delta, "multiple": True})
-@inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
-@inputs.max_size_option
-@inputs.report_options("Output report.  [default: reports/A_against_B.pdf]")
-@inputs.open_option
+@click.argument("estimate", type=options.InputPath())
+@click.argument("reference", type=options.InputPath())
+@click.option(
+    "--rpe",
+    type=delta,
+    metavar="DELTA",
+    multiple=True,
+    help="RPE over a distance (5m), a time (10s) or a number of frames (1f); repeatable.  "
+    "[default: several that fit the path length]",
+)
+@click.option(
+    "--alignment",
+    type=options.Choice(("none", "yaw", "se3", "sim3")),
+    help="Transform that is fitted before errors are computed.  [default: yaw for VIO, EKF2 and "
+    "KF; se3 for SLAM; sim3 for monocular SLAM]",
+)
+@click.option(
+    "--association",
+    type=options.Choice(("interpolate", "nearest")),
+    default="interpolate",
+    help="Interpolate the reference, or use its nearest pose (as evo does).",
+)
+@click.option(
+    "--max-gap",
+    "max_gap_s",
+    type=options.TypedQuantity("s"),
+    help="Longest gap in the reference to interpolate over; with nearest, the largest time "
+    "difference.  [default: from its rate; 0.01 for nearest]",
+)
+@click.option(
+    "--time-offset",
+    "time_offset_s",
+    type=options.TypedQuantity("s", auto=True),
+    help="Seconds to add to the timestamps of the estimate; auto estimates them from the motion.  "
+    "[default: auto if the two do not overlap]",
+)
+@click.option(
+    "--consecutive",
+    is_flag=True,
+    help="RPE over consecutive, non-overlapping pairs instead of all pairs.",
+)
+@options.system_option
+@options.max_size_option
+@options.report_options("Output report.  [default: reports/A_against_B.pdf]")
+@options.open_option
 def evaluate(
     estimate: Path,
     reference: Path,

@@ -6,11 +6,17 @@ import importlib.util
 import io
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import InputPath, comparison_request, options, recording_options
+from px4fuse.cli.options import (
+    Choice,
+    InputPath,
+    comparison_request,
+    flight_options,
+    output_option,
+)
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError, to_one_line
 from px4fuse.input_files import check_output_folder, own_files
@@ -25,12 +31,18 @@ MAX_DESCRIPTION_BYTES = 50_000_000
 
 @click.command()
 @click.argument("log", type=InputPath())
-@options("extract")
-@recording_options
+@output_option("DIR", "Output folder for the tables.", required=True)
+@click.option(
+    "--format",
+    type=Choice(("csv", "parquet")),
+    default="csv",
+    help='Table format; parquet requires pip install "px4fuse[parquet]".',
+)
+@flight_options
 def extract(
     log: Path,
     output: Path,
-    format: Literal["csv", "parquet"] = "csv",  # noqa: A002 - the name of the option
+    format: str,  # noqa: A002 - the name of the option
     **option_values: Any,
 ) -> None:
     """Export a log as tables (CSV or Parquet).

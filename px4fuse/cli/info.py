@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import InputPath, comparison_request, json_option, recording_options
+from px4fuse.cli.options import InputPath, comparison_request, flight_options, json_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.record import Unavailable
 from px4fuse.text import join_first
@@ -46,7 +46,7 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
     help="Print the versions of px4fuse, system and libraries for a bug report, and exit.",
 )
 @json_option
-@recording_options
+@flight_options
 def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """List the contents of a log and which analyses are possible.
 

@@ -6,12 +6,33 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import options
+from px4fuse.cli.options import output_option
 from px4fuse.cli.outputs import OPEN_KEY, progress, web_page, write_and_print
 
 
 @click.command()
-@options("practice")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    metavar="N",
+    help="Random seed; the same number gives the same flights.  [default: random]",
+)
+@click.option(
+    "--level",
+    type=click.IntRange(1, 3),
+    metavar="N",
+    default=1,
+    help="Difficulty. 1: one large mistake; 2: one smaller mistake; 3: small mistakes, sometimes "
+    "two.",
+)
+@click.option(
+    "--flights",
+    type=click.IntRange(1, 20),
+    metavar="N",
+    default=10,
+    help="Number of flights.",
+)
+@output_option("FILE.html", "Output file.  [default: reports/practice_SEED.html]")
 @click.option(
     "--open/--no-open", "opened", default=None, help="Open the page.  [default: on a terminal]"
 )
@@ -19,10 +40,10 @@ from px4fuse.cli.outputs import OPEN_KEY, progress, web_page, write_and_print
 def practice(
     ctx: click.Context,
     seed: int | None,
+    level: int,
+    flights: int,
     output: Path | None,
     opened: bool | None,
-    level: int = 1,
-    flights: int = 10,
 ) -> None:
     """Write a quiz page with simulated flights and hidden mistakes.
 

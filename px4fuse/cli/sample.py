@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import options
+from px4fuse.cli.options import output_option
 from px4fuse.cli.outputs import write_and_print
 
 FOLDER = Path("sample_logs")
@@ -41,8 +41,8 @@ def sample_log() -> Path:
 
 
 @click.command()
-@options("sample")
-def sample(output: Path = FOLDER) -> None:
+@output_option("DIR", "Output folder.", default=FOLDER)
+def sample(output: Path) -> None:
     """Write the sample logs (aisle with UWB, loop with VIO) to a folder."""
     from importlib.resources import files
 

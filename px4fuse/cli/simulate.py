@@ -6,11 +6,18 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args
 
 import click
 
-from px4fuse.cli.inputs import InputPath, TypedQuantity, options, typed_parameters
+from px4fuse.cli.options import (
+    Choice,
+    InputPath,
+    NonEmptyPath,
+    TypedQuantity,
+    output_option,
+    typed_parameters,
+)
 from px4fuse.cli.outputs import check_targets, progress, write_and_print
 from px4fuse.errors import OutputError, SettingsError, to_one_line
 from px4fuse.input_files import check_output_folder
@@ -79,7 +86,75 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@options("simulate", assignment={"type": InputPath()}, secret_file={"type": InputPath()})
+@output_option(
+    "FLIGHT.ulg|DIR", "Output log, or with --assignment the folder for the class.", required=True
+)
+@click.option(
+    "--assignment",
+    type=InputPath(),
+    metavar="ROSTER.csv",
+    help="Class list (student id, name): write one flight per student, with individual noises and "
+    "mistakes, and the answer key beside the folder.",
+)
+@click.option(
+    "--secret-file",
+    type=InputPath(),
+    metavar="FILE",
+    help="File with the secret for --assignment; the same secret and id give the same flight.  "
+    "[default: generated, and stored in the answer key]",
+)
+@click.option(
+    "--mistakes",
+    type=int,
+    metavar="N",
+    help="Number of mistakes in each assigned flight.  [default: random, 0 to 2]",
+)
+@click.option(
+    "--preview",
+    is_flag=True,
+    help="Print what --assignment would draw, without writing files.",
+)
+@click.option(
+    "--kind",
+    type=Choice((*get_args(Kind), MIXED)),
+    default=_DEFAULT.kind,
+    help="aisle: passes along an aisle with UWB. loop: laps of a square with drifting VIO. "
+    "outdoor: laps with GNSS. mixed (--assignment only): one third loops, the rest aisles.",
+)
+@click.option(
+    "--seed",
+    type=int,
+    metavar="N",
+    default=_DEFAULT.seed,
+    help="Random seed; the same number gives the same flight.",
+)
+@click.option(
+    "--mistake",
+    metavar="NAME[=VALUE]",
+    multiple=True,
+    help="Mistake to simulate (listed below); repeatable.",
+)
+@click.option(
+    "--answer",
+    type=NonEmptyPath(),
+    metavar="FILE.json",
+    help="Write the solution: mistakes, biases, outliers, clock offset. Not for students.  "
+    "[default with --assignment: DIR_answers.json]",
+)
+@click.option("--no-truth", is_flag=True, help="Do not log ground truth.")
+@click.option("--no-ekf2", is_flag=True, help="Do not simulate EKF2 (faster).")
+@click.option(
+    "--passes",
+    type=int,
+    metavar="N",
+    help="Number of passes [6], or of laps of the square [1; outdoors 3].",
+)
+@click.option(
+    "--yaw",
+    type=Choice(get_args(Yaw)),
+    help="Heading of the vehicle: fixed, or along the flight direction.  [default: fixed; follow "
+    "on a square]",
+)
 @_scenario_options
 def simulate(
     output: Path,
@@ -92,8 +167,8 @@ def simulate(
     no_truth: bool,
     no_ekf2: bool,
     preview: bool,
-    kind: Literal[Kind, "mixed"] = _DEFAULT.kind,
-    seed: int = _DEFAULT.seed,
+    kind: Literal[Kind, "mixed"],
+    seed: int,
     passes: int | None,
     yaw: Yaw | None,
     **chosen: Any,

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import InputPath, analysis_options, comparison_request, json_option
+from px4fuse.cli.options import InputPath, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 
 

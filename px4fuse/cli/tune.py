@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import InputPath, analysis_options, comparison_request, json_option
+from px4fuse.cli.options import InputPath, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.record import Unavailable
 

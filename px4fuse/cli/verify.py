@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import InputPath, max_size_option, open_option, report_options
+from px4fuse.cli.options import InputPath, max_size_option, open_option, report_options
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.errors import LogError
 from px4fuse.reading import display_name, files_by_sha256, read_bytes_limited

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.units import NAMES, in_unit
 
@@ -16,16 +16,43 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("log", type=inputs.InputPath())
-@inputs.options("whatif", since={"type": inputs.TypedQuantity("s", 60.0)})
-@inputs.flight_options
-@inputs.json_option
+@click.argument("log", type=options.InputPath())
+@click.option(
+    "--set",
+    "changes",
+    metavar="NAME=VALUE",
+    multiple=True,
+    help="Parameter to change, in PX4's unit; repeatable.  [default: the maximum-likelihood noise "
+    "and delay]",
+)
+@click.option(
+    "--sweep",
+    metavar="NAME=LOW:HIGH[:COUNT]",
+    help="Replay with several values of one parameter.",
+)
+@click.option(
+    "--without",
+    metavar="AID",
+    multiple=True,
+    help="Aid that EKF2 no longer fuses, for example gnss_pos, gnss_vel, baro_hgt, mag or ev_pos; "
+    "repeatable.",
+)
+@click.option(
+    "--from",
+    "start_s",
+    type=options.TypedQuantity("s", 60.0),
+    metavar="SECONDS",
+    help="Time from which the aids of --without are missing.  [default: from the start]",
+)
+@options.recording_options
+@options.max_size_option
+@options.json_option
 def whatif(
     log: Path,
     changes: tuple[str, ...],
     sweep: str | None,
     without: tuple[str, ...],
-    since: float | None,
+    start_s: float | None,
     json_path: Path | None,
     **option_values: Any,
 ) -> None:
@@ -43,13 +70,13 @@ def whatif(
     from px4fuse.results.build import whatif_results
 
     outputs.check_targets([json_path])
-    if since is not None and not without:
+    if start_s is not None and not without:
         raise SettingsError("--from requires --without AID.")
     request = WhatIfRequest(
         log=str(log),
         changes=_parse_changes(changes),
         sweep=None if sweep is None else _parse_sweep(sweep),
-        without=dict.fromkeys(without, since or 0.0),
+        without=dict.fromkeys(without, start_s or 0.0),
         **option_values,
     )
     with outputs.progress(json_path) as step:

@@ -19,7 +19,7 @@ from rich.text import Text
 from px4fuse.report.page import Block, Cell
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import (
-    OPTIONS,
+    COMPARISON_OPTIONS,
     ComparisonRequest,
     LoopRequest,
     Request,
@@ -39,7 +39,7 @@ STYLES = {
 }
 # The pattern of a value excludes the full stop at the end of a sentence
 _COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
-_FIELDS = {option.name: field for field, option in OPTIONS.items()}
+_FIELDS = {option: field for field, option in COMPARISON_OPTIONS.items()}
 
 
 def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:

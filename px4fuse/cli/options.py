@@ -6,34 +6,29 @@ Numbers are typed without their unit; for a number with a unit the error shows t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from inspect import Parameter, signature
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 from click.core import ParameterSource
-from msgspec import NODEFAULT, Struct
-from msgspec.structs import fields
 
 from px4fuse.cli.outputs import OPEN_KEY
 from px4fuse.errors import SettingsError
+from px4fuse.filter.settings import DT_RANGE_S, SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M
 from px4fuse.input_files import add_input
 from px4fuse.reading import max_log_bytes, read_text
-from px4fuse.record import table
 from px4fuse.request import (
     AUTO,
-    CLOCK_OPTION,
-    FILTER_OPTIONS,
-    OPTIONS,
-    POSITION_OPTIONS,
-    RECORDINGS,
+    DT_S,
+    OPTION_NAMES,
+    SIGMA_A_M_S2,
+    AxisName,
     ComparisonRequest,
-    EvaluationRequest,
     PositionFile,
+    SourceKind,
 )
-from px4fuse.request import Option as Declared
 from px4fuse.units import NAMES, in_unit
 
 if TYPE_CHECKING:
@@ -46,6 +41,7 @@ def column_names(text: str) -> tuple[str, ...]:
 
 
 Option = Callable[[Callable[..., None]], Callable[..., None]]
+Choice = partial(click.Choice, case_sensitive=False)
 
 
 def _combine_options(*options: Option) -> Option:
@@ -76,8 +72,6 @@ class InputPath(NonEmptyPath):
     """File or folder to read; it is registered as input before the command begins.
 
     A log may be followed by the name of a track: ``LOG:vio``.
-
-    A log may have a part of it after a colon, as ``LOG:vio``.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -134,114 +128,6 @@ class TypedQuantity(click.ParamType["float | str"]):
         return number
 
 
-def option(
-    typed: str,
-    meaning: str,
-    least: float | None = None,
-    most: float | None = None,
-    *,
-    name: str = "",
-    **more: Any,
-) -> Option:
-    """Declare an option; its type and default are those of the command's parameter of that name.
-
-    Parameters
-    ----------
-    typed : str
-        Names and metavar as shown by --help: "-o, --output FILE".
-    meaning : str
-        Help text.
-    least, most : float, optional
-        Limits of a number.
-    name : str
-        Name of the parameter, if it differs from the option.
-    **more
-        Further arguments of ``click.option``.
-    """
-    names, _, metavar = typed.replace(", ", ",").partition(" ")
-    field = name or names.rpartition("--")[2].replace("-", "_")
-
-    def add(command: Callable[..., None]) -> Callable[..., None]:
-        details: dict[str, Any] = {"help": meaning, "metavar": metavar or None}
-        if "type" not in more and (hint := get_type_hints(command).get(field)) is not None:
-            default = signature(command).parameters[field].default
-            details |= _click_type(hint)
-            if default is not Parameter.empty:
-                details["default"] = default
-            elif hint is Path:
-                details["required"] = True
-        if (least, most) != (None, None):
-            range_type: Any = click.FloatRange if details.get("type") is float else click.IntRange
-            details["type"] = range_type(least, most)
-        return click.option(*names.split(","), field, **details | more)(command)
-
-    return add
-
-
-class _OptionRow(Struct, frozen=True):
-    """Row of ``options.toml``: arguments of :func:`option`."""
-
-    typed: str
-    meaning: str
-    least: int | float | None = None
-    most: int | float | None = None
-
-
-_TABLES = table(__file__, "options.toml", dict[str, dict[str, _OptionRow]])
-
-
-def options(title: str, **more: Mapping[str, Any]) -> Option:
-    """Declare the options of a table of ``options.toml``; ``more``: further arguments by option."""
-    return _combine_options(
-        *(
-            option(row.typed, row.meaning, row.least, row.most, name=name, **more.get(name, {}))
-            for name, row in _TABLES[title].items()
-        )
-    )
-
-
-def request_options(kind: type[Struct], options: Mapping[str, Declared]) -> Option:
-    """Declare options for fields of a request, with the type and default of each field."""
-    hints, defaults = get_type_hints(kind), {field.name: field for field in fields(kind)}
-    return _combine_options(
-        *(
-            _declared_option(name, declared, hints[name], defaults[name].default)
-            for name, declared in options.items()
-            if declared.meaning
-        )
-    )
-
-
-def _declared_option(field: str, declared: Declared, hint: Any, default: Any) -> Option:
-    """Declare the option of one field; parameters of a position file begin with ``position``."""
-    name = declared.name[2:].replace("-", "_") if declared.name.startswith("--position") else field
-    details = {"default": default or None} if default is not NODEFAULT else {}
-    details |= _click_type(hint) | {"help": declared.meaning, "metavar": declared.metavar}
-    if field in ("path", "mavlink", "reference"):
-        details["type"] = InputPath(str)
-    elif declared.unit:
-        auto = len(get_args(hint)) > 2
-        details["type"] = TypedQuantity(declared.unit, declared.example, auto=auto)
-    elif field == "columns":
-        details |= {"type": column_names, "multiple": False}
-    elif field == "system":
-        details["type"] = click.IntRange(0, 255)
-    return click.option(declared.name, name, **details)
-
-
-def _click_type(hint: Any) -> dict[str, Any]:
-    """Return click's arguments for a type hint: a Literal is a choice, a tuple is repeatable."""
-    types = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    inner = next(member for member in types if member is not NoneType)
-    if get_origin(inner) is tuple:
-        return _click_type(get_args(inner)[0]) | {"multiple": True}
-    if get_origin(inner) is Literal:
-        return {"type": click.Choice(get_args(inner), case_sensitive=False)}
-    if inner is bool:
-        return {"is_flag": True, "default": False}
-    return {"type": NonEmptyPath() if inner is Path else inner}
-
-
 def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
     if megabytes is not None:
         before = max_log_bytes.set(megabytes * 1_000_000)
@@ -249,67 +135,224 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
 
 
 # A limit of this computer, not a setting of the analysis, so it is not part of the request
-max_size_option = option(
-    "--max-size MB",
-    f"Maximum size of a log.  [default: {max_log_bytes.get() // 1_000_000}]",
-    1,
+max_size_option = click.option(
+    "--max-size",
+    type=click.IntRange(1),
+    metavar="MB",
     expose_value=False,
     callback=_set_max_size,
+    help=f"Maximum size of a log.  [default: {max_log_bytes.get() // 1_000_000}]",
 )
 #: Option --json
-json_option = option(
-    "--json FILE",
-    "Write the results as JSON; - prints them to standard output. With --json and without -o, no "
-    "report is written.  [default: beside the report]",
-    name="json_path",
+json_option = click.option(
+    "--json",
+    "json_path",
+    type=NonEmptyPath(),
+    metavar="FILE",
+    help="Write the results as JSON; - prints them to standard output. With --json and without -o, "
+    "no report is written.  [default: beside the report]",
 )
 
 
-def _open_flag(option_text: str, name: str) -> Option:
+def output_option(metavar: str, text: str, **details: Any) -> Option:
+    """Declare -o for a file or folder; ``details``: further arguments of ``click.option``."""
+    return click.option(
+        "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=text, **details
+    )
+
+
+def report_options(text: str) -> Option:
+    """Declare -o for the PDF report and --json for its results."""
+    return _combine_options(output_option("FILE.pdf", text), json_option)
+
+
+def fail_option(severities: tuple[str, ...], text: str) -> Option:
+    """Declare --fail-on for a command that ends with exit code 1 on a finding."""
+    return click.option("--fail-on", type=Choice(severities), help=text)
+
+
+def _open_flag(*names: str) -> Option:
     """Declare a flag to open the output; :func:`~px4fuse.cli.outputs.write_and_print` opens it."""
-    return option(
-        option_text,
-        "Open the written file in its default program.",
-        name=name,
+    return click.option(
+        *names,
         is_flag=True,
         expose_value=False,
         callback=lambda ctx, _, value: ctx.meta.update({OPEN_KEY: value}),
+        help="Open the written file in its default program.",
     )
 
 
 #: --open of commands that write a report or a page
-open_option = _open_flag("--open, --show", "opened")
+open_option = _open_flag("--open", "--show", "opened")
 #: --show of px4fuse loop, whose --open means an open loop
 show_option = _open_flag("--show", "shown")
 #: Student, notes and answers
-person_options = options("person", notes={"type": InputPath()}, answers={"type": InputPath()})
-
-
-def report_options(meaning: str) -> Option:
-    """Declare -o for the PDF report and --json for its results."""
-    return _combine_options(option("-o, --output FILE.pdf", meaning), json_option)
-
-
-system_option = request_options(EvaluationRequest, {"system": OPTIONS["system"]})
-_FILTER_GROUP = request_options(ComparisonRequest, FILTER_OPTIONS)
-_CLOCK_GROUP = request_options(ComparisonRequest, CLOCK_OPTION)
-#: Recordings of one flight, for commands that read it as logged
-flight_options = _combine_options(request_options(ComparisonRequest, RECORDINGS), max_size_option)
-#: Recordings of one flight, position file and clock offset
-recording_options = _combine_options(
-    request_options(ComparisonRequest, RECORDINGS),
-    request_options(PositionFile, POSITION_OPTIONS),
-    _CLOCK_GROUP,
-    max_size_option,
+person_options = _combine_options(
+    click.option("--student", metavar="NAME", help="Student name, printed on the report."),
+    click.option("--id", "student_id", metavar="ID", help="Student id, printed on the report."),
+    click.option(
+        "--notes",
+        type=InputPath(),
+        metavar="FILE.md",
+        help="Your own text in Markdown, printed in the report.",
+    ),
+    click.option(
+        "--answers",
+        type=InputPath(),
+        metavar="FILE.toml",
+        help="Completed form from px4fuse answers.",
+    ),
 )
-#: Settings, segment and recordings, for commands that run KF
-analysis_options = _combine_options(_FILTER_GROUP, recording_options)
+system_option = click.option(
+    "--system",
+    type=click.IntRange(0, 255),
+    metavar="ID",
+    help="MAVLink system id of the vehicle.  [default: the id with the most messages]",
+)
+_clock_option = click.option(
+    "--clock-offset",
+    "clock_offset_s",
+    type=TypedQuantity("s", auto=True),
+    help="Seconds to add to the timestamps of the position source; auto estimates them.  "
+    "[default: 0; auto with --position]",
+)
+#: Recordings of one flight, for commands that read it as logged
+recording_options = _combine_options(
+    click.option(
+        "--mavlink",
+        type=InputPath(str),
+        metavar="FILE.tlog",
+        help="MAVLink recording of the same flight; adds the data that are missing in LOG.",
+    ),
+    system_option,
+)
+#: Position file; its parameters begin with ``position``
+position_options = _combine_options(
+    click.option(
+        "--position",
+        type=InputPath(str),
+        metavar="FILE.csv",
+        help="Position file of the positioning system (CSV): time, x, y, z. Replaces the position "
+        "in LOG.",
+    ),
+    click.option(
+        "--position-frame",
+        type=Choice(("ned", "enu", "nwu")),
+        help="Frame of x, y, z in the position file.  [default: from the column names, else the "
+        "frame that fits EKF2 best]",
+    ),
+    click.option(
+        "--position-yaw",
+        type=TypedQuantity("°", 30.0, auto=True),
+        help="Rotate the position file by this yaw, clockwise seen from above; auto estimates yaw "
+        "and origin.  [default: 0]",
+    ),
+    click.option(
+        "--position-columns",
+        type=column_names,
+        metavar="TIME,X,Y,Z[,SIGMA]",
+        help="Names or numbers of the columns of the position file.  [default: recognised by name]",
+    ),
+    click.option(
+        "--position-time-unit",
+        type=Choice(("s", "ms", "us", "ns")),
+        help="Unit of the time column in the position file.  [default: detected]",
+    ),
+    click.option(
+        "--position-unit",
+        type=Choice(("m", "cm", "mm")),
+        help="Unit of x, y, z in the position file.  [default: detected]",
+    ),
+)
+#: Settings and segment, for commands that run KF
+filter_options = _combine_options(
+    click.option(
+        "--sigma-a",
+        "sigma_a_m_s2",
+        type=TypedQuantity("m/s²", SIGMA_A_M_S2),
+        default=SIGMA_A_M_S2,
+        help="KF process noise SIGMA_A (acceleration, 1 σ over DT), {:g} to {:g}.".format(
+            *SIGMA_A_RANGE_M_S2
+        ),
+    ),
+    click.option(
+        "--sigma-z",
+        "sigma_z_m",
+        type=TypedQuantity("m"),
+        help="KF measurement noise SIGMA_Z (position, 1 σ), {:g} to {:g}.  [default: 0.1; for GNSS "
+        "the R that EKF2 uses]".format(*SIGMA_Z_RANGE_M),
+    ),
+    click.option(
+        "--dt",
+        "dt_s",
+        type=TypedQuantity("s"),
+        default=DT_S,
+        help="KF prediction step DT, {:g} to {:g}.".format(*DT_RANGE_S),
+    ),
+    click.option(
+        "--input",
+        type=Choice(("imu", "zero")),
+        help="KF input: acceleration from the IMU, or zero (constant velocity).  [default: imu if "
+        "logged]",
+    ),
+    click.option(
+        "--axis",
+        "axes",
+        type=Choice(get_args(AxisName)),
+        multiple=True,
+        help="Axis to analyse; repeatable.  [default: all axes with a position; for GNSS the "
+        "horizontal axes]",
+    ),
+    click.option(
+        "--heading",
+        "heading_deg",
+        type=TypedQuantity("°", 30.0),
+        help="Heading of the aisle axis, clockwise from north.  [default: main direction of the "
+        "track]",
+    ),
+    click.option(
+        "--start",
+        "start_s",
+        type=TypedQuantity("s", 20.0),
+        help="Start of the analysis, in seconds after the first data.  [default: take-off]",
+    ),
+    click.option(
+        "--end",
+        "end_s",
+        type=TypedQuantity("s", 60.0),
+        help="End of the analysis, in seconds after the first data.  [default: landing]",
+    ),
+    click.option(
+        "--position-source",
+        metavar="NAME",
+        help="Position source to use, for example vehicle_gps_position; px4fuse info lists them.  "
+        "[default: the most direct one logged]",
+    ),
+    click.option(
+        "--source-kind",
+        type=Choice(get_args(SourceKind)),
+        help="Kind of the position source. VIO drifts; motion capture in the same messages does "
+        "not.  [default: vio if the source sends a changing orientation]",
+    ),
+    click.option(
+        "--height",
+        type=Choice(("gnss", "barometer")),
+        help="Height source of --axis down on a GNSS flight.  [default: the one that EKF2 fused, "
+        "GNSS first]",
+    ),
+)
+#: Recordings of one flight, position file and clock offset
+flight_options = _combine_options(
+    recording_options, position_options, _clock_option, max_size_option
+)
+#: Settings, segment and recordings, for commands that run KF on one flight
+analysis_options = _combine_options(filter_options, flight_options)
 #: Settings that apply to many logs, so without the files of one flight
-settings_options = _combine_options(_FILTER_GROUP, system_option, _CLOCK_GROUP, max_size_option)
+settings_options = _combine_options(filter_options, system_option, _clock_option, max_size_option)
 
 
 def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRequest:
-    """Make a request of the values of :func:`recording_options` or :func:`analysis_options`.
+    """Make a request of the values of :func:`flight_options` or :func:`analysis_options`.
 
     Raises
     ------
@@ -320,13 +363,13 @@ def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRe
 
 
 def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
-    option_names = {field: option.name for field, option in POSITION_OPTIONS.items()}
-    fields_of_file = {
+    option_names = OPTION_NAMES[PositionFile]
+    fields = {
         field: option_values.pop(name[2:].replace("-", "_")) for field, name in option_names.items()
     }
-    if fields_of_file["path"] is not None:
-        return PositionFile(**fields_of_file)
-    for field, value in fields_of_file.items():
+    if fields["path"] is not None:
+        return PositionFile(**fields)
+    for field, value in fields.items():
         if value is not None:
             raise SettingsError(f"{option_names[field]} requires --position.")
     return None
