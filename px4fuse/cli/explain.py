@@ -52,13 +52,15 @@ def _finding_page(typed: str) -> Page:
     effects = dict.fromkeys(effect.partition(":")[0] for effect in CONSEQUENCES.get(name, ()))
     page = Page()
     page.write(f"{entry.title}  [{name}]", bold=True)
-    page.labelled("Meaning", entry.meaning)
-    page.labelled("Example", example.message)
-    page.labelled("Action", example.remedy)
+    page.write_labelled("Meaning", entry.meaning)
+    page.write_labelled("Example", example.message)
+    page.write_labelled("Action", example.remedy)
     for label, names in {"Causes": causes, "Effects": effects}.items():
         if names:
-            page.labelled(label, ", ".join(names))
-    page.labelled("Rates", *_rates(example.clean_flights, example.false_alarms, example.detection))
+            page.write_labelled(label, ", ".join(names))
+    page.write_labelled(
+        "Rates", *_rates(example.clean_flights, example.false_alarms, example.detection)
+    )
     return page
 
 

@@ -74,7 +74,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
     for label, text in _log_facts(inventory):
-        page.labelled(label, text)
+        page.write_labelled(label, text)
     if inventory.flight.log.senders:
         page.table(("sender", "type", "messages", "lost"), _sender_rows(inventory), right=(2, 3))
     page.table(SOURCES_HEAD, list(_source_rows(inventory)), right=(2, 3, 4, 5))
@@ -100,7 +100,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     }
     for label, texts in lists.items():
         if texts:
-            page.labelled(label, *texts)
+            page.write_labelled(label, *texts)
     return page
 
 

@@ -306,7 +306,7 @@ def _write_assignment(
         mistake.partition("=")[0] for typed, _ in drawn_flights for mistake in typed or ("none",)
     )
     difficulties = [difficulty for _, difficulty in drawn_flights if difficulty is not None]
-    page.advice(
+    page.write_labelled_texts(
         {
             "Class": f"{len(drawn_flights)} student{'s' * (len(drawn_flights) != 1)}, {kind}",
             "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
@@ -329,7 +329,7 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     path = f"{scenario.passes} lap{'s' * many} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
         path = f"{scenario.passes} pass{'es' * many} of {scenario.length_m:g} m"
-    page.advice(
+    page.write_labelled_texts(
         {
             "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
             f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
@@ -342,10 +342,10 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     mistake_texts = [
         f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names
     ]
-    page.labelled("Mistakes", *(mistake_texts or ["none"]))
-    page.labelled("Truth", "logged" if scenario.truth else "not logged")
+    page.write_labelled("Mistakes", *(mistake_texts or ["none"]))
+    page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
     none = "not simulated and not in the log"
-    page.labelled("EKF2", "px4fuse's model of EKF2" if scenario.ekf2 else none)
+    page.write_labelled("EKF2", "px4fuse's model of EKF2" if scenario.ekf2 else none)
     if answer is not None:
-        page.labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
+        page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
     return page

@@ -43,5 +43,5 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
         )
     results = sync_results(request, compared, clock_result)
     page = Page()
-    page.advice(advice)
+    page.write_labelled_texts(advice)
     write_and_print(result_files(results, json_path), page, request)

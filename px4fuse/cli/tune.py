@@ -94,11 +94,11 @@ def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> P
         gain = "" if isinstance(validation, Unavailable) else f"{validation.gain_nats:+.3f}"
         noises = [noise_text(noise) for noise in (tuning.filter_sigma_a, tuning.sigma_z)]
         rows.append([name, *noises, f"{tuning.gain_nats:.3f}", gain, lag_text])
-    page.labelled("Chosen", format_settings(compared.settings))
+    page.write_labelled("Chosen", format_settings(compared.settings))
     if rows:
         page.table(TUNING_HEAD, rows, right=(1, 2, 3, 4, 5))
         notes.append(TUNING_NOTE)
     for text in notes:
         page.write(text, colour=MUTED_COLOUR)
-    page.advice(tuning_advice(compared, tuned))
+    page.write_labelled_texts(tuning_advice(compared, tuned))
     return page

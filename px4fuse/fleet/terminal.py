@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from px4fuse.findings import finding_title
 from px4fuse.fleet.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from px4fuse.fleet.rows import FAILED, FINDING_SEPARATOR
-from px4fuse.report.page import Page, words
+from px4fuse.report.page import Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval
 from px4fuse.text import format_factor, format_number
@@ -67,7 +67,7 @@ def differences(results: ChangeResults) -> Page:
     for name, side in (("A", results.a), ("B", results.b)):
         log = side.kind if side.given == side.log else f"{side.kind} of {side.log}"
         versions = f"SHA-256 {side.log_sha256[:12]}, px4fuse {side.px4fuse}"
-        page.labelled(name, f"{side.given} ({log}), {versions}")
+        page.write_labelled(name, f"{side.given} ({log}), {versions}")
     if results.settings:
         settings = [
             (setting.name, _plain(setting.a), _plain(setting.b)) for setting in results.settings
@@ -87,12 +87,12 @@ def differences(results: ChangeResults) -> Page:
     least = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(f"Numbers that differ by less than {least} are not listed.", colour=MUTED_COLOUR)
     for finding in results.findings:
-        styled = words(
+        styled = styled_text(
             f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
         )
-        page.labelled(f"Only {finding.only_in}", styled)
+        page.write_labelled(f"Only {finding.only_in}", styled)
     for text in results.worse:
-        page.labelled("Worse", words(text, 8.0, RED))
+        page.write_labelled("Worse", styled_text(text, 8.0, RED))
     if not results.worse:
         page.write("No verdict is worse in B.")
     return page
