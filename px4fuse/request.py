@@ -165,7 +165,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
     start_s, end_s : float or None
         Start and end of the loop; None for take-off and landing.
     landed_at : Landing or None
-    came_back : bool
+    closed_loop : bool
         False if the vehicle did not return to the take-off place.
     closures : tuple of GivenClosure
     position_drift_m, heading_drift_deg : float
@@ -181,7 +181,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
     start_s: float | None = None
     end_s: float | None = None
     landed_at: Landing | None = None
-    came_back: bool = True
+    closed_loop: bool = True
     closures: tuple[GivenClosure, ...] = ()
     position_drift_m: float = 1.0
     heading_drift_deg: float = 3.0
@@ -289,7 +289,7 @@ OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
         "start_s": "--from",
         "end_s": "--to",
         "landed_at": "--landed-at",
-        "came_back": "--open",
+        "closed_loop": "--open",
         "closures": "--closure",
         "position_drift_m": "--drift",
         "heading_drift_deg": "--heading-drift",

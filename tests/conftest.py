@@ -233,7 +233,9 @@ def _once(known: tuple[str | bytes, ...] | None, make: Callable[[], Any]) -> Any
     return _kept[known]
 
 
-def _read_once(request: ComparisonRequest, progress: analysis.Progress = analysis.silent) -> Flight:
+def _read_once(
+    request: ComparisonRequest, progress: analysis.Progress = analysis.ignore_progress
+) -> Flight:
     return _once(_known_flight(request), lambda: _read(request, progress))
 
 
@@ -243,7 +245,7 @@ def _log_once(path: str | Path, *, system: int | None = None) -> Flight:
 
 def _run_once(
     request: ComparisonRequest,
-    progress: analysis.Progress = analysis.silent,
+    progress: analysis.Progress = analysis.ignore_progress,
     flight: Flight | None = None,
 ) -> analysis.Analysis:
     if flight is not None and flight is not _kept.get(_known_flight(request)):

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from px4fuse.loop.model import Closure, Correction, KnownEnd, LoopResult, OdometryNoise
+from px4fuse.loop.model import Closure, Correction, LoopResult, OdometryNoise, TrueEnd
 from px4fuse.record import Unavailable
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_plain
@@ -32,14 +32,14 @@ def correction(rmse: float, moved_m: float) -> Correction:
         alignment_reason="asked",
         transform=Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
         association=Association("interpolate", 9, 0.1, 0, 0, 1.0, 1.0),
-        time_offset=TimeOffset(offset_s=0.0, determinable=True, reason=""),
+        time_offset=TimeOffset(offset_s=0.0, is_determinable=True, reason=""),
         ate=AbsoluteError(statistics, Interval(rmse, rmse, 1, 9.0), NONE),
         rpe=(RelativeError(5.0, "m", True, "reference", statistics, NONE, NONE),),
         notes=(),
         warnings=(),
     )
     return Correction(
-        moved_max_m=moved_m, moved_rms_m=moved_m, scores={"slam.tum": score, "ekf2": NONE}
+        correction_max_m=moved_m, correction_rms_m=moved_m, scores={"slam.tum": score, "ekf2": NONE}
     )
 
 
@@ -61,7 +61,7 @@ LOOP = to_plain(
             key_frame_spacing_m=0.5,
             path_length_m=87.7,
             end_from_start_m={"north": 1.42, "east": 0.0, "down": 0.0},
-            known_end=KnownEnd(
+            true_end=TrueEnd(
                 displacement_m={"north": 0.0, "east": 0.0, "down": 0.0},
                 sigma_m=0.1,
                 source="landing",
@@ -70,7 +70,7 @@ LOOP = to_plain(
             closure_error_m=1.42,
             closure_percent=1.62,
             heading_error_deg=NONE,
-            absolute=False,
+            is_absolute_track=False,
             odometry_noise=OdometryNoise(),
             closures=(
                 Closure(

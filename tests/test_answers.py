@@ -10,7 +10,7 @@ from cli_tools import done, refused
 from flights import aisle_flight
 from pypdf import PdfReader
 
-from px4fuse.answer_form import MISTAKES, ClaimedMistake, draw_questions, form_text, read_answers
+from px4fuse.answer_form import MISTAKES, StudentMistake, draw_questions, form_text, read_answers
 from px4fuse.assignment.truth import quantity_truth
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
@@ -43,13 +43,13 @@ def test_an_empty_form_says_nothing_and_explains_every_mistake(tmp_path: Path) -
 def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
     text = EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = -0.367")
     text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
-    found = read(tmp_path, text.replace('verdict_ours = ""', 'verdict_ours = "overstated"'))
+    found = read(tmp_path, text.replace('verdict_kf = ""', 'verdict_kf = "overstated"'))
     (claim,) = found.mistakes
     assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)
-    assert found.verdict_ours == "underconfident"
-    assert ClaimedMistake("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
-    assert ClaimedMistake("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
+    assert found.verdict_kf == "underconfident"
+    assert StudentMistake("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
+    assert StudentMistake("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(

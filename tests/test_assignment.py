@@ -42,10 +42,10 @@ PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
 # What names each mistake that is drawn
 FINDINGS = {
-    "clock-offset": "source_clock_offset", "clock-jump": "source_stamps_of_arrival",
-    "yaw": "source_frame_turned", "nlos": "source_outliers", "dropout": "source_gap",
-    "imu-rate": "logging_rate_low", "ekf2-noise": "ekf2_variance_understated",
-    "ekf2-gate": "ekf2_rejecting", "ekf2-delay": "ekf2_ev_delay_wrong",
+    "clock-offset": "source_time_offset", "clock-jump": "source_timestamps_are_arrival_times",
+    "yaw": "source_frame_misaligned", "nlos": "source_outliers", "dropout": "source_gap",
+    "imu-rate": "imu_rate_too_low", "ekf2-noise": "ekf2_overconfident",
+    "ekf2-gate": "ekf2_rejects_positions", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
 CHOICE = {choice.mistake: choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind}

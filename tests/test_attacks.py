@@ -261,7 +261,7 @@ REJECTED = {"closures": [{**LOOP["loop"]["closures"][0], "p": 1e-9, "d2": 60.0, 
 NO_END: dict[str, Any] = {
     "closures": [],
     "closure_error_m": ...,
-    "known_end": {"what": "m", "reason": "r", "remedy": ""},
+    "true_end": {"what": "m", "reason": "r", "remedy": ""},
 }
 
 
@@ -284,10 +284,10 @@ LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
     "closed, without a key": (None, {}, {}, 40, 0),
     "open end, rejected": (OPEN_END, {}, REJECTED, 40, 0),
     "open end, rejected, without a key": (None, {}, REJECTED, 10, 0),
-    "open end, left open": (OPEN_END, {"came_back": False}, NO_END, 40, 0),
-    "open end, left open, without a key": (None, {"came_back": False}, NO_END, 0, 0),
+    "open end, left open": (OPEN_END, {"closed_loop": False}, NO_END, 40, 0),
+    "open end, left open, without a key": (None, {"closed_loop": False}, NO_END, 0, 0),
     "open end, landing stated": (OPEN_END, LANDED, {}, 40, 0),
-    "closed, left open": (CLOSED, {"came_back": False}, NO_END, 0, 0),
+    "closed, left open": (CLOSED, {"closed_loop": False}, NO_END, 0, 0),
     "closed, rejected by a small drift": (CLOSED, {"position_drift_m": 0.01}, REJECTED, 10, 1),
     "open end, accepted by a large drift": (OPEN_END, {"position_drift_m": 50.0}, {}, 40, 1),
     "open end, accepted by a heading drift": (OPEN_END, {"heading_drift_deg": 90.0}, {}, 40, 1),

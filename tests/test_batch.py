@@ -135,7 +135,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     assert list(first["kf_nis_mean"]) == [
         axis.filters["kf"].nis_mean for axis in analysis.axes.values()
     ]
-    assert list(first["kf_factor"] ** 2 * first["kf_nis_mean"]) == pytest.approx([1.0] * 4)
+    assert list(first["kf_sigma_ratio"] ** 2) == pytest.approx(list(first["kf_nis_mean"]))
     tuned = analysis.tuning["horizontal"].sigma_z
     assert first.loc[0, ["sigma_z_m", "sigma_z_low_m", "sigma_z_high_m"]].tolist() == [
         tuned.value, tuned.low, tuned.high,
@@ -143,7 +143,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     assert (first["status"] == "done").all()
     results = read_results((output / first.loc[0, "results"]).read_bytes())
     assert results.request.log == "f1.ulg"
-    assert results.story == tuple(first.loc[0, "story"].split("\n"))
+    assert results.summary == tuple(first.loc[0, "summary"].split("\n"))
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
     # a log whose clock is out of range has no date
     beyond = structs.replace(results.log, start_unix_s=1e18)
@@ -151,7 +151,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     assert log_columns(beyond)["date"] == ""
     # the clock offset is present only if it is determinable
     rows = axis_rows(
-        structs.replace(results, clock=structs.replace(results.clock, determinable=False))
+        structs.replace(results, clock=structs.replace(results.clock, is_determinable=False))
     )
     assert first["clock_offset_s"].tolist() == pytest.approx([results.clock.offset_s] * 4)
     assert all("clock_offset_s" not in row for row in rows)
@@ -203,7 +203,7 @@ def test_batch_log_without_position_is_not_compared(tmp_path):
     assert row["firmware"] == "PX4 v1.16.0"
     assert row["duration_s"] > 10
     assert "--position" in row["remedy"]
-    assert row["aids"].startswith("gnss_pos variance overstated")
+    assert row["aids"].startswith("gnss_pos underconfident")
     assert "1 reused from an earlier run" in command(log, "-o", tmp_path / "out").output
 
 
@@ -213,7 +213,7 @@ def test_batch_gnss_flight_has_rows(shared_logs):
     (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
     table = px4fuse.batch(log)
     assert table["axis"].tolist() == ["aisle", "north", "east"]
-    assert table["aids"].str.startswith("gnss_pos variance overstated;gnss_vel ").all()
+    assert table["aids"].str.startswith("gnss_pos underconfident;gnss_vel ").all()
 
 
 # ------------------------------------------------------------------ resuming

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
-from px4fuse.answer_form import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, StudentMistake
 from px4fuse.grading.class_page import html_text, tenths
 from px4fuse.grading.model import Entry, GradedReport, Item, Override
 from px4fuse.grading.outputs import anonymise_entry
@@ -60,7 +60,7 @@ def row(name: str, points: float | None, **more: Any) -> Entry:
 
 FORM = Answers(
     log_sha256="a" * 64,
-    mistakes=(ClaimedMistake(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),),
+    mistakes=(StudentMistake(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),),
 )
 CLASS = (
     row(

@@ -67,7 +67,7 @@ def test_compare_report_prints_special_characters(report):
 
 
 @pytest.mark.usefixtures("no_drawing")
-@pytest.mark.parametrize(("severity", "code"), [("info", 1), ("error", 0)])
+@pytest.mark.parametrize(("severity", "code"), [("note", 1), ("error", 0)])
 def test_compare_fail_on_sets_exit_code(tmp_path, sample_log, severity, code):
     done("compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity, code=code)
 

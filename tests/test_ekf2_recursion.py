@@ -145,13 +145,13 @@ def test_variant_timing_horizon_is_buffer_length(settings, by_delay, timing):
     inputs = made(Inputs, rules=rules, settings=usual, horizon_s=0.12, step_s=0.01, predict_s=0.01)
     found = Variant({**usual, **settings}).timing(inputs)
     assert (found.delay_s, found.horizon_s) == pytest.approx((timing.delay_s, timing.horizon_s))
-    shifted = Variant(usual, stamp_offset_s=0.03).timing(inputs)
+    shifted = Variant(usual, timestamp_offset_s=0.03).timing(inputs)
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
 def test_replay_delay_max_unknown_raises_error():
     rules = replace(RULES, horizon_by_delay=True)
-    received = made(ReceivedPositions, own_times=False)
+    received = made(ReceivedPositions, uses_sender_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
     model = made(Model, inputs=inputs, flight=flight)

@@ -10,7 +10,7 @@ import pytest
 from class_tools import graded
 from exchange import replace
 
-from px4fuse.answer_form import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, StudentMistake
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_page import _point_boxes
@@ -115,7 +115,7 @@ def test_what_is_no_report_counts_only_where_nothing_else_is_there() -> None:
 
 
 def of_form(points: float, kind: str, **more):
-    form = Answers(log_sha256="a" * 64, mistakes=(ClaimedMistake(kind),))
+    form = Answers(log_sha256="a" * 64, mistakes=(StudentMistake(kind),))
     return replace(graded("", points, student_id="1"), form=form, **more)
 
 

@@ -247,7 +247,7 @@ def test_a_transformed_copy_has_no_error(kind: AlignmentKind) -> None:
     got = evaluate(copied, reference, alignment=kind)
     assert got.ate.translation_m.max < 1e-9
     assert got.ate.rotation_deg.max < 1e-9
-    assert [one.delta_words for one in got.rpe] == ["1 m", "5 m", "10 m", "1 s", "10 s"]
+    assert [one.delta_text for one in got.rpe] == ["1 m", "5 m", "10 m", "1 s", "10 s"]
     for one in got.rpe:
         assert one.translation_m.max < 1e-9
         assert one.rotation_deg.max < 1e-9
@@ -405,7 +405,7 @@ def test_an_offset_between_clocks_is_recovered(offset_s: float, rate_hz: float) 
     position_m = estimate.position_m + noise
     estimate = replace(estimate, time_s=estimate.time_s - offset_s, position_m=position_m)
     got = estimate_time_offset(estimate, reference)
-    assert got.determinable
+    assert got.is_determinable
     assert got.offset_s == pytest.approx(offset_s, abs=2e-3)
     assert got.interval_s[0] - 1e-3 < offset_s < got.interval_s[1] + 1e-3
     back = estimate_time_offset(reference, estimate)
@@ -451,7 +451,7 @@ def test_an_offset_without_excitation_is_not_determinable(kind: str, noise_m: fl
     noise = np.random.default_rng(6).normal(0.0, noise_m, (2, *position.shape))
     estimate, reference = (Trajectory(kind, "kf", time, position + e, None, "NED") for e in noise)
     got = estimate_time_offset(estimate, reference)
-    assert (got.determinable, got.offset_s, got.interval_s) == (False, None, None)
+    assert (got.is_determinable, got.offset_s, got.interval_s) == (False, None, None)
     assert "cannot be estimated" in got.reason
     used = evaluate(estimate, reference, alignment="none", time_offset_s="auto")
     assert used.time_offset.offset_s == 0.0
@@ -466,7 +466,7 @@ def test_a_motion_that_repeats_is_ambiguous() -> None:
     closed = one.position_m * np.sin(np.pi * one.time_s / 20.0)[:, None] ** 2
     laps = Trajectory("laps", "vio", time, closed[lap], None)
     got = estimate_time_offset(replace(laps[:800], unix_offset_s=None), laps)
-    assert not got.determinable
+    assert not got.is_determinable
     assert "is periodic" in got.reason
 
 

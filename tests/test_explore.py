@@ -119,7 +119,7 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
         low, high = found.nis_band
         return [
             f"{found.nis_mean:.2f}", f"{low:.2f}–{high:.2f}",
-            f"{100 * found.outside_two_sigma:.1f} %", f"{found.lag1_autocorrelation:.2f}",
+            f"{100 * found.fraction_outside_two_sigma:.1f} %", f"{found.lag1_autocorrelation:.2f}",
             str(found.count),
         ]  # fmt: skip
 
@@ -129,8 +129,8 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     expected = {name: list(pair) for name, pair in zip(names, both, strict=True)}
     difference: Any = result.difference
     errors = [result.filters[name].truth for name in FILTERS]
-    expected["Position: KF - EKF2, RMS"] = [f"{difference.position_rmse_m:.3f} m", "–"]
-    expected["Velocity: KF - EKF2, RMS"] = [f"{difference.velocity_rmse_m_s:.3f} m/s", "–"]
+    expected["Position: KF - EKF2, RMS"] = [f"{difference.position_rms_m:.3f} m", "–"]
+    expected["Velocity: KF - EKF2, RMS"] = [f"{difference.velocity_rms_m_s:.3f} m/s", "–"]
     for name, unit in (("Position", "m"), ("Velocity", "m/s")):
         field = "position_rmse_m" if unit == "m" else "velocity_rmse_m_s"
         expected[f"{name} RMSE"] = [f"{getattr(one, field):.3f} {unit}" for one in errors]
@@ -180,7 +180,7 @@ def test_buttons_set_estimated_ekf2_and_lesson_values(
     settle(page)
     a, z = (float(page.ask(f"document.getElementById('{name}-value').value"))
             for name in ("sigma-a", "sigma-z"))  # fmt: skip
-    assert a == pytest.approx(tuned.filter_sigma_a.value, rel=5e-3)
+    assert a == pytest.approx(tuned.sigma_a_two_state.value, rel=5e-3)
     assert z == pytest.approx(tuned.sigma_z.value, rel=5e-3)
     page.click("#ekf2-r")
     settle(page)

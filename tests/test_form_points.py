@@ -14,7 +14,7 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.answer_form import CURES, MISTAKES, PANELS, Answers, ClaimedMistake, update_values
+from px4fuse.answer_form import CURES, MISTAKES, PANELS, Answers, StudentMistake, update_values
 from px4fuse.assignment.random_assignment import draw
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
@@ -36,7 +36,7 @@ TRUTH = FormTruth(
 RIGHT = Answers(
     log_sha256=SHA256,
     mistakes=(
-        ClaimedMistake(
+        StudentMistake(
             "clock-offset",
             190.0,
             "ms",
@@ -48,9 +48,9 @@ RIGHT = Answers(
             "s",
             "clock",
         ),
-        ClaimedMistake("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
+        StudentMistake("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
     ),
-    verdict_ours="overconfident",
+    verdict_kf="overconfident",
     verdict_ekf2="underconfident",
     ekf2_did=("followed wrong positions", "dead-reckoned, then reset"),
     quantities=(0.505, (3.0, 7.0), -0.2),
@@ -69,7 +69,7 @@ def with_claim(**values: Any) -> Answers:
 
 def with_false(*kinds: str) -> Answers:
     """The right form with more claims."""
-    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(ClaimedMistake, kinds)))
+    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(StudentMistake, kinds)))
 
 
 def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
@@ -112,8 +112,8 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     # each false claim costs ten; three take all
     (with_false("yaw"), {"kinds": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
-    (replace(RIGHT, mistakes=(ClaimedMistake("none"),)), NO_MISTAKES),
-    (replace(RIGHT, verdict_ours="consistent"), {"verdicts": 10.0}),
+    (replace(RIGHT, mistakes=(StudentMistake("none"),)), NO_MISTAKES),
+    (replace(RIGHT, verdict_kf="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 12.5}),
     (replace(RIGHT, ekf2_did=("dead-reckoned, then reset",)), {"verdicts": 12.5}),
     (replace(RIGHT, quantities=(0.53, (3.0,), None)), {"quantities": 5.0}),
@@ -127,11 +127,11 @@ def test_what_is_half_right(answers: Answers, less: dict[str, float]) -> None:
 
 
 def test_a_clean_flight() -> None:
-    none = Answers(log_sha256=SHA256, mistakes=(ClaimedMistake("none"),))
+    none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).share == 0.4
     whole = replace(
-        none, verdict_ours="consistent", verdict_ekf2="consistent", quantities=(0.5, 0.1, 0.2),
+        none, verdict_kf="consistent", verdict_ekf2="consistent", quantities=(0.5, 0.1, 0.2),
         ekf2_did=("followed the positions",),
     )  # fmt: skip
     assert form_points(whole, CLEAN).share == 1.0
@@ -141,7 +141,7 @@ def test_a_clean_flight() -> None:
 def test_a_cure_that_needs_no_measurement_counts_with_the_size_alone() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
-    claim = ClaimedMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
+    claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
     guess = Answers(log_sha256=SHA256, mistakes=(claim,))
     assert parts(guess, truth) == [30.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     measured = replace(guess, mistakes=(replace(claim, size=5.1, unit="m"),))
@@ -198,7 +198,7 @@ def answers_of(form: dict[str, Any]) -> Answers:
         parameter = one["parameter"] if one["parameter"] in CURES else ""
         unit = one["value_unit"] if one["value_unit"] in CURES.get(parameter, {}) else ""
         claims.append(
-            ClaimedMistake(
+            StudentMistake(
                 one["kind"], one["size"],
                 "" if one["unit"] == next(iter(MISTAKES[one["kind"]].units), "") else one["unit"],
                 "whole flight" if when["text"] == "whole flight" else "", when["from_s"],
@@ -206,7 +206,7 @@ def answers_of(form: dict[str, Any]) -> Answers:
             )
         )  # fmt: skip
     return Answers(
-        log_sha256=SHA256, mistakes=tuple(claims), verdict_ours=form["verdict_ours"],
+        log_sha256=SHA256, mistakes=tuple(claims), verdict_kf=form["verdict_kf"],
         verdict_ekf2=form["verdict_ekf2"], ekf2_did=tuple(form["ekf2_did"]),
         quantities=tuple(given(one["given"]) for one in form["quantities"]),
     )  # fmt: skip

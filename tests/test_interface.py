@@ -136,7 +136,7 @@ def test_table_has_the_numbers_of_the_results(analysis) -> None:
 
 def test_table_filter_without_innovations_is_nan(analysis) -> None:
     row = px4fuse.table(analysis).loc[("down", "ekf2")]
-    assert row[["count", "nis_mean", "nis_low", "nis_high", "sigma_factor"]].isna().all()
+    assert row[["count", "nis_mean", "nis_low", "nis_high", "sigma_ratio"]].isna().all()
     assert row["verdict"] == ""
     assert row["position_rmse_m"] == analysis["down"].filters["ekf2"].truth.position_rmse_m
 

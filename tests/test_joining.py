@@ -68,8 +68,8 @@ def test_a_ulog_without_positions_gets_them_back_and_keeps_what_it_has(
     assert joined.ekf2.state is stripped.ekf2.state
     assert joined.streams["imu"].log == "stripped.ulg"
     assert joined.log.senders == tlog_flight.log.senders
-    set_back = replace(tlog_flight, log=replace(tlog_flight.log, receipt_went_back=3))
-    assert join(stripped, set_back).log.receipt_went_back == 3
+    set_back = replace(tlog_flight, log=replace(tlog_flight.log, receive_time_reversals=3))
+    assert join(stripped, set_back).log.receive_time_reversals == 3
     [given] = joined.inputs
     assert (given.name, given.role) == ("aisle_uwb.tlog", "mavlink")
     assert given.sha256 == tlog_flight.log.sha256

@@ -105,7 +105,7 @@ def test_both_corrections_bring_the_sample_closer_and_end_where_the_vehicle_did(
         before = rmse(sample_loop, "uncorrected", reference)
         for way in ("by_distance", "gated"):
             assert rmse(sample_loop, way, reference) < 0.8 * before
-    end = sample_loop.known_end.displacement
+    end = sample_loop.true_end.displacement
     for way, within in (("by_distance_plain", 1e-9), ("by_distance", 1e-9), ("gated", 0.02)):
         position = path(sample_loop, way).trajectory.position_m
         assert np.linalg.norm(position[-1] - position[0] - end) < within
@@ -141,7 +141,7 @@ def test_the_plain_correction_moves_each_pose_by_its_share_and_turns_none(sample
 def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop) -> None:
     """The sample's heading drifts: over 10 m only the one that turns is as good as the odometry."""
     over = [
-        next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_words == "10 m")
+        next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_text == "10 m")
         for way in ("uncorrected", "by_distance", "by_distance_plain")
     ]
     before, turned, plain = (e.rmse for e in over if isinstance(e, Statistics))
@@ -161,8 +161,8 @@ def test_without_a_known_heading_there_is_one_correction_by_distance(sample, sam
 
 
 def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop) -> None:
-    forward, right, _ = sample_loop.known_end.displacement  # its nose points along x
-    heading = sample_loop.known_end.heading_change_deg
+    forward, right, _ = sample_loop.true_end.displacement  # its nose points along x
+    heading = sample_loop.true_end.heading_change_deg
     taped = loop_of(sample, landed_at=Landing(forward, right, heading))
     # a tape does not see the height, which the truth has 0.16 m lower
     assert taped.closure_error_m == pytest.approx(sample_loop.closure_error_m, abs=0.03)
@@ -179,8 +179,8 @@ def test_an_absolute_track_is_not_taken_for_odometry() -> None:
     source = read_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
     assert source.trajectory.kind == "ekf2"
     found = analyse(source)
-    assert found.absolute
-    assert "loop_of_absolute_track" in {finding.id for finding in find_loop(found)}
+    assert found.is_absolute_track
+    assert "loop_on_absolute_positions" in {finding.id for finding in find_loop(found)}
     assert isinstance(analyse_flight_loop(source.flight), Unavailable)
 
 
@@ -235,7 +235,7 @@ def test_one_false_closure_among_true_ones() -> None:
         assert min(getattr(judged, name) for judged in true) > 0.5
     named = [finding.id for finding in find_loop(fooled)]
     assert named[0] == "false_loop_closure"
-    assert "loop_closure_doubtful" not in named
+    assert "loop_closure_inconsistent" not in named
 
 
 def test_the_gate_accepts_true_landings_as_often_as_stated() -> None:
@@ -263,7 +263,7 @@ def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
     finding = find_loop(found)[0]
     assert (finding.id, finding.severity) == ("false_loop_closure", "error")
     assert finding.evidence["p"] < 0.001
-    opened = close_loop(half, came_back=False)
+    opened = close_loop(half, closed_loop=False)
     assert opened.closure_error_m is None
     assert opened.closure_error_axes_m is None
     assert opened.closures == ()
@@ -289,7 +289,7 @@ def test_a_doubtful_closure_is_named() -> None:
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
     found = close_loop(odometry, closures=(*TRUE, wrong))
     assert found.closures[-1].accepted
-    doubtful = [f for f in find_loop(found) if f.id == "loop_closure_doubtful"]
+    doubtful = [f for f in find_loop(found) if f.id == "loop_closure_inconsistent"]
     assert len(doubtful) == 1
     assert doubtful[0].evidence["time_1_s"] == 20.0
 
@@ -302,7 +302,7 @@ def test_dropping_most_closures_points_to_the_drift() -> None:
     position = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     biased = replace(odometry, position_m=position, rotation=turn * odometry.rotation)
     found = close_loop(biased, closures=TRUE, heading_drift_deg=1.0)
-    assert "loop_drift_understated" in {finding.id for finding in find_loop(found)}
+    assert "loop_drift_too_small" in {finding.id for finding in find_loop(found)}
 
 
 def test_an_assumed_landing_is_said_to_be_assumed(sample: LoopSource, sample_loop: Loop) -> None:
@@ -310,7 +310,7 @@ def test_an_assumed_landing_is_said_to_be_assumed(sample: LoopSource, sample_loo
     blind = Unavailable("ground truth", "left out", "")
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
     (finding,) = find_loop(found)
-    assert (finding.id, finding.severity) == ("loop_end_assumed", "info")
+    assert (finding.id, finding.severity) == ("loop_landing_assumed", "note")
     assert "--landed-at" in finding.remedy
     assert find_loop(loop_of(sample, landed_at=Landing(0.0, 0.0))) == ()
 

@@ -139,7 +139,7 @@ def test_read_mavlink_duplicates_over_two_links_are_removed(read):
     assert_frame_equal(one.ekf2.state, two.ekf2.state)
     assert len(two.positions[0].samples) == 200
     assert_allclose(one.positions[0].samples.index, two.positions[0].samples.index, atol=1e-3)
-    assert {s.lost_share for s in two.log.senders} == {0.0}
+    assert {s.lost_fraction for s in two.log.senders} == {0.0}
 
 
 # ---- IMU ----------------------------------------------------------------------------------------

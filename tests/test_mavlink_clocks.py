@@ -401,9 +401,9 @@ def test_describe_senders_reports_lost_fraction(tmp_path):
     assert described[AUTOPILOT].description == "PX4 quadrotor"
     assert described[COMPANION].description == "companion computer"
     assert described[GROUND].description == "ground station"
-    assert described[COMPANION].lost_share == pytest.approx(0.1, abs=0.005)
-    assert described[AUTOPILOT].lost_share == 0.0
-    assert described[constant].lost_share is None
+    assert described[COMPANION].lost_fraction == pytest.approx(0.1, abs=0.005)
+    assert described[AUTOPILOT].lost_fraction == 0.0
+    assert described[constant].lost_fraction is None
     assert [*described] == [AUTOPILOT, COMPANION, GROUND, constant]  # most messages first
 
 

@@ -114,8 +114,8 @@ def test_to_json_rejects_nan_and_infinity():
         (b'[{"a": 1, "b": {}, "a": 2}]', "a key is repeated"),
         (b"[]", "no results of px4fuse"),
         (b"1", "no results of px4fuse"),
-        (b'{"schema": {"name": "px4fuse-loop", "version": "1.0"}}', "uses schema version 1.0"),
-        (b'{"schema": {"name": "px4fuse-loop", "version": "3.0"}}', "missing required field"),
+        (b'{"schema": {"name": "px4fuse-loop", "version": "3.0"}}', "uses schema version 3.0"),
+        (b'{"schema": {"name": "px4fuse-loop", "version": "4.0"}}', "missing required field"),
     ],
     ids=range(21),
 )

@@ -10,11 +10,11 @@ import pytest
 from exchange import replace
 from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, finding
 
-from px4fuse.answer_form import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, StudentMistake
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth
 from px4fuse.errors import ResultsError
-from px4fuse.findings import NAMES
+from px4fuse.findings import TITLES
 from px4fuse.grading.flags import class_flags, own_flags
 from px4fuse.grading.model import Entry, GradedReport
 from px4fuse.grading.outputs import feedback_text
@@ -69,13 +69,14 @@ def test_a_file_that_is_not_at_hand():
     assert (points, comment[-28:]) == (0.0, "(made with another version).")
 
 
+GAIN = "log_likelihood_gain_per_measurement"
 RMSE = "axes.north.filters.kf.truth.position_rmse_m"
 BLIND = changed(axes__north__filters__kf__truth=NONE)
 NORTH = changed(axes={"north": EXAMPLE["axes"]["north"]}, tuning={}, horizontal={})
 SIGMA_Z = "tuning__horizontal__sigma_z_m"
-UNCLEAR = changed(clock__determinable=False, clock__reason="no acceleration.")
-JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_clock_changes")]}
-UNDERSTATED = {"horizontal__kf__verdict": "variance understated", "horizontal__kf__nis_mean": 3.0}
+UNCLEAR = changed(clock__is_determinable=False, clock__reason="no acceleration.")
+JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_time_offset_changes")]}
+UNDERSTATED = {"horizontal__kf__verdict": "overconfident", "horizontal__kf__nis_mean": 3.0}
 AFTER = "loop__corrections__by_distance"
 WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
 REJECTED = changed(LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}])
@@ -99,7 +100,7 @@ CHECKED = [
                               "rmse", "at_most": 0.3}, 1.0, ""),
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
     ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
-    ("number", NORTH, {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}, 0.0,
+    ("number", NORTH, {"path": f"tuning.horizontal.held_out.{GAIN}", "at_most": 1.0}, 0.0,
      "leave --axis out"),
     ("consistent", changed(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
     ("consistent", EXAMPLE, {}, 0.72, "σ of KF is 1.06 times too large"),
@@ -121,9 +122,9 @@ CHECKED = [
     ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
     ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
-    ("loop", changed(LOOP, loop__absolute=True), {}, 0.0, "does not drift"),
+    ("loop", changed(LOOP, loop__is_absolute_track=True), {}, 0.0, "does not drift"),
     ("loop", REJECTED, {}, 0.25, "no closure was accepted"),
-    ("loop", changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE), {}, 0.0,
+    ("loop", changed(LOOP, loop__closure_error_m=..., loop__true_end=NONE), {}, 0.0,
      "too few of them"),
     ("number", changed(axes__north__updates__count=50), {"path": "axes.*.updates.count",
      "at_least": 100, "zero_at": 0}, 0.5, "axes.north"),
@@ -307,10 +308,10 @@ class TestWhatStudentsRead:
 
     def test_words_never_ids(self):
         """Whatever is missing is told in words; paths and ids are the program's own."""
-        wrong = [finding(name, "error") for name in NAMES]
+        wrong = [finding(name, "error") for name in TITLES]
         spoilt = [
             changed(findings=wrong, student__notes="It is a flight of 5 s.", tuning={}, clock=NONE),
-            changed(LOOP, findings=wrong, loop__closure_error_m=..., loop__known_end=NONE,
+            changed(LOOP, findings=wrong, loop__closure_error_m=..., loop__true_end=NONE,
                     loop__closures=[]),
             filled(["nlos", "dropout"], student__id="s01", findings=wrong),
         ]  # fmt: skip
@@ -336,7 +337,7 @@ class TestWhatStudentsRead:
         ({"log__hardware": HARDWARE}, ("simulate",)),
         ({"settings__sigma_z_m": 100.0}, ("SIGMA_Z 100 is far from",)),
         ({"settings__sigma_a_m_s2": 0.001}, ("SIGMA_A 0.001 is far from",)),
-        ({"source__passage": "kept by EKF2"}, ("kept by EKF2",)),
+        ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
 def test_what_stands_out_in_one_report(values, said):
@@ -396,9 +397,9 @@ class TestClassFlags:
         }
 
     def test_a_classmates_numbers_each_changed_a_little(self):
-        claims = ClaimedMistake("yaw", -20.5), ClaimedMistake("nlos", 1.23)
+        claims = StudentMistake("yaw", -20.5), StudentMistake("nlos", 1.23)
         mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
-        other = (ClaimedMistake("nlos", 1.24), ClaimedMistake("yaw", -20.3))
+        other = (StudentMistake("nlos", 1.24), StudentMistake("yaw", -20.3))
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
         made = class_flags([of(1, form=mine), of(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}

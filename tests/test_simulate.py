@@ -369,8 +369,8 @@ def test_findings_clean_flight_are_notes_only(scenario):
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))
-    drift = ["errors_larger_than_claimed"] if scenario.kind == "loop" else []
-    assert [finding.id for finding in findings] == [*drift, "ekf2_is_a_model"]
+    drift = ["error_exceeds_reported_sigma"] if scenario.kind == "loop" else []
+    assert [finding.id for finding in findings] == [*drift, "ekf2_simulated"]
     most_m = 0.12 if scenario.kind == "aisle" else 0.7
     for axis in compared.axes.values():
         assert axis.filters["kf"].truth.position_rmse_m < most_m

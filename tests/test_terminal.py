@@ -91,9 +91,9 @@ def test_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
     assert "\x1b" not in whole
     # in a pipe a paragraph is one line; the summary comes first and is not repeated
     lines = whole.splitlines()
-    story = document[1].story
-    assert lines[: len(story) + 1] == [*story, ""]
-    assert all(whole.count(sentence) == 1 for sentence in story)
+    summary = document[1].story
+    assert lines[: len(paragraphs) + 1] == [*paragraphs, ""]
+    assert all(whole.count(paragraph) == 1 for paragraph in paragraphs)
 
 
 def test_paragraph_has_hanging_indent(capsys) -> None:
@@ -165,7 +165,7 @@ def test_command_of_finding_removes_finding(desk) -> None:
         {one["id"] for one in json.loads(Path(name).read_text())["findings"]}
         for name in ("a.json", "b.json")
     ]
-    assert "source_clock_offset" in findings[0] - findings[1]
+    assert "source_time_offset" in findings[0] - findings[1]
 
 
 # --- files ---

@@ -157,7 +157,7 @@ def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
     assert found == results(*command)
     assert found["alignment"] == "se3"
     assert found["ate"]["translation_m"]["rmse"] == pytest.approx(0.060, abs=0.01)
-    assert found["time_offset"]["determinable"]
+    assert found["time_offset"]["is_determinable"]
     assert run(*command).exit_code == 0
     assert contents(tmp_path) == before
     deltas = results(*command, "--rpe", "5m", "--rpe", "10s", "--rpe", "1f")["rpe"]

@@ -477,9 +477,9 @@ def test_what_if_smaller_vision_gate_rejects_more() -> None:
     assert "external vision, position: mean NIS" in update_log
     results = json.loads(to_json(whatif_results(request, made_of)))
     jsonschema.validate(results, schema())
-    assert results["replayed"]["others"]["ev_pos"]["rejected_share"] == 0.0
-    assert found.replayed.others["ev_pos"].rejected_share == 0.0
-    assert found.whatif[0].others["ev_pos"].rejected_share > 0.2
+    assert results["replayed"]["others"]["ev_pos"]["rejected_fraction"] == 0.0
+    assert found.replayed.others["ev_pos"].rejected_fraction == 0.0
+    assert found.whatif[0].others["ev_pos"].rejected_fraction > 0.2
 
 
 def test_what_if_without_vision_or_gnss_uses_other() -> None:
@@ -545,7 +545,7 @@ def test_steps_contain_vision_and_causes_only_kf() -> None:
             < names.index(steps.VISION_STEP)
             < names.index(steps.GATE)
         )
-        assert why.position_left_share < 0.05
+        assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
         assert min(moved_m[steps.VELOCITY_STEP], moved_m[steps.VISION_STEP]) > 0.05
     analysis = explain(compare(flown(), Settings(0.27, 0.4)))

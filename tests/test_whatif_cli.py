@@ -55,7 +55,7 @@ def test_whatif_without_gnss_from_time_drifts_afterwards(sample_log: Path) -> No
     said = json.loads(done("whatif", sample_log, *options).stdout)
     jsonschema.validate(said, schema())
     assert said["whatif"]["without"] == {"ev_pos": 100.0}
-    assert said["judged_s"][0][0] == 100.0
+    assert said["evaluated_s"][0][0] == 100.0
     assert said["provenance"]["command"].endswith("aisle_uwb.ulg --without ev_pos --from 100")
     assert said["replayed"]["without"] == {}
     # consistent after 30 s of dead reckoning with a noise of 0.35 m/s²
@@ -124,8 +124,8 @@ class TestFlownFlights:
         assert set(found.changes) == {"EKF2_EVP_NOISE"}
         (cured,) = found.whatif.whatif
         assert all(0.9 <= axis.nis_mean <= 1.1 for axis in cured.axes.values())
-        assert cured.rejected_share == 0.0
-        assert found.whatif.logged.rejected_share > 0.5
+        assert cured.rejected_fraction == 0.0
+        assert found.whatif.logged.rejected_fraction > 0.5
         assert cured.position_rmse_to_truth_m < 0.4 * error(found.whatif.logged)
 
     @pytest.mark.parametrize("name", ["v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync"])

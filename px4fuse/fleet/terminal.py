@@ -37,18 +37,18 @@ def summary(fleet: Fleet) -> Page:
         f"{filter_name}\
 {title}"
         for filter_name in ("KF", "EKF2")
-        for title in ("logs", "factor")
+        for title in ("logs", "σ ratio")
     ]
     lines = []
     for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
         cells = []
-        for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
-            cells += [f"{len(factors)}", format_factor(factors.median()) if len(factors) else "–"]
+        for ratios in (rows["kf_sigma_ratio"].dropna(), rows["ekf2_sigma_ratio"].dropna()):
+            cells += [f"{len(ratios)}", format_factor(ratios.median()) if len(ratios) else "–"]
         lines.append((str(axis), *cells))
     if lines:
         page.table(("axis", *heads), lines, right=(1, 2, 3, 4))
-        factor_note = "factor: median of reported σ / actual σ (above 1: underconfident)"
-        page.write(factor_note, colour=MUTED_COLOUR)
+        ratio_note = "σ ratio: median of actual σ / reported σ (above 1: overconfident)"
+        page.write(ratio_note, colour=MUTED_COLOUR)
     finding_ids = logs["findings"].str.split(FINDING_SEPARATOR).explode()
     for finding, count in finding_ids[finding_ids != ""].value_counts().head(MAX_SHOWN).items():
         page.write(f"{count} × {finding_title(str(finding))}")

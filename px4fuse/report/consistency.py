@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import Of
+from px4fuse.comparison.causal_replays import Statistic
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
@@ -38,10 +38,10 @@ MAX_NON_WHITE_P = 0.01
 RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # points; heights of the axes
 BAND_GREY = "#dcdcdc"
 # Label of each statistic that a cause explains, and the power with which its value is printed
-CAUSE_STATISTICS: Mapping[Of, tuple[str, float]] = {
+CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
-    "apart": ("KF - EKF2 (m)", 1.0),
+    "difference": ("KF - EKF2 (m)", 1.0),
 }
 
 
@@ -112,7 +112,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     for cause in analysis.causes:
         if cause.axis == axis.name:
             owner = "KF" if cause.filter == "kf" else "EKF2"
-            statistic, power = CAUSE_STATISTICS[cause.of]
+            statistic, power = CAUSE_STATISTICS[cause.statistic]
             values = (format_number(value**power, 2) for value in (cause.before, cause.after))
             rows.append(
                 [
@@ -249,8 +249,8 @@ def _nis_sentence(series: list[FilterSeries]) -> str:
 
 def _shape_sentence(series: list[FilterSeries]) -> str:
     return "\n".join(
-        f"{name}: {consistency.outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), mean "
-        f"{consistency.innovation_mean_m:+z.3f} m ({format_p_value(consistency.bias_p)})."
+        f"{name}: {consistency.fraction_outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), "
+        f"mean {consistency.innovation_mean_m:+z.3f} m ({format_p_value(consistency.bias_p)})."
         for name, _, consistency in series
     )
 
@@ -278,7 +278,7 @@ def _statistic_cells(
         return [""] * 5
     return [
         f"{consistency.count}",
-        f"{consistency.outside_two_sigma:.1%}",
+        f"{consistency.fraction_outside_two_sigma:.1%}",
         f"{consistency.bias_t:+.1f}",
         f"{consistency.lag1_autocorrelation:+.2f}",
         format_p_value(consistency.ljung_box_p),

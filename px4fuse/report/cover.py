@@ -53,7 +53,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     page = Page("EKF2 check: comparison with a two-state Kalman filter (KF)")
     page.add_foot(_map_and_facts(analysis, facts(analysis)))
     page.write(flight_line(results.student, analysis.flight.log), colour=MUTED_COLOUR, above=-4.0)
-    for sentence in results.story:
+    for sentence in results.summary:
         page.write(sentence, size=10.5, above=2.0)
     _write_verdict(page, analysis)
     write_errors(page, analysis)

@@ -9,7 +9,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
-from px4fuse.ekf2.steps import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
@@ -41,7 +41,9 @@ INCREASE_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that incre
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the steps for each axis with an explanation; no page if no axis has one."""
     explanations = _explanations(analysis)
-    if not any(isinstance(explanation, Why) for explanation in explanations.values()):
+    if not any(
+        isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
+    ):
         return
     page = Page(
         TITLE,
@@ -64,13 +66,13 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     yield page
 
 
-def _explanations(analysis: Analysis) -> Mapping[str, Why | Unavailable]:
+def _explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
     """Return the explanation of the aisle axis if it exists, else those of all axes."""
-    explanations = analysis.why
+    explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
 
-def write_explanation(page: Page, explanation: Why | Unavailable) -> None:
+def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
     """Write the largest step of the difference KF - EKF2, or the reason why it is unknown."""
     if isinstance(explanation, Unavailable):
         page.write_labelled("KF-EKF2", f"Difference not explained: {explanation.reason}.")
@@ -82,7 +84,7 @@ def unexplained_note(analysis: Analysis) -> str:
     """Return the reason why the report has no such page; "" if it has or the log has no EKF2."""
     explanations = list(_explanations(analysis).values())
     if isinstance(analysis.flight.ekf2, Unavailable) or any(
-        isinstance(explanation, Why) for explanation in explanations
+        isinstance(explanation, DifferenceExplanation) for explanation in explanations
     ):
         return ""
     reasons = {
@@ -104,8 +106,8 @@ def format_agreement(agreement: Agreement) -> str:
     return (
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
         f"Correlation of {agreement.samples} innovations {correlation}; S ratio replay/log "
-        f"{ratio}; rejected {agreement.rejected_share_replayed:.1%} (log "
-        f"{agreement.rejected_share_logged:.1%})"
+        f"{ratio}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
+        f"{agreement.rejected_fraction_logged:.1%})"
         + "".join(
             f". The {AIDS[name].label} does not agree and is not used: {reason}"
             for name, reason in agreement.doubtful.items()
@@ -113,24 +115,26 @@ def format_agreement(agreement: Agreement) -> str:
     )
 
 
-def _draw_axis(page: Page, name: str, explanation: Why, analysis: Analysis) -> None:
+def _draw_axis(
+    page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
+) -> None:
     spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
     page.heading(f"{name}, {spans}", 9.5, above=10.0)
     for sentence in explanation.sentences:
         page.write(sentence, size=8.5, above=1.0)
     names = [step.name for step in explanation.steps]
     columns = halves(LEFT_COLUMN_FRACTION, gap=COLUMN_GAP)
-    for column, left, (quantity, unit, power) in zip(
-        columns,
-        (LABEL_WIDTH, 4.0),
-        (("position", "m", "m2"), ("velocity", "m/s", "m2_s2")),
-        strict=True,
+    quantities = (
+        ("position", "m", "m2", explanation.unexplained_mean_square_m2),
+        ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
+    )
+    for column, left, (quantity, unit, power, unexplained) in zip(
+        columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
         total = getattr(explanation, f"{quantity}_mean_square_{power}")
         steps = np.array(
             [getattr(step, f"{quantity}_mean_square_{power}") for step in explanation.steps]
         )
-        unexplained = getattr(explanation, f"{quantity}_left_mean_square_{power}")
         title, height = (
             f"{quantity} difference, {np.sqrt(total):.3f} {unit} RMS",
             ROW_HEIGHT * (len(names) + 2),
@@ -180,7 +184,7 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_sha
     axes.grid(visible=False)
 
 
-def _time_sentence(explanation: Why) -> str:
+def _time_sentence(explanation: DifferenceExplanation) -> str:
     """Caption of the time panel: largest difference and unexplained RMS."""
     largest = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     return (

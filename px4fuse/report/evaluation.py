@@ -224,9 +224,7 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
             axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
         axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
     shown_indices = range(0, len(rpe_statistics), 1 + len(rpe_statistics) // MAX_DELTA_LABELS)
-    axes.set_xticks(
-        shown_indices, [rpe_statistics[index][0].delta_words for index in shown_indices]
-    )
+    axes.set_xticks(shown_indices, [rpe_statistics[index][0].delta_text for index in shown_indices])
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
     axes.set_xlabel("delta")
@@ -305,7 +303,7 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
 def error_rows(evaluation: Evaluation) -> list[list[str]]:
     """Return the table rows of the ATE and each RPE, with the columns of SCORE_HEAD."""
     errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": evaluation.ate}
-    errors |= {f"RPE {error.delta_words} (m)": error for error in evaluation.rpe}
+    errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
     for name, error in errors.items():
         translation, rotation = error.translation_m, error.rotation_deg

@@ -192,7 +192,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
             for name, consistency in filters_by_name(result).items()
         )
         if isinstance(result.difference, Difference):
-            verdicts += f"; KF - EKF2 {result.difference.position_rmse_m:.3f} m RMS"
+            verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
         column.heading(result.axis.name)
         column.write(f"{verdicts}.", size=7.5)
     page.add_columns(*columns, gap=COLUMN_GAP)

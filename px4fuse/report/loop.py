@@ -180,7 +180,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     page.write_labelled("Track", track_text)
     page.write_labelled("Segment", f"{_format_span(loop)}, {loop.part_reason}")
     page.write_labelled("Closure", describe_closure_error(loop))
-    true_end = loop.known_end
+    true_end = loop.true_end
     page.write_labelled(
         "True end", "not used" if isinstance(true_end, Unavailable) else true_end.source
     )
@@ -251,7 +251,7 @@ def write_scores(page: Page, loop: Loop) -> None:
         if not evaluations:
             continue
         first_evaluation = next(iter(evaluations.values()))
-        head = ["path", *(f"{e.delta_words} (m)" for e in first_evaluation.rpe), "rotation (°)"]
+        head = ["path", *(f"{e.delta_text} (m)" for e in first_evaluation.rpe), "rotation (°)"]
         page.table(
             head,
             [
@@ -354,9 +354,9 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 def format_correction(correction: CorrectedPath) -> str:
     """Format RMS and maximum (m) of a correction."""
-    if not correction.moved_max_m:
+    if not correction.correction_max_m:
         return "–"
-    return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
+    return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
 
 
 def graph_summary(solved: SolvedGraph) -> Page:

@@ -220,7 +220,7 @@ def _position_numbers(result: AxisComparison) -> str:
     if isinstance(difference, Unavailable):
         return f"{difference.what}: {difference.reason}"
     return (
-        f"KF - EKF2: RMS {difference.position_rmse_m:.3f} m, mean "
+        f"KF - EKF2: RMS {difference.position_rms_m:.3f} m, mean "
         f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
     )
 
@@ -228,7 +228,7 @@ def _position_numbers(result: AxisComparison) -> str:
 def _velocity_numbers(result: AxisComparison) -> str:
     texts = [_error_numbers(result, VELOCITIES)]
     if isinstance(result.difference, Difference):
-        texts.append(f"KF - EKF2: RMS {result.difference.velocity_rmse_m_s:.3f} m/s")
+        texts.append(f"KF - EKF2: RMS {result.difference.velocity_rms_m_s:.3f} m/s")
     return "; ".join(filter(None, texts))
 
 
@@ -297,8 +297,8 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
             sentences.append(f"{name}: {consistency.reason}.")
         else:
             sentences.append(
-                f"{name}: {consistency.outside_two_sigma:.1%} of {consistency.count} innovations "
-                f"outside ±2√S (expected 5 %): {format_verdict(consistency)}."
+                f"{name}: {consistency.fraction_outside_two_sigma:.1%} of {consistency.count} "
+                f"innovations outside ±2√S (expected 5 %): {format_verdict(consistency)}."
             )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from px4fuse.comparison.model import (
     AxisComparison,
@@ -28,10 +28,9 @@ if TYPE_CHECKING:
 # p value of the Ljung-Box test below which innovations are reported as not white; so a flight with
 # eight tests has a false alarm in less than 1 % of cases
 MIN_WHITE_P = 0.001
-SIGMA_VERDICTS = {
-    "variance overstated": ("underconfident", "large"),
-    "variance understated": ("overconfident", "small"),
-}
+# Error of the reported σ, by verdict
+SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
+RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
@@ -54,13 +53,12 @@ def format_verdict(consistency: Consistency | Unavailable) -> str:
 def format_sigma_verdict(verdict: str, factor: float) -> str:
     """Format a verdict of the results with the factor between reported and actual σ.
 
-    >>> format_sigma_verdict("variance understated", 2.41)
+    >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
     """
     if verdict not in SIGMA_VERDICTS:
         return verdict
-    confidence, size = SIGMA_VERDICTS[verdict]
-    return f"{confidence}, σ {format_factor(factor)}× too {size}"
+    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_VERDICTS[verdict]}"
 
 
 def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UnjudgedFilter]:
@@ -118,9 +116,9 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     def rms_cells(
         result: AxisComparison, name: str, consistency: FilterSummary | UnjudgedFilter
     ) -> list[str]:
-        statistics: list[Any] = [result.difference if name == "KF" else None] if has_ekf2 else []
-        statistics += [consistency.truth] if has_truth else []
-        return [_format_rms(statistic, field) for statistic in statistics for field in RMSE_FIELDS]
+        difference = result.difference if name == "KF" else None
+        cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
+        return cells + [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
 
     head = [*VERDICT_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
@@ -180,7 +178,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
 def format_consequences(consequences: Sequence[Finding]) -> str:
     """Format the findings that are consequences of another finding, with their ids."""
     return "Consequences: " + " ".join(
-        f"{finding.headline} [{finding.id}]." for finding in consequences
+        f"{finding.title} [{finding.id}]." for finding in consequences
     )
 
 
@@ -228,7 +226,7 @@ def tuning_advice(
     tuning = tuned.get(name)
     if not isinstance(tuning, AxisTuning):
         return {}
-    advice, sigma_a, sigma_z = {}, tuning.filter_sigma_a, tuning.sigma_z
+    advice, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
         advice["Drift"] = (

@@ -64,7 +64,7 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
             )
         )
         facts["position source"] = (
-            f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
+            f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
     parameters = (

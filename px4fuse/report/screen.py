@@ -34,7 +34,7 @@ STYLES = {
     MUTED_COLOUR: "dim",
     SEVERITY_COLOURS["error"]: "bold red",
     SEVERITY_COLOURS["warning"]: "yellow",
-    SEVERITY_COLOURS["info"]: "cyan",
+    SEVERITY_COLOURS["note"]: "cyan",
     GOOD_COLOUR: "green",
 }
 # A value does not end in a full stop: that ends the sentence

@@ -3,7 +3,7 @@
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
-from px4fuse.ekf2.steps import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.findings import by_root
 from px4fuse.report.aids import write_aids_of_comparison, write_aids_only
 from px4fuse.report.cover import facts, write_finding
@@ -37,7 +37,7 @@ def summary(analysis: Analysis | AidsOnlyAnalysis, results: Any, report: object 
         page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
         write_aids_only(page, analysis, results.findings)
         return page
-    for sentence in results.story:
+    for sentence in results.summary:
         page.write(sentence)
     page.add("blank")
     names = " + ".join([log.name, *(file.name for file in analysis.flight.inputs)])
@@ -48,8 +48,10 @@ def summary(analysis: Analysis | AidsOnlyAnalysis, results: Any, report: object 
     write_errors(page, analysis)
     for note in (ERROR_LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED_COLOUR)
-    explanation = analysis.why.get(analysis.main.axis.name)
-    is_in_summary = isinstance(explanation, Why) and explanation.cause in results.story
+    explanation = analysis.difference_steps.get(analysis.main.axis.name)
+    is_in_summary = (
+        isinstance(explanation, DifferenceExplanation) and explanation.cause in results.summary
+    )
     if explanation is not None and not is_in_summary:
         write_explanation(page, explanation)
     write_aids_of_comparison(page, analysis)

@@ -27,11 +27,11 @@ AXIS_ROWS: Rows = (
     ("    median σ_p (m)", lambda axis: _format_number(axis.sigma_p_median_m)),
     ("    position RMSE (m)", lambda axis: _format_number(axis.position_rmse_to_truth_m)),
 )
-HEIGHT_ROWS: Rows = (*NIS_ROWS, ("    rejected", lambda height: f"{height.rejected_share:.1%}"))
+HEIGHT_ROWS: Rows = (*NIS_ROWS, ("    rejected", lambda height: f"{height.rejected_fraction:.1%}"))
 # Statistics of the whole replay
 OVERALL_ROWS: Rows = (
     ("samples", lambda s: f"{s.samples}"),
-    ("rejected", lambda s: f"{s.rejected_share:.1%}"),
+    ("rejected", lambda s: f"{s.rejected_fraction:.1%}"),
     ("longest time without fusion (s)", lambda s: _format_number(s.longest_without_fusion_s, 2)),
     ("position resets", lambda s: f"{s.resets}"),
 )
@@ -85,7 +85,7 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
 
 def _format_cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str:
     """Format a statistic of an axis or aid; the name "" stands for the whole replay."""
-    if not summary.steady:
+    if not summary.is_predictable:
         return NOT_PREDICTABLE
     statistics = {"": summary, **summary.axes, **summary.heights, **summary.others}.get(name)
     return "n/a" if statistics is None else cell(statistics)
@@ -98,7 +98,7 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
     (_, nis), _, _, (_, sigma), (_, rmse) = AXIS_ROWS
     for summary in sweep_summaries(analysis):
         cells = [NOT_PREDICTABLE, *[""] * 5]
-        if summary.steady:
+        if summary.is_predictable:
             per_axis_cells = [
                 "/".join(map(cell, summary.axes.values())) for cell in (nis, sigma, rmse)
             ]
@@ -134,7 +134,7 @@ def swept_parameter(analysis: WhatIfAnalysis) -> str:
 def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
     """Return sentences on the best values of the sweep and on the limits of the replay."""
     sentences = []
-    if summaries := [summary for summary in sweep_summaries(analysis) if summary.steady]:
+    if summaries := [summary for summary in sweep_summaries(analysis) if summary.is_predictable]:
         name = swept_parameter(analysis)
         best = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         sentences.append(
@@ -152,7 +152,7 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
                 f"The horizontal position RMSE against ground truth is smallest at {name} "
                 f"{format_number(errors[min_error_m])} ({min_error_m:.3f} m)."
             )
-    if not all(summary.steady for summary in analysis.whatif.whatif):
+    if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
             f"Not predictable: more than {MAX_REJECTED_SHARE:.0%} of the samples would "
             f"be rejected, {1000.0 * DISTURBED_M:.0f} mm of position noise would change "
@@ -169,11 +169,11 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 def summary(analysis: WhatIfAnalysis) -> Page:
     """Make the terminal page of ``px4fuse whatif``."""
     page = Page()
-    if AISLE in analysis.why:
-        write_explanation(page, analysis.why[AISLE])
+    if AISLE in analysis.difference_steps:
+        write_explanation(page, analysis.difference_steps[AISLE])
     log, whatif_result = analysis.flight.log, analysis.whatif
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.judged)
+    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)
     page.write_labelled("Used", f"{spans} of the flight, in all columns")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(analysis)]

@@ -65,7 +65,7 @@ def judge_agreement(name: str, model: Model) -> None:
             assert axis.velocity_rms_difference_m_s < 0.02, (name, aid)
     for axis in agreement.axes.values():
         if OVERCONFIDENT in name:
-            off = agreement.rejected_share_replayed - agreement.rejected_share_logged
+            off = agreement.rejected_fraction_replayed - agreement.rejected_fraction_logged
             assert abs(off) < 0.03, name
             assert abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) < 0.10, name
             continue
@@ -99,7 +99,7 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
         total = sum(axis.position_mean_square_m2 for axis in axes)
         for step in (step for axis in axes for step in axis.steps):
             bars[step.name] += step.position_mean_square_m2 / total
-        left = sum(axis.position_left_mean_square_m2 for axis in axes) / total
+        left = sum(axis.unexplained_mean_square_m2 for axis in axes) / total
         told = " | ".join(f"{share:.1%}" for share in (*bars.values(), left))
         print(f"{name} | {np.sqrt(total):.3f} | {told}")
         assert abs(sum(bars.values()) + left - 1.0) < 1e-9, name
@@ -121,7 +121,7 @@ def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
         cells = (
             name, a.samples, " / ".join(f"{axis.innovation_correlation:.4f}" for axis in axes),
             f"{min(x.s_ratio_p5 for x in axes):.3f} to {max(x.s_ratio_p95 for x in axes):.3f}",
-            f"{a.rejected_share_replayed:.1%} / {a.rejected_share_logged:.1%}",
+            f"{a.rejected_fraction_replayed:.1%} / {a.rejected_fraction_logged:.1%}",
             " / ".join(f"{axis.position_rms_difference_m:.3f}" for axis in axes),
             f"{left[name]:.1%}", height_cell(a),
         )  # fmt: skip
@@ -177,12 +177,12 @@ def counterfactuals(models: dict[str, Model]) -> None:
         nis = [axis.nis_mean for axis in summary.axes.values()]
         rmse = horizontal_rmse(summary)
         print(
-            f"{name} {change} | {nis[0]:.2f}, {nis[1]:.2f} | {summary.rejected_share:.1%} | "
+            f"{name} {change} | {nis[0]:.2f}, {nis[1]:.2f} | {summary.rejected_fraction:.1%} | "
             f"{rmse:.3f} ({horizontal_rmse(made.logged):.3f})"
         )
         if "EKF2_EVP_NOISE" in change:
             assert all(0.9 <= value <= 1.1 for value in nis), nis
-            assert summary.rejected_share == 0.0
+            assert summary.rejected_fraction == 0.0
         elif isinstance(expected_m, float):
             assert abs(summary.position_rmse_to_truth_m / expected_m - 1.0) < 0.06, (name, summary)
         elif expected_m in models:

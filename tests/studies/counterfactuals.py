@@ -78,13 +78,14 @@ def tried(pair: Pair) -> tuple[Pair, str, tuple[float, ...]]:
     assert not isinstance(errors_m[0], Unavailable)
     assert not isinstance(errors_m[1], Unavailable)
     numbers = (
-        predicted.nis_mean, real.nis_mean, predicted.rejected_share, real.rejected_share, *errors_m
+        predicted.nis_mean, real.nis_mean, predicted.rejected_fraction, real.rejected_fraction,
+        *errors_m
     )  # fmt: skip
-    if not predicted.steady:
+    if not predicted.is_predictable:
         return pair, "chaotic", numbers
     near = abs(predicted.nis_mean / real.nis_mean - 1.0) <= NIS_WITHIN
     near &= abs(errors_m[0] / errors_m[1] - 1.0) <= ERROR_WITHIN
-    near &= abs(predicted.rejected_share - real.rejected_share) <= REJECTED_WITHIN
+    near &= abs(predicted.rejected_fraction - real.rejected_fraction) <= REJECTED_WITHIN
     return pair, "right" if near else "WRONG", numbers
 
 

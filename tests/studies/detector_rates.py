@@ -24,7 +24,7 @@ from scipy.stats import binomtest
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import estimate_frame_rotation, noises_and_clock
+from px4fuse.comparison.estimates import estimate_frame_rotation, estimate_noises_and_clock
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, find_loop
@@ -40,10 +40,10 @@ CLEAN = "none"
 CLEAN_FLIGHTS, FAULTY_FLIGHTS = 50, 20
 # Faulty flights have other seeds than clean ones
 FAULTY_SEED = 10_000
-ALWAYS = ("ekf2_unavailable", "ekf2_is_a_model", "loop_end_assumed")
+ALWAYS = ("ekf2_not_logged", "ekf2_simulated", "loop_landing_assumed")
 NOT_ASKED = Unavailable("EKF2 replay", "the condition is not about EKF2", "Fly with EKF2.")
 # Beginnings of the findings that are read from what EKF2 logs
-OF_EKF2 = ("ekf2_", "source_stamps_of_arrival")
+OF_EKF2 = ("ekf2_", "source_timestamps_are_arrival_times")
 # Options of ``px4fuse simulate`` that a scenario may have, and their fields
 OPTIONS = {
     "--kind": "kind", "--passes": "passes", "--pause": "pause_s", "--yaw": "yaw",
@@ -81,7 +81,7 @@ SCENARIOS: Mapping[str, Flown] = MappingProxyType({
     "0.30 m": Flown("--sigma-uwb 0.3", Settings(0.27, 0.30)),
     "hover": Flown("--passes 2 --pause 30", Settings(0.27, 0.10)),
     "yaw follows": Flown("--yaw follow", Settings(0.27, 0.10)),
-    "loop, VIO": Flown("--kind loop", Settings(0.27, 0.01), ("errors_larger_than_claimed",)),
+    "loop, VIO": Flown("--kind loop", Settings(0.27, 0.01), ("error_exceeds_reported_sigma",)),
     # faster, so that an attitude that is off weighs more
     "outdoors, GNSS": Flown("--kind outdoor", Settings(0.35, 0.40)),
 })  # fmt: skip
@@ -211,11 +211,11 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
 def _explain(flight: Flight, condition: Condition) -> Analysis:
     """What the detectors look at, without why EKF2 differs, for speed."""
     comparison = compare(flight, condition.settings, axes=("north", "east"))
-    tuning, clock = noises_and_clock(comparison)
+    tuning, clock = estimate_noises_and_clock(comparison)
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
     heading = estimate_frame_rotation(comparison, tuning, clock)
     return Analysis(
-        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, why={},
+        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, difference_steps={},
         loop=analyse_flight_loop(flight), heading=heading,
     )  # fmt: skip
 

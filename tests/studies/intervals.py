@@ -18,7 +18,7 @@ import numpy as np
 from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import noises_and_clock
+from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.source_clock import MIN_OFFSET_S
@@ -41,7 +41,7 @@ def measured(job: Job) -> tuple[float, ...] | None:
     flown = replace(clean(scenario).flight(seed), ekf2=False, truth=False)
     flight = simulate_flight(flown, parse((mistake,) if mistake else ()))
     comparison = compare(flight, axes=("north", "east"))
-    tuning, clock = noises_and_clock(comparison)
+    tuning, clock = estimate_noises_and_clock(comparison)
     tuned = tuning[HORIZONTAL]
     if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
         return None
@@ -50,8 +50,9 @@ def measured(job: Job) -> tuple[float, ...] | None:
     return (
         (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
         covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),
-        clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.determinable,
-        clock.determinable and false, clock.change_p is not None and clock.change_p < MAX_CHANGE_P,
+        clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.is_determinable,
+        clock.is_determinable and false,
+        clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P,
     )  # fmt: skip
 
 

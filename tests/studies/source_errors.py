@@ -39,7 +39,7 @@ from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.summary import story
+from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -120,21 +120,21 @@ def clock_jump(rng: Rng, time: Values, true: Values, late: float) -> Made:
 MODELS: dict[str, tuple[Model, str]] = {
     "white 0.1 m": (white, ""),
     "white 0.05, 0.2 m north, east": (
-        partial(white, sigma=np.array([0.05, 0.2, 0.1])), "source_axes_unequal"),
-    "AR(1) 0.2 s": (partial(coloured, tau_s=0.2), "source_coloured"),
-    "AR(1) 1 s": (partial(coloured, tau_s=1.0), "source_coloured"),
-    "AR(1) 5 s": (partial(coloured, tau_s=5.0), "source_coloured"),
-    "AR(1) 20 s": (partial(coloured, tau_s=20.0), "source_coloured"),
-    "held 30 %": (partial(held, share=0.3), "source_repeats"),
-    "held 60 %": (partial(held, share=0.6), "source_repeats"),
-    "low pass 0.3 s": (partial(low_pass, tau_s=0.3), "source_smoothed"),
-    "low pass 0.6 s": (partial(low_pass, tau_s=0.6), "source_smoothed"),
+        partial(white, sigma=np.array([0.05, 0.2, 0.1])), "source_noise_unequal_axes"),
+    "AR(1) 0.2 s": (partial(coloured, tau_s=0.2), "source_noise_time_correlated"),
+    "AR(1) 1 s": (partial(coloured, tau_s=1.0), "source_noise_time_correlated"),
+    "AR(1) 5 s": (partial(coloured, tau_s=5.0), "source_noise_time_correlated"),
+    "AR(1) 20 s": (partial(coloured, tau_s=20.0), "source_noise_time_correlated"),
+    "held 30 %": (partial(held, share=0.3), "source_samples_repeated"),
+    "held 60 %": (partial(held, share=0.6), "source_samples_repeated"),
+    "low pass 0.3 s": (partial(low_pass, tau_s=0.3), "source_low_pass_filtered"),
+    "low pass 0.6 s": (partial(low_pass, tau_s=0.6), "source_low_pass_filtered"),
     "outliers 5 %": (partial(with_outliers, share=0.05), "source_outliers"),
-    "three times as noisy": (partial(two_levels, factor=3.0), "source_noise_changes"),
-    "scale 20 %": (partial(scaled, scale=0.2), "source_scale_wrong"),
-    "jump 1 m": (partial(jumped, size=1.0), "source_jumps"),
-    "clock 0.3 s late": (partial(clock, late=0.3), "source_clock_offset"),
-    "clock jumps 0.3 s": (partial(clock_jump, late=0.3), "source_clock_changes"),
+    "three times as noisy": (partial(two_levels, factor=3.0), "source_noise_varies"),
+    "scale 20 %": (partial(scaled, scale=0.2), "source_scale_error"),
+    "jump 1 m": (partial(jumped, size=1.0), "source_position_jump"),
+    "clock 0.3 s late": (partial(clock, late=0.3), "source_time_offset"),
+    "clock jumps 0.3 s": (partial(clock_jump, late=0.3), "source_time_offset_changes"),
 }  # fmt: skip
 
 
@@ -202,19 +202,19 @@ def told(job: tuple[str, str, float, int], *, truth: bool = True) -> tuple[str, 
     if not truth:
         flight = replace(flight, truth=Unavailable("truth", "left out", "Not in this study."))
     analysis = explain(compare(flight, Settings(0.27, sigma_z_m), axes=("north", "east")))
-    told = story(analysis, find(analysis))[0].partition(", since ")[2]
+    told = summarise(analysis, find(analysis))[0].partition(", since ")[2]
     since = (f"since: {re.sub(r'[-+0-9.]+', '#', told.partition(' (')[0])}",) if told else ()
     return name, since + tuple(
         f"{one.id}{'!' if one.severity == 'error' else ''}"
         for one in find(analysis)
-        if one.severity != "info" and one.caused_by is None
+        if one.severity != "note" and one.caused_by is None
     )
 
 
 def right(name: str, ids: tuple[str, ...]) -> bool:
     """Whether the first finding is the model's own; of a pair, whether both are told."""
     wanted = {MODELS[each][1] for each in name.split(BOTH)} - {""}
-    causes = [one.strip("!") for one in ids if not one.startswith(("since", "ekf2_unavailable"))]
+    causes = [one.strip("!") for one in ids if not one.startswith(("since", "ekf2_not_logged"))]
     return wanted <= set(causes if len(wanted) > 1 else causes[:1]) and bool(wanted) >= bool(causes)
 
 
