@@ -37,7 +37,7 @@ if str(TESTS) not in sys.path:
     sys.path.insert(0, str(TESTS))
 
 import mavlink_tools  # noqa: E402
-from conftest import page_of  # noqa: E402
+from conftest import blank_page  # noqa: E402
 from exchange import replace  # noqa: E402
 from ulog_tools import Log, load  # noqa: E402
 
@@ -338,7 +338,7 @@ def run_command(
     words = [word.format(log=log, out=out) for word in command]
     where = f"{label}: {command[0]}"
     begin = time.process_time()
-    with warnings.catch_warnings(), mock.patch.object(pdf, "render", page_of):
+    with warnings.catch_warnings(), mock.patch.object(pdf, "render", blank_page):
         warnings.simplefilter("error")
         done = CliRunner().invoke(cli, words)
     took = time.process_time() - begin
