@@ -91,7 +91,7 @@ def test_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
     assert "\x1b" not in whole
     # in a pipe a paragraph is one line; the summary comes first and is not repeated
     lines = whole.splitlines()
-    summary = document[1].story
+    paragraphs = document[1].summary
     assert lines[: len(paragraphs) + 1] == [*paragraphs, ""]
     assert all(whole.count(paragraph) == 1 for paragraph in paragraphs)
 
