@@ -16,7 +16,7 @@ from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
 FAILED = "failed"
-# For --scheduler NAME, batch prints NAME.txt of this folder: how to start such a cluster
+# --scheduler NAME prints NAME.txt of this folder: instructions to start such a cluster
 CLUSTERS = ("slurm", "kubernetes")
 
 
@@ -53,8 +53,7 @@ CLUSTERS = ("slurm", "kubernetes")
 @options.settings_options
 @options.fail_option(
     (FAILED, *SEVERITIES),
-    "Exit with 1 if a log failed, is worse than the baseline, or has a finding of at least this "
-    "severity.",
+    "Exit with 1 if a log failed or has a finding of at least this severity.",
 )
 @options.open_option
 def batch(
@@ -87,9 +86,9 @@ def batch(
     from px4fuse.fleet.run import run
     from px4fuse.fleet.terminal import summary
 
-    gc.enable()  # the run is long, and Dask leaves reference cycles
+    gc.enable()  # Dask leaves reference cycles, which would fill the memory in a long run
     try:
-        with outputs.progress() as step:
+        with outputs.progress() as show_progress:
             fleet = run(
                 logs,
                 output,
@@ -98,12 +97,12 @@ def batch(
                 scheduler=scheduler,
                 workers=workers,
                 memory_gb=memory,
-                progress=partial(_show_rate, step, time.monotonic()),
+                progress=partial(_show_rate, show_progress, time.monotonic()),
                 **option_values,
             )
-    except KeyboardInterrupt as stopped:
+    except KeyboardInterrupt as interrupt:
         message = f"finished results are in {output}. Run the same command to continue."
-        raise outputs.Interrupted(stopped, message) from None
+        raise outputs.Interrupted(interrupt, message) from None
     outputs.write_and_print({}, summary(fleet), written=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
@@ -112,9 +111,13 @@ def batch(
 
 
 def _show_rate(
-    step: outputs.ShowStep, start_s: float, activity: str, done_count: int, total_count: int
+    show_progress: outputs.ShowProgress,
+    start_s: float,
+    activity: str,
+    done_count: int,
+    total_count: int,
 ) -> None:
-    """Show the progress with the number of logs per minute; ``start_s`` is monotonic time."""
+    """Show the progress with the logs per minute; ``start_s`` is the monotonic start time."""
     per_minute = 60.0 * done_count / (time.monotonic() - start_s)
     text = f"{activity}, {per_minute:.3g} per minute" if done_count else activity
-    step(text, done_count, total_count)
+    show_progress(text, done_count, total_count)

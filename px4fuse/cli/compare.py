@@ -48,21 +48,21 @@ def compare(
     from px4fuse.report.terminal import summary
     from px4fuse.results.build import outcome_results
 
-    person = options.read_student(option_values)
+    student = options.read_student(option_values)
     request = options.comparison_request(log, option_values)
-    outputs.report_paths(output, json_path)  # fail early if the output cannot be written
-    with outputs.progress(json_path) as step:
-        outcome = run_or_evaluate_aids(request, step)
-        results = outcome_results(request, outcome, person)
-        release_free_memory()  # the import of the report modules needs memory
+    outputs.report_paths(output, json_path)  # report an impossible output before the long analysis
+    with outputs.progress(json_path) as show_progress:
+        outcome = run_or_evaluate_aids(request, show_progress)
+        results = outcome_results(request, outcome, student)
+        release_free_memory()  # importing the report modules needs memory
         if output is None and json_path != STANDARD_OUTPUT:
             output = outputs.default_report(log.stem, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, outcome, step)
+        contents = outputs.result_files(results, json_path, output, outcome, show_progress)
     outputs.write_and_print(contents, summary(outcome, results, output), request)
-    bad = failed_checks(outcome) if checks else {}
-    for name, verdict in bad.items():
+    failed = failed_checks(outcome) if checks else {}
+    for name, verdict in failed.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
-    if bad:
+    if failed:
         sys.exit(1)
     if fail_on is not None:
         failing_severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1]

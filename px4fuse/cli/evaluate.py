@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
 MAX_DELTA = 1e6  # m, s or frames
-# Options that the function evaluate takes under the same name
+# Parameters that the function evaluate has under the same name
 SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
-def delta(text: str) -> Delta:
+def parse_delta(text: str) -> Delta:
     """Parse an RPE delta: a distance, a time or a number of frames (``5m``, ``10s``, ``1f``)."""
     from px4fuse.trajectory.scores import Delta
 
@@ -39,7 +39,7 @@ def delta(text: str) -> Delta:
 @click.argument("reference", type=options.InputPath())
 @click.option(
     "--rpe",
-    type=delta,
+    type=parse_delta,
     metavar="DELTA",
     multiple=True,
     help="RPE over a distance (5m), a time (10s) or a number of frames (1f); repeatable.  "
@@ -61,15 +61,15 @@ def delta(text: str) -> Delta:
     "--max-gap",
     "max_gap_s",
     type=options.TypedQuantity("s"),
-    help="Longest gap in the reference to interpolate over; with nearest, the largest time "
-    "difference.  [default: from its rate; 0.01 for nearest]",
+    help="Longest gap in the reference to interpolate over; with --association nearest, "
+    "the largest time difference.  [default: from the rate of the reference; 0.01 for nearest]",
 )
 @click.option(
     "--time-offset",
     "time_offset_s",
     type=options.TypedQuantity("s", auto=True),
     help="Seconds to add to the timestamps of the estimate; auto estimates them from the motion.  "
-    "[default: auto if the two do not overlap]",
+    "[default: auto if the two trajectories do not overlap in time]",
 )
 @click.option(
     "--consecutive",
@@ -97,7 +97,7 @@ def evaluate(
     from px4fuse.report.evaluation import write_evaluation
     from px4fuse.report.page import Page
     from px4fuse.results.build import evaluation_results
-    from px4fuse.trajectory.evaluation import evaluate as score
+    from px4fuse.trajectory.evaluation import evaluate as evaluate_trajectory
 
     deltas = option_values.pop("rpe")
     request = EvaluationRequest(
@@ -109,23 +109,23 @@ def evaluate(
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: the value must be above 0 s.")
     outputs.report_paths(output, json_path)
-    with outputs.progress(json_path) as step:
-        step("reading")
-        first = read_source(request.estimate, system=request.system)
-        second = read_source(request.reference, default="truth", system=request.system)
-        step("computing errors")
-        score_result = score(
-            first.trajectory,
-            second.trajectory,
+    with outputs.progress(json_path) as show_progress:
+        show_progress("reading")
+        estimate_source = read_source(request.estimate, system=request.system)
+        reference_source = read_source(request.reference, default="truth", system=request.system)
+        show_progress("computing errors")
+        evaluation = evaluate_trajectory(
+            estimate_source.trajectory,
+            reference_source.trajectory,
             rpe_deltas=deltas or None,
             all_pairs=not request.consecutive,
             **{name: option_values[name] for name in SCORE_OPTIONS},
         )
-        results = evaluation_results(request, score_result)
+        results = evaluation_results(request, evaluation)
         if output is None and json_path is None:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
             output = outputs.default_report(name, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, score_result, step)
+        contents = outputs.result_files(results, json_path, output, evaluation, show_progress)
     page = Page()
-    write_evaluation(page, score_result)
+    write_evaluation(page, evaluation)
     outputs.write_and_print(contents, page)

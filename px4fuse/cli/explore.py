@@ -28,10 +28,10 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
     log = log or sample_log()
     request = options.comparison_request(log, option_values)
     target = outputs.web_page(output, Path("reports", f"{log.stem}{settings_name(request)}.html"))
-    with outputs.progress(target) as step:
-        analysis = run(request, step)
-        step("writing the page")
-        # imported late: Bokeh is slow to import, and an error above does not need it
+    with outputs.progress(target) as show_progress:
+        analysis = run(request, show_progress)
+        show_progress("writing the page")
+        # Bokeh is slow to import, so an error above is shown without waiting for the import
         from px4fuse.explore.page import html_text
 
         content = html_text(analysis).encode()

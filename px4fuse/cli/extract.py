@@ -25,7 +25,7 @@ from px4fuse.reading import read_text
 if TYPE_CHECKING:
     import pandas as pd
 
-# bytes; limit for flight.json of an earlier run
+# Limit for flight.json of an earlier run
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 
@@ -83,12 +83,12 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
     try:
         with own_files():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
-        before = json.loads(text)["log"]
-        other = before["sha256"] != sha256
-        name = str(before["name"])
+        earlier_log = json.loads(text)["log"]
+        is_other_log = earlier_log["sha256"] != sha256
+        name = str(earlier_log["name"])
     except (OutputError, ValueError, KeyError, TypeError):  # flight.json is not from px4fuse
         return
-    if other:
+    if is_other_log:
         raise OutputError(
             f"{folder} contains the tables of another log, {name}. Choose another folder (-o)."
         )

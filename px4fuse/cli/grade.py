@@ -61,13 +61,13 @@ if TYPE_CHECKING:
     "--attempt",
     type=Choice(("latest", "best", "first")),
     default="latest",
-    help="Which attempt of a student counts.",
+    help="Attempt of each student that counts.",
 )
 @click.option(
     "--due",
     metavar="TIME",
     help="Due time: '2026-11-20 23:59' in this computer's time zone, or followed by '+01:00' or "
-    "'Europe/Berlin'. Times of the platform without a zone use the same zone.",
+    "'Europe/Berlin'. Submission times without a zone are in the same zone.",
 )
 @click.option(
     "--late",
@@ -78,7 +78,7 @@ if TYPE_CHECKING:
 @click.option(
     "--include-pending",
     is_flag=True,
-    help="Also enter points that still need the instructor's confirmation.",
+    help="Also enter points that the instructor has not confirmed yet.",
 )
 @click.option(
     "--worksheet",
@@ -137,24 +137,24 @@ def grade(
     from px4fuse.assignment.roster import read_people
     from px4fuse.assignment.sheet import read_sheet
     from px4fuse.grading.entries import Course, due_time, late_rule
-    from px4fuse.grading.grade import grade as grade_all
+    from px4fuse.grading.grade import grade as grade_submissions
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
         return
-    costs = late_rule(late) if late else None
-    if costs is not None and due is None:
+    late_deduction = late_rule(late) if late else None
+    if late_deduction is not None and due is None:
         raise SettingsError("--late requires --due TIME.")
     if not submissions:
         raise SettingsError("no submissions were given. Give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("grade requires an output folder: -o DIR.")
     _require_output_outside(output, (*submissions, *logs))
-    answers = None if key is None else read_key(key)
+    answer_key = None if key is None else read_key(key)
     course = Course(
         read_rubric(rubric),
-        answers,
+        answer_key,
         logs,
         title or "",
         roster=None if roster is None else read_people(read_sheet(roster)),
@@ -162,18 +162,22 @@ def grade(
         column=column or "",
         attempt=attempt,
         due=due_time(due) if due else None,
-        late=costs,
+        late=late_deduction,
         include_pending=include_pending,
         anonymous=anonymous,
     )
     try:
-        with progress() as step:
-            outcome = grade_all(
-                submissions, course, output, processes=jobs, progress=partial(step, "grading")
+        with progress() as show_progress:
+            outcome = grade_submissions(
+                submissions,
+                course,
+                output,
+                processes=jobs,
+                progress=partial(show_progress, "grading"),
             )
-    except KeyboardInterrupt as stopped:
+    except KeyboardInterrupt as interrupt:
         message = f"finished results are in {output}. Run the same command to continue."
-        raise Interrupted(stopped, message) from None
+        raise Interrupted(interrupt, message) from None
     write_and_print({}, _page(outcome), written=outcome.written)
 
 

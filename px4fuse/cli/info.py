@@ -58,9 +58,9 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
     request = comparison_request(log, option_values)
     check_targets([json_path])
-    with progress(json_path) as step:
-        flight = read_flight(request, step)
-        step("reading the contents")
+    with progress(json_path) as show_progress:
+        flight = read_flight(request, show_progress)
+        show_progress("reading the contents")
         inventory = take_inventory(flight)
     contents = result_files(to_plain(inventory), json_path)
     write_and_print(contents, _page(inventory, request))
@@ -169,7 +169,14 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         part = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
-            yield part, ("none", MUTED_COLOUR), "", "", "", ""  # the next table gives the reason
+            yield (
+                part,
+                ("none", MUTED_COLOUR),
+                "",
+                "",
+                "",
+                "",
+            )  # the table of analyses gives the reason
             continue
         yield (
             f"{part:8} (used)" if source.chosen else part,
@@ -198,7 +205,7 @@ def _span_text(source: Source) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0
-    # + 0.0 turns -0.0 into 0.0
+    # Adding 0.0 turns -0.0 into 0.0
     start, end = (round(time, digits) + 0.0 for time in (source.start_s, source.end_s))
     return f"{start:.{digits}f} to {end:.{digits}f}"
 

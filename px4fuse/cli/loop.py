@@ -24,19 +24,19 @@ from px4fuse.writing import STANDARD_OUTPUT
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# m; limit for --landed-at, longer than any tape measure
+# Limit for --landed-at, longer than any tape measure
 MAX_LANDING_DISTANCE_M = 10_000.0
 # Parameters that are allowed with a pose graph
 GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
 
 
-def _parse_numbers(text: str, expected: str, most: float) -> list[float]:
+def _parse_numbers(text: str, expected: str, max_absolute: float) -> list[float]:
     """Parse two or three comma-separated finite numbers of at most ``most``."""
     try:
-        numbers = [float(text_part) for text_part in text.split(",")]
+        numbers = [float(word) for word in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (2, 3) or not all(abs(number) <= most for number in numbers):
+    if len(numbers) not in (2, 3) or not all(abs(number) <= max_absolute for number in numbers):
         raise click.BadParameter(f"{text!r} is not {expected}.")
     return numbers
 
@@ -100,7 +100,7 @@ def parse_closure(text: str) -> GivenClosure:
 @click.option(
     "--reference",
     type=options.InputPath(str),
-    metavar="FILE|LOG:PART",
+    metavar="FILE|LOG:TRACK",
     help="Reference trajectory (for example SLAM) for the ATE and RPE of each path, besides the "
     "log's ground truth.",
 )
@@ -165,7 +165,7 @@ def loop(
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
-    person = options.read_student(option_values)
+    student = options.read_student(option_values)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
             raise SettingsError(
@@ -176,20 +176,20 @@ def loop(
         return
     request = loop_request(source, option_values)
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
-    with outputs.progress(json_path) as step:
-        loop_result = run_loop(request, step)
-        loop_output = loop_results(request, loop_result, person)
+    with outputs.progress(json_path) as show_progress:
+        loop_result = run_loop(request, show_progress)
+        results = loop_results(request, loop_result, student)
         if output is None and json_path is None:
             output = outputs.default_report(
-                f"{file_name(source)}_loop", settings_name(request), loop_output
+                f"{file_name(source)}_loop", settings_name(request), results
             )
         contents = _output_files(loop_result, tum, g2o)
-        contents |= outputs.result_files(loop_output, json_path, output, loop_result, step)
-    outputs.write_and_print(contents, summary(loop_result, loop_output.findings), request)
+        contents |= outputs.result_files(results, json_path, output, loop_result, show_progress)
+    outputs.write_and_print(contents, summary(loop_result, results.findings), request)
 
 
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
-    """Make a request of the values of the command's options."""
+    """Make a request from the values of the options."""
     del option_values["robust"]
     return LoopRequest(
         source=str(source), closed_loop=not option_values.pop("opened"), **option_values
@@ -242,9 +242,9 @@ def _solve_graph(
                 "Use only --g2o FILE, --json FILE and --robust.",
             )
     outputs.check_targets([json_path, g2o])
-    with outputs.progress(json_path) as step:
-        step(f"reading {display_name(source)}")
-        solved = analyse_graph(display_name(source), read_g2o(path), step, robust=robust)
+    with outputs.progress(json_path) as show_progress:
+        show_progress(f"reading {display_name(source)}")
+        solved = analyse_graph(display_name(source), read_g2o(path), show_progress, robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
     contents |= outputs.result_files(graph_results(solved, command), json_path)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from px4fuse.results.model import Student
 
 
-def column_names(text: str) -> tuple[str, ...]:
+def parse_columns(text: str) -> tuple[str, ...]:
     """Parse comma-separated names or numbers of columns."""
     return tuple(text.split(","))
 
@@ -45,7 +45,7 @@ Choice = partial(click.Choice, case_sensitive=False)
 
 
 def _combine_options(*options: Option) -> Option:
-    """Combine several options into one decorator; the help lists them in this order."""
+    """Combine options into one decorator; --help lists them in this order."""
 
     def add(command: Callable[..., None]) -> Callable[..., None]:
         for option in reversed(options):
@@ -69,13 +69,13 @@ class NonEmptyPath(click.Path):
 
 
 class InputPath(NonEmptyPath):
-    """File or folder to read; it is registered as input before the command begins.
+    """File or folder to read, which no output may overwrite.
 
     A log may be followed by the name of a track: ``LOG:vio``.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert the typed text to a path and register the file."""
+        """Convert the typed text to a path and register it as an input."""
         path = super().convert(value, param, ctx)
         file, colon, _ = str(path).rpartition(":")
         add_input(Path(file) if colon and not Path(path).exists() else Path(path))
@@ -115,8 +115,8 @@ class TypedQuantity(click.ParamType["float | str"]):
         try:
             number = float(value)
         except ValueError:
-            parsed = in_unit(value, self.unit)
-            example_text = f"{self.example if parsed is None else parsed:.12g}"
+            converted = in_unit(value, self.unit)
+            example_text = f"{self.example if converted is None else converted:.12g}"
             self.fail(
                 f"{value!r} is not a number{unit}. Give for example {example_text}"
                 f"{', or auto' if self.auto else ''}.",
@@ -130,11 +130,11 @@ class TypedQuantity(click.ParamType["float | str"]):
 
 def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
     if megabytes is not None:
-        before = max_log_bytes.set(megabytes * 1_000_000)
-        ctx.call_on_close(lambda: max_log_bytes.reset(before))
+        token = max_log_bytes.set(megabytes * 1_000_000)
+        ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
-# A limit of this computer, not a setting of the analysis, so it is not part of the request
+# The limit depends on the computer and does not change results, so no request contains it
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(1),
@@ -249,7 +249,7 @@ position_options = _combine_options(
     ),
     click.option(
         "--position-columns",
-        type=column_names,
+        type=parse_columns,
         metavar="TIME,X,Y,Z[,SIGMA]",
         help="Names or numbers of the columns of the position file.  [default: recognised by name]",
     ),
@@ -352,7 +352,7 @@ settings_options = _combine_options(filter_options, system_option, _clock_option
 
 
 def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRequest:
-    """Make a request of the values of :func:`flight_options` or :func:`analysis_options`.
+    """Make a request from the values of :func:`flight_options` or :func:`analysis_options`.
 
     Raises
     ------
@@ -376,7 +376,7 @@ def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
 
 
 def typed_parameters() -> Iterator[click.Parameter]:
-    """Yield the parameters that were typed, not those at their defaults."""
+    """Yield the parameters that the user typed."""
     context = click.get_current_context()
     for parameter in context.command.params:
         if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
@@ -384,7 +384,7 @@ def typed_parameters() -> Iterator[click.Parameter]:
 
 
 def read_student(option_values: dict[str, Any]) -> Student:
-    """Take the values of :func:`person_options` out of the options and read their files.
+    """Remove the values of :func:`person_options` from the option values and read their files.
 
     Raises
     ------
@@ -397,16 +397,16 @@ def read_student(option_values: dict[str, Any]) -> Student:
     from px4fuse.results.model import MAX_NOTES_BYTES, Student
 
     name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
-    path, form, notes = option_values.pop("notes"), option_values.pop("answers"), ""
-    if path is not None:
-        from px4fuse.report.notes import parse  # imported here, as it is slow
+    notes_path, answers_path, notes = option_values.pop("notes"), option_values.pop("answers"), ""
+    if notes_path is not None:
+        from px4fuse.report.notes import parse  # slow import
 
-        notes = read_text(path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {path}")
-        parse(notes, f"--notes {path}")  # report errors before the analysis
-    answers = UNSET if form is None else read_answers(form)
-    person = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
-    _warn_missing_fonts(person.name + person.id + person.notes)
-    return person
+        notes = read_text(notes_path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {notes_path}")
+        parse(notes, f"--notes {notes_path}")  # report errors before the analysis
+    answers = UNSET if answers_path is None else read_answers(answers_path)
+    student = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
+    _warn_missing_fonts(student.name + student.id + student.notes)
+    return student
 
 
 def _warn_missing_fonts(text: str) -> None:

@@ -53,8 +53,8 @@ def practice(
     seed = secrets.randbelow(10**6) if seed is None else seed
     target = web_page(output, Path("reports", f"practice_{seed}.html"))
     ctx.meta[OPEN_KEY] = sys.stdout.isatty() if opened is None else opened
-    with progress(target) as step:
+    with progress(target) as show_progress:
         from px4fuse.practice import practice_text
 
-        content = practice_text(seed, level, flights, step).encode()
+        content = practice_text(seed, level, flights, show_progress).encode()
     write_and_print({target: content})

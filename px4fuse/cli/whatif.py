@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @click.option(
     "--sweep",
     metavar="NAME=LOW:HIGH[:COUNT]",
-    help="Replay with several values of one parameter.",
+    help="Replay with COUNT values of one parameter, from LOW to HIGH.  [default COUNT: 9]",
 )
 @click.option(
     "--without",
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     "start_s",
     type=options.TypedQuantity("s", 60.0),
     metavar="SECONDS",
-    help="Time from which the aids of --without are missing.  [default: from the start]",
+    help="Time from which EKF2 does not fuse the aids of --without.  [default: from the start]",
 )
 @options.recording_options
 @options.max_size_option
@@ -79,8 +79,8 @@ def whatif(
         without=dict.fromkeys(without, start_s or 0.0),
         **option_values,
     )
-    with outputs.progress(json_path) as step:
-        counterfactual = run_what_if(request, step)
+    with outputs.progress(json_path) as show_progress:
+        counterfactual = run_what_if(request, show_progress)
     results = whatif_results(request, counterfactual)
     outputs.write_and_print(outputs.result_files(results, json_path), summary(counterfactual))
 
@@ -102,8 +102,8 @@ def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:
 def _parse_sweep(text: str) -> Sweep:
     from px4fuse.request import Sweep
 
-    name, _, ends = text.partition("=")
-    limits = ends.split(":")
+    name, _, range_text = text.partition("=")
+    limits = range_text.split(":")
     if len(limits) not in (2, 3) or (len(limits) == 3 and not limits[2].isdecimal()):
         raise SettingsError(
             f"--sweep {text} is not valid. Use NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for "
@@ -120,7 +120,7 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
         return float(value)
     except ValueError as error:
         unit = PARAMETERS[name].unit.replace("^2", "²") if name in PARAMETERS else ""
-        parsed = in_unit(value, unit)
-        of_unit = f" in {NAMES[unit]}" if unit else ""
-        problem = "" if parsed is None else f"{of_unit}. Give {parsed:g}"
+        converted = in_unit(value, unit)
+        unit_text = f" in {NAMES[unit]}" if unit else ""
+        problem = "" if converted is None else f"{unit_text}. Give {converted:g}"
         raise SettingsError(f"{option_text}: {value!r} is not a number{problem}.") from error

@@ -1,7 +1,7 @@
 /* Practice: current flight, given answers and score. The address contains the state, so a reload keeps
    it. The correct answers are decoded only after an answer. */
 const Practice = (() => {
-  const count = Number($("quiz").dataset.rounds), parts = new URLSearchParams(location.hash.slice(1));
+  const count = Number($("quiz").dataset.flights), parts = new URLSearchParams(location.hash.slice(1));
   const saved = (parts.get("answers") ?? "").split("~").slice(0, count);
   const answers = Array.from({ length: count }, (_, i) => saved[i] ?? "");
   const wanted = Math.trunc(Number(parts.get("flight") ?? 1)) - 1;
