@@ -157,13 +157,13 @@ def test_printed_commands_run_when_pasted(desk, monkeypatch, typed) -> None:
 
 @pytest.mark.usefixtures("no_drawing")
 def test_command_of_finding_removes_finding(desk) -> None:
-    first = run_checked("compare", "l.ulg", "--sigma-z", "0.12", "--json", "a.json")
+    first = run_checked("compare", "l.ulg", "--sigma-z", "0.12")
     assert "reports/l_sigma-z-0.12.pdf" in first.stdout.replace(os.sep, "/")
     command = next(command for command in commands(first.stdout) if "--clock-offset" in command)
     run_checked(*shlex.split(command)[1:], "--json", "b.json")
     findings = [
         {one["id"] for one in json.loads(Path(name).read_text())["findings"]}
-        for name in ("a.json", "b.json")
+        for name in ("reports/l_sigma-z-0.12.json", "b.json")
     ]
     assert "source_time_offset" in findings[0] - findings[1]
 
@@ -179,6 +179,11 @@ def files(folder: Path) -> set[str]:
 def test_json_to_standard_output_writes_no_file(command, desk) -> None:
     assert json.loads(run_checked(command, "l.ulg", "--json", "-").stdout)
     assert files(desk) == {"l.ulg"}
+
+
+def test_json_to_file_writes_no_report(desk) -> None:
+    run_checked("compare", "l.ulg", "--json", "a.json")
+    assert files(desk) == {"a.json", "l.ulg"}
 
 
 @pytest.fixture
@@ -246,6 +251,36 @@ def test_same_name_in_two_folders_keeps_first_report(desk, sample_log) -> None:
     assert "Choose another name with -o" in error_line("compare", "b/l.ulg")
     assert Path("reports/l.pdf").read_bytes() == before
     run_checked("compare", "l.ulg")
+
+
+def test_default_page_of_another_log_is_kept(desk, sample_log) -> None:
+    (desk / "b").mkdir()
+    shutil.copy(sample_log, desk / "b" / "l.ulg")
+    page = Path("reports/l.html")
+    run_checked("explore", "l.ulg")
+    before = page.read_bytes()
+    assert "l.html exists and is not a page" in error_line("explore", "b/l.ulg")
+    assert page.read_bytes() == before
+    run_checked("explore", "l.ulg")
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["explore l.ulg", "practice --seed 3 --flights 1 --no-open"],
+    ids=["explore", "practice"],
+)
+@pytest.mark.parametrize(
+    "mine", [b"mine", b"\xff", b"<html><title>l.ulg - px4fuse explore</title>"]
+)
+def test_default_page_of_user_is_kept(desk, command, mine) -> None:
+    page = Path("reports", "practice_3.html" if "practice" in command else "l.html")
+    page.parent.mkdir()
+    page.write_bytes(mine)
+    assert f"{page} exists and is not a page of" in error_line(*command.split())
+    assert page.read_bytes() == mine
+    run_checked(*command.split(), "-o", page)
+    assert page.read_bytes() != mine
+    run_checked(*command.split())  # an own page is replaced
 
 
 def test_settings_name_is_valid_in_file_names() -> None:

@@ -143,15 +143,21 @@ max_size_option = click.option(
     callback=_set_max_size,
     help=f"Maximum size of a log.  [default: {max_log_bytes.get() // 1_000_000}]",
 )
-#: Option --json
-json_option = click.option(
-    "--json",
-    "json_path",
-    type=NonEmptyPath(),
-    metavar="FILE",
-    help="Write the results as JSON; - prints them to standard output. With --json and without -o, "
-    "no report is written.  [default: beside the report]",
-)
+
+
+def _json_option(more_text: str = "") -> Option:
+    """Declare --json."""
+    return click.option(
+        "--json",
+        "json_path",
+        type=NonEmptyPath(),
+        metavar="FILE",
+        help=f"Write the results as JSON; - prints them to standard output.{more_text}",
+    )
+
+
+#: Option --json of commands without a report
+json_option = _json_option()
 
 
 def output_option(metavar: str, text: str, **details: Any) -> Option:
@@ -163,7 +169,8 @@ def output_option(metavar: str, text: str, **details: Any) -> Option:
 
 def report_options(text: str) -> Option:
     """Declare -o for the PDF report and --json for its results."""
-    return _combine_options(output_option("FILE.pdf", text), json_option)
+    json_text = "With --json and without -o, no report is written.  [default: beside the report]"
+    return _combine_options(output_option("FILE.pdf", text), _json_option(f" {json_text}"))
 
 
 def fail_option(severities: tuple[str, ...], text: str) -> Option:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.options import output_option
-from px4fuse.cli.outputs import OPEN_KEY, progress, web_page, write_and_print
+from px4fuse.cli.outputs import OPEN_KEY, check_default_page, progress, web_page, write_and_print
 
 
 @click.command()
@@ -56,5 +56,7 @@ def practice(
     with progress(target) as show_progress:
         from px4fuse.practice import practice_text
 
-        content = practice_text(seed, level, flights, show_progress).encode()
-    write_and_print({target: content})
+        page = practice_text(seed, level, flights, show_progress)
+        if output is None:
+            check_default_page(target, page)
+    write_and_print({target: page.encode()})
