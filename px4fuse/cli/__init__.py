@@ -20,7 +20,7 @@ from px4fuse.threads import ONE_THREAD
 COMMANDS = {
     "compare": "Check EKF2 against a two-state Kalman filter and report mistakes.",
     "batch": "Run compare on many logs and collect one table.",
-    "diff": "List the settings, numbers and findings that differ between two flights or reports.",
+    "diff": "List differences between two flights or reports.",
     "answers": "Write the answer form for a flight.",
     "explore": "Write an interactive page with sliders for the filter settings.",
     "practice": "Write a quiz page with simulated flights and hidden mistakes.",
