@@ -166,11 +166,11 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
 
     previous = ""
     for source in inventory.sources:
-        part = source.part if source.part != previous else ""
+        data_type = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
             yield (
-                part,
+                data_type,
                 ("none", MUTED_COLOUR),
                 "",
                 "",
@@ -179,7 +179,7 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
             )  # the table of analyses gives the reason
             continue
         yield (
-            f"{part:8} (used)" if source.chosen else part,
+            f"{data_type:8} (used)" if source.chosen else data_type,
             source.name,
             "" if source.samples is None else f"{source.samples}",
             "" if source.rate_hz is None else _format_short(source.rate_hz),

@@ -136,18 +136,18 @@ def check_default_page(path: Path, page: str) -> None:
     OutputError
         A file of that name exists and is not a page of the same command and log.
     """
-    made_by = GENERATOR.findall(page)
+    generator = GENERATOR.findall(page)
     kind = "a page of the same command and log by this version"
-    _check_default(path, kind, lambda content: GENERATOR.findall(content.decode()) == made_by)
+    _check_default(path, kind, lambda content: GENERATOR.findall(content.decode()) == generator)
 
 
 def _check_default(path: Path, kind: str, is_replaceable: Callable[[bytes], bool]) -> None:
     """Raise an error if the file of a default path exists and its content is of another kind."""
     try:
-        replaceable = not path.exists() or is_replaceable(path.read_bytes())
+        may_replace = not path.exists() or is_replaceable(path.read_bytes())
     except (OSError, UnicodeDecodeError, ResultsError):
-        replaceable = False
-    if not replaceable:
+        may_replace = False
+    if not may_replace:
         raise OutputError(
             f"{path} exists and is not {kind}; it was not overwritten",
             "Choose another name with -o.",
@@ -160,9 +160,9 @@ def _is_same_report(
     """Return True if the files are the same, and the old report has no other student."""
     from px4fuse.results.contract import file_hashes_in, to_json
 
-    old = read(content, "report")
-    same_files = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
-    return same_files and _person(old) in (NO_PERSON, _person(results))
+    existing = read(content, "report")
+    same_files = file_hashes_in(to_json(existing)) == file_hashes_in(to_json(results))
+    return same_files and _person(existing) in (NO_PERSON, _person(results))
 
 
 def _person(results: Results) -> tuple[str, str]:

@@ -58,26 +58,30 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
     if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_OFFSET_S):
         side = "late" if offset < 0.0 else "early"
         advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
-        typed = typed_offset_s(comparison, clock)
-        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
-    delay, name = delay_ms(comparison), aid_of(comparison).delay
+        typed_offset = typed_offset_s(comparison, clock)
+        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed_offset:.3f}"
+    configured_delay_ms, delay_name = delay_ms(comparison), aid_of(comparison).delay
     age_s = comparison.source.age_s
-    least, most = age_s - high, age_s - low
+    min_delay_s, max_delay_s = age_s - high, age_s - low
     if (
-        delay is not None
-        and least - NEGLIGIBLE_OFFSET_S <= delay * 1e-3 <= most + NEGLIGIBLE_OFFSET_S
+        configured_delay_ms is not None
+        and min_delay_s - NEGLIGIBLE_OFFSET_S
+        <= configured_delay_ms * 1e-3
+        <= max_delay_s + NEGLIGIBLE_OFFSET_S
     ):
-        advice["PX4"] = f"{name} {delay:g} ms is within the 95 % interval."
-    elif delay is not None and offset > age_s and delay <= 0.0:
+        advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
+    elif configured_delay_ms is not None and offset > age_s and configured_delay_ms <= 0.0:
         advice["PX4"] = (
-            f"The position timestamps are {1e3 * (offset - age_s):.0f} ms early, and {name} cannot "
-            "be negative. Correct the sender's clock."
+            f"The maximum-likelihood {delay_name} is {1e3 * (age_s - offset):.0f} ms, but "
+            f"{delay_name} cannot be negative. Correct the sender's clock."
         )
-    elif delay is not None:
-        ml_delay_ms, least, most = (max(1e3 * s, 0.0) for s in (age_s - offset, least, most))
+    elif configured_delay_ms is not None:
+        ml_delay_ms, min_ms, max_ms = (
+            max(1e3 * s, 0.0) for s in (age_s - offset, min_delay_s, max_delay_s)
+        )
         advice["PX4"] = (
-            f"Set {name} to {ml_delay_ms:.0f} ms (now {delay:g} ms; 95 % {least:.0f} to "
-            f"{most:.0f} ms), or correct the sender's clock."
+            f"Set {delay_name} to {ml_delay_ms:.0f} ms (now {configured_delay_ms:g} ms; 95 % "
+            f"{min_ms:.0f} to {max_ms:.0f} ms), or correct the sender's clock."
         )
     if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)

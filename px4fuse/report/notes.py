@@ -108,7 +108,9 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
     markdown.inline.ruler.before("escape", "maths", _parse_maths)
     tokens = markdown.parse(notes)
-    all_tokens = (part for token in tokens for part in (token, *(token.children or ())))
+    all_tokens = (
+        nested_token for token in tokens for nested_token in (token, *(token.children or ()))
+    )
     depth = max(accumulate(token.nesting for token in all_tokens), default=0)
     if depth > MAX_NESTING:
         raise SettingsError(
