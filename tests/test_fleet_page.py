@@ -141,7 +141,9 @@ def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     page.click(head("KF"))
     page.click("tbody tr:first-child .name")
     factors = {
-        log["name"]: log["sigma_ratios"]["kf"] for log in logs_of(made_up(240)) if log["factors"]
+        log["name"]: log["sigma_ratios"]["kf"]
+        for log in logs_of(made_up(240))
+        if log["sigma_ratios"]
     }
     assert page.names()[:3] == sorted(factors, key=lambda name: factors[name])[:3]
     assert STORY.splitlines()[0] in page.ask("document.querySelector('.more').innerText")
