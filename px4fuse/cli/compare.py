@@ -9,7 +9,7 @@ import click
 from px4fuse.cli import inputs, outputs
 from px4fuse.request import settings_name
 
-Severity = Literal["error", "warning", "info"]
+Severity = Literal["error", "warning", "note"]
 SEVERITIES = get_args(Severity)
 
 
@@ -55,7 +55,7 @@ def compare(
     outputs.write_and_print(contents, summary(outcome, results, output), request)
     bad = failed_checks(outcome) if checks else {}
     for name, verdict in bad.items():
-        click.echo(f"{name}: {verdict}", err=True)
+        click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
     if bad:
         sys.exit(1)
     if fail_on is not None:

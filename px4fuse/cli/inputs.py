@@ -353,7 +353,7 @@ def read_student(option_values: dict[str, Any]) -> Student:
     """
     from msgspec import UNSET
 
-    from px4fuse.answers import read_answers
+    from px4fuse.answer_form import read_answers
     from px4fuse.results.model import MAX_NOTES_BYTES, Student
 
     name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""

@@ -115,7 +115,7 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
         A file of that name exists and is not a report of the same files and student.
     """
     from px4fuse.results.reading import read_results
-    from px4fuse.verification.intake import attached_results
+    from px4fuse.verification.pdf_input import attached_results
 
     name = f"{stem}{settings}"
     if len(os.fsencode(name)) > LONGEST_NAME:

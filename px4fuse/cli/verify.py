@@ -44,7 +44,7 @@ def verify(
 
     Exit code 0: verified; 1: differences, other log or not verifiable; 2: invalid input.
     """
-    from px4fuse.verification.intake import MAX_BYTES, read_report
+    from px4fuse.verification.pdf_input import MAX_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
     from px4fuse.workers import JobFailure, run_one_bounded
 

@@ -36,8 +36,8 @@ from pypdf.generic import (
 )
 
 from px4fuse.results.reading import one_line
-from px4fuse.verification.intake import BROKEN_PDF_ERRORS, MAX_VALUES, PYPDF_LIMITS, opened
 from px4fuse.verification.model import PageDifference
+from px4fuse.verification.pdf_input import BROKEN_PDF_ERRORS, MAX_VALUES, PYPDF_LIMITS, opened
 from px4fuse.workers import JobFailure, run_one_bounded
 
 # pt; tolerance of coordinates. Other kernels of OpenBLAS move points by at most 0.07; 0.25 is not
@@ -105,7 +105,7 @@ def compare_pages(
     Parameters
     ----------
     submitted : bytes
-        A file that :func:`px4fuse.verification.intake.read_report` accepted.
+        A file that :func:`px4fuse.verification.pdf_input.read_report` accepted.
     words_alike : callable
         Returns True if two texts are equal up to the rounding of a number.
 
