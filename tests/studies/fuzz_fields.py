@@ -502,7 +502,7 @@ def written_statements(out: Path) -> Iterator[str]:
             json.loads(data, parse_constant=_reject_constant)
     for path in out.rglob("*.pdf"):
         for page in PdfReader(path).pages:
-            # without percentages: contributions, which have both signs, stand apart from their title
+            # without percentages: those of contributions have both signs, apart from their title
             yield from impossible_text(page.extract_text().replace("%", ""))
 
 
