@@ -19,12 +19,12 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import one_line_repr
 from px4fuse.ekf2_parameters import BAROMETER, Aid
-from px4fuse.origin import Origin
+from px4fuse.log import ClockMap, InputFile, LogInfo, Stream, Unused
+from px4fuse.notebook_display import one_line_repr
+from px4fuse.position_source import Origin
 from px4fuse.record import NotNegative, Record, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
-from px4fuse.recording import ClockMap, InputFile, LogInfo, Stream, Unused
 
 AxisName = Literal["north", "east", "down"]
 # Fraction of intervals near the median, below which the samples are in bursts
@@ -204,7 +204,7 @@ class PositionTrack:
         names = (
             "name",
             "kind",
-            "passage",
+            "path",
             "description",
             "frame",
             "clock",

@@ -16,8 +16,8 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.findings import Finding
 from px4fuse.flight import FlightMode, Reset
-from px4fuse.recording import Dropout
-from px4fuse.report import cover, flight, marks, panels
+from px4fuse.log import Dropout
+from px4fuse.report import cover, event_marks, flight, panels
 from px4fuse.report.page import Page
 from px4fuse.report.style import report_style
 from px4fuse.request import ComparisonRequest
@@ -47,7 +47,7 @@ def eventful() -> Analysis:
     made = aisle_flight(
         duration_s=100.0,
         uwb=Uwb(gap_s=(60.0, 65.0), outlier_share=0.03),
-        ekf2=Estimator(rejected_share=0.1, resets=(Reset(30.0, "position", (1.0, 0.0, 0.0)),)),
+        ekf2=Estimator(rejected_fraction=0.1, resets=(Reset(30.0, "position", (1.0, 0.0, 0.0)),)),
         dropouts=(Dropout(50.0, 0.5),),
     )
     made = replace(made, airborne=((20.0, 90.0),), modes=MODES)
@@ -56,7 +56,7 @@ def eventful() -> Analysis:
 
 
 def test_draw_marks_draws_each_kind_with_its_label(eventful: Analysis) -> None:
-    labels = [artist.get_label() for artist in marks.legend_entries(eventful)]
+    labels = [artist.get_label() for artist in event_marks.legend_entries(eventful)]
     assert labels == [
         "flight modes (alternating)", "on the ground", "gap in position source", "log dropout",
         "EKF2 rejected", "outlier", "EKF2 reset", "take-off", "landing",
@@ -64,7 +64,7 @@ def test_draw_marks_draws_each_kind_with_its_label(eventful: Analysis) -> None:
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.plot([6.0, 94.0], [2.0, 3.0])
     limits = axes.get_xlim(), axes.get_ylim()
-    marks.draw_marks(axes, eventful, strip=True)
+    event_marks.draw_marks(axes, eventful, strip=True)
     axes.autoscale()
     assert (axes.get_xlim(), axes.get_ylim()) == limits
     axes.lines[0].remove()
@@ -76,13 +76,13 @@ def test_draw_marks_draws_each_kind_with_its_label(eventful: Analysis) -> None:
     assert {text.get_text() for text in axes.texts} == {"Offboard", "Land"}
     # rejected, outliers, resets, take-off, landing
     assert [len(line.get_xdata()) for line in axes.lines[2:]] == [1, 1, 1]
-    assert set(axes.lines[1].get_xdata()) <= set(marks.outlier_times(eventful))
+    assert set(axes.lines[1].get_xdata()) <= set(event_marks.outlier_times(eventful))
 
 
 def test_marks_of_long_flight_do_not_overlap() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
-    visible = marks._visible_times(time_s, 3600.0 * marks.MIN_MARK_DISTANCE)
-    assert len(visible) <= 1.0 / marks.MIN_MARK_DISTANCE + 1.0
+    visible = event_marks._visible_times(time_s, 3600.0 * event_marks.MIN_MARK_DISTANCE)
+    assert len(visible) <= 1.0 / event_marks.MIN_MARK_DISTANCE + 1.0
     assert set(visible) <= set(time_s)
 
 

@@ -7,7 +7,7 @@ from ekf2_tools import opened
 from exchange import replace
 from findings_tools import made
 
-from px4fuse.ekf2.earth import earth_rate_rad_s, ekf2_metres_per_metre
+from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.flight import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M

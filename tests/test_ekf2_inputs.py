@@ -26,7 +26,7 @@ from px4fuse.ekf2.inputs import (
     prepare_inputs,
     read_vision,
 )
-from px4fuse.ekf2.stretches import (
+from px4fuse.ekf2.replay_segments import (
     Stretch,
     _stretch,
     down_sampled,
@@ -44,7 +44,7 @@ from px4fuse.ekf2_parameters import (
 )
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Reset, Unavailable
-from px4fuse.origin import (
+from px4fuse.position_source import (
     ALIGNED,
     GNSS,
     LOGGED_BY_EKF2,
@@ -353,7 +353,7 @@ def stretches(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     def keep(_imu: Any, _attitude: Any, _ekf2: Any, record: Any, at: int, high: float) -> None:
         found.append((float(record.delayed.index[at]), round(float(high), 2)))
 
-    monkeypatch.setattr("px4fuse.ekf2.stretches._stretch", keep)
+    monkeypatch.setattr("px4fuse.ekf2.replay_segments._stretch", keep)
     imu, fused, delayed = (
         pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
     )

@@ -9,12 +9,12 @@ from conftest import LOG
 from ekf2_tools import opened, plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
 
-from px4fuse.alignment.joining import join
+from px4fuse.alignment.merge_recordings import join
+from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.model import Model, delayed_states, open_model, replay_settings, run_variants
-from px4fuse.ekf2.recursion import Variant
 from px4fuse.ekf2.replay import HORIZONTAL
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.origin import RECEIVED
+from px4fuse.position_source import RECEIVED
 from px4fuse.readers import read_log
 
 
@@ -90,7 +90,7 @@ def test_model_sample_flight_agrees_with_log(model: Model) -> None:
     agreement = model.agreement
     assert agreement.good
     assert agreement.samples > 200
-    assert agreement.rejected_share_logged == agreement.rejected_share_replayed == 0.0
+    assert agreement.rejected_fraction_logged == agreement.rejected_fraction_replayed == 0.0
     for axis in agreement.ev_pos.values():
         assert axis.innovation_correlation > 0.999
         assert axis.innovation_rms_difference < 0.005

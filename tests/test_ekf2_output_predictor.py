@@ -6,7 +6,13 @@ from findings_tools import made as made_of
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.output_predictor import corrections, follow_attitude, publish
-from px4fuse.ekf2.stretches import ACCELEROMETER_BIAS, GRAVITY_M_S2, POSITION, VELOCITY, Stretch
+from px4fuse.ekf2.replay_segments import (
+    ACCELEROMETER_BIAS,
+    GRAVITY_M_S2,
+    POSITION,
+    VELOCITY,
+    Stretch,
+)
 
 STEP_S = 0.01
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 
-from px4fuse.alignment.joining import shift_times
+from px4fuse.alignment.merge_recordings import shift_times
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.readers import read_log
 

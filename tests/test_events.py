@@ -10,13 +10,13 @@ import pytest
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 
-from px4fuse.alignment.joining import join
+from px4fuse.alignment.merge_recordings import join
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.events import collect_events, source_gaps
+from px4fuse.comparison.flight_events import collect_events, source_gaps
 from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
+from px4fuse.log import Dropout
 from px4fuse.readers import read_log
-from px4fuse.readers.parts import mode_spans
-from px4fuse.recording import Dropout
+from px4fuse.readers.common import mode_spans
 
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
 
@@ -75,7 +75,7 @@ def test_collect_events_lists_all_within_the_segment() -> None:
 
 
 def test_collect_events_rejections_are_per_axis() -> None:
-    comparison = compare(aisle_flight(ekf2=Estimator(rejected_share=0.2)))
+    comparison = compare(aisle_flight(ekf2=Estimator(rejected_fraction=0.2)))
     found = collect_events(comparison)
     for result in comparison.axes.values():
         frame = result.ekf2_innovations

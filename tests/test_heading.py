@@ -11,8 +11,13 @@ from exchange import replace
 from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.preparation import choose_segment, choose_source
-from px4fuse.filter import heading
-from px4fuse.filter.heading import MAX_DRIFT_P, HeadingError, HeadingPart, estimate_heading_error
+from px4fuse.filter import frame_rotation
+from px4fuse.filter.frame_rotation import (
+    MAX_DRIFT_P,
+    HeadingError,
+    HeadingPart,
+    estimate_heading_error,
+)
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
@@ -37,10 +42,10 @@ def estimate(flight: Flight, sigma_z_m: float = SIGMA_UWB_M) -> HeadingError | U
     )
 
 
-def rotated(quaternions: pd.DataFrame, turn_deg: np.ndarray) -> pd.DataFrame:
+def rotated(quaternions: pd.DataFrame, misalignment_deg: np.ndarray) -> pd.DataFrame:
     """Return the orientations with a heading error."""
     values = quaternions[Columns.QUATERNION].to_numpy(copy=True)
-    wrong = Rotation.from_euler("Z", turn_deg[:, None], degrees=True)
+    wrong = Rotation.from_euler("Z", misalignment_deg[:, None], degrees=True)
     made = (wrong * Rotation.from_quat(values, scalar_first=True)).as_quat(scalar_first=True)
     return pd.DataFrame(made, index=quaternions.index, columns=Columns.QUATERNION)
 
@@ -51,11 +56,11 @@ def with_heading_drift(flight: Flight) -> tuple[Flight, np.ndarray]:
     return replace(flight, attitude=rotated(flight.attitude, turn)), turn
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 20.0, -40.0])
-def test_heading_constant_misalignment_is_recovered(turn_deg):
-    found = estimate(simulated(*([f"yaw={turn_deg:g}"] if turn_deg else [])))
+@pytest.mark.parametrize("misalignment_deg", [0.0, 20.0, -40.0])
+def test_heading_constant_misalignment_is_recovered(misalignment_deg):
+    found = estimate(simulated(*([f"yaw={misalignment_deg:g}"] if misalignment_deg else [])))
     assert not found.drifts
-    assert found.turn_deg == pytest.approx(turn_deg, abs=3.0 * found.sigma_deg)
+    assert found.misalignment_deg == pytest.approx(misalignment_deg, abs=3.0 * found.sigma_deg)
     assert found.sigma_deg < 3.0
 
 
@@ -128,7 +133,7 @@ def test_heading_motion_capture_logs_match_known_range(shared_logs, log, drifts,
 def test_heading_long_downsampled_flight_has_parts() -> None:
     """1,000 measurements in 25 minutes: fewer than three per part of ``PART_LENGTH_S``."""
     time = np.linspace(0.0, 1500.0, 1000)
-    parts = heading._mean_per_part(
+    parts = frame_rotation._mean_per_part(
         time, np.radians(np.full(1000, 4.0)), np.radians(np.full(1000, 1.0))
     )
     assert len(parts) > 100
@@ -139,7 +144,7 @@ def test_heading_long_downsampled_flight_has_parts() -> None:
 
 def test_heading_drifts_needs_range_and_significance() -> None:
     for spread, drift_p, drifts in ((1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)):
-        turns = (0.0, spread * heading.MIN_DRIFT_DEG)
+        turns = (0.0, spread * frame_rotation.MIN_DRIFT_DEG)
         parts = tuple(HeadingPart(float(n), n + 1.0, turn, 0.1) for n, turn in enumerate(turns))
-        found = heading.combine_heading_parts(parts, drift_p, "positions")
-        assert (found.drifts, found.turn_deg) == (drifts, pytest.approx(np.mean(turns)))
+        found = frame_rotation.combine_heading_parts(parts, drift_p, "positions")
+        assert (found.drifts, found.misalignment_deg) == (drifts, pytest.approx(np.mean(turns)))

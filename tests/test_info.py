@@ -19,9 +19,9 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.inspect.inventory import AnalysisOption, Inventory, Source, take_inventory, to_plain
-from px4fuse.origin import GNSS
+from px4fuse.log import Dropout, Sender
+from px4fuse.position_source import GNSS
 from px4fuse.readers import read_log
-from px4fuse.recording import Dropout, Sender
 
 WIDTH = 80
 pytestmark = pytest.mark.usefixtures("quick_filter")

@@ -1,4 +1,4 @@
-"""The vectorised filter against the filterpy replay, and the noise that the data ask for."""
+"""Fast filter against the filterpy replay, and likelihoods of the noises."""
 
 import numpy as np
 import pandas as pd
@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import (
     filter_states,
@@ -19,7 +20,6 @@ from px4fuse.filter.likelihood import (
     run_filter,
     score_grid,
 )
-from px4fuse.filter.quick import quick_replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.flight import Flight

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_field, mean_by_event
-from px4fuse.ekf2.stretches import SensorSamples, Stretch, _field_span, _mean_field
+from px4fuse.ekf2.replay_segments import SensorSamples, Stretch, _field_span, _mean_field
 from px4fuse.flight import Columns, FusionRecord
 from px4fuse.readers import read_log
 

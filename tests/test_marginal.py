@@ -36,7 +36,7 @@ from px4fuse.filter.likelihood import (
     profile_ends,
     score_grid,
 )
-from px4fuse.filter.marginal import (
+from px4fuse.filter.marginal_likelihood import (
     Positions,
     centre_on_path,
     expected_squares,

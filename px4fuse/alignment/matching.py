@@ -6,11 +6,11 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from px4fuse.alignment import fitting, tracks
-from px4fuse.alignment.fitting import MIN_CONCORDANCE, RESIDUAL_FLOOR_M, Fit, Peak
+from px4fuse.alignment import time_and_pose_fit, tracks
+from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, RESIDUAL_FLOOR_M, Fit, Peak
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.trajectory.offset import MIN_SECOND_PEAK_RATIO, STEP_S
+from px4fuse.trajectory.time_offset import MIN_SECOND_PEAK_RATIO, STEP_S
 
 # frames to try if yaw is free; nwu is enu rotated by 90°
 YAW_FREE_FRAMES = ("ned", "enu")
@@ -203,7 +203,9 @@ def _fit_across_resets(flight: Flight, match: Match, problem: AlignmentProblem) 
     samples, frame = problem.samples, match.frame
     placed = tracks.placed_samples(samples, frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
     track, file = tracks.continuous_track(ekf2, placed), tracks.file_track(samples, frame)
-    fit_again = partial(fitting.least_squares_fit, file, track, clock_free=problem.lag_s is None)
+    fit_again = partial(
+        time_and_pose_fit.least_squares_fit, file, track, clock_free=problem.lag_s is None
+    )
     free_yaw_fit = fit_again(match.free_yaw_fit, None)
     fit = free_yaw_fit if problem.yaw_rad is None else fit_again(match.fit, problem.yaw_rad)
     return replace(match, reference=track, fit=fit, free_yaw_fit=free_yaw_fit)
@@ -220,5 +222,11 @@ def _best_fit(
             raise NoMatchError("the file is too short for a match with the IMU")
         band_passed_twice = tracks.band_pass(tracks.band_pass(coarse.position_m))
         file = coarse = tracks.remove_edges(replace(coarse, position_m=band_passed_twice))
-    peak = fitting.correlation_peak(coarse, reference, yaw_rad) if lag_s is None else Peak(lag_s)
-    return fitting.least_squares_fit(file, reference, peak, yaw_rad, clock_free=lag_s is None)
+    peak = (
+        time_and_pose_fit.correlation_peak(coarse, reference, yaw_rad)
+        if lag_s is None
+        else Peak(lag_s)
+    )
+    return time_and_pose_fit.least_squares_fit(
+        file, reference, peak, yaw_rad, clock_free=lag_s is None
+    )

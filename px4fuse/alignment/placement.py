@@ -19,16 +19,16 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.alignment import matching, tracks
-from px4fuse.alignment.fitting import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.matching import AlignmentProblem, Match
+from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Alignment, Flight, PositionTrack, Unavailable
-from px4fuse.origin import POSITION_FILE
-from px4fuse.readers.parts import finite_rows
+from px4fuse.log import InputFile
+from px4fuse.position_source import POSITION_FILE
+from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
-from px4fuse.recording import InputFile
 
 # ratio of residuals below which another lag fits nearly as well
 NEAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}  # IMU noise gives ratios of 1.4 to 1.7

@@ -12,10 +12,10 @@ from px4fuse.arrays import Array, BoolArray, Complex
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.filter.signals import Segment, ned_acceleration
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable
-from px4fuse.origin import POSITION_FILE
-from px4fuse.readers.parts import finite_rows
+from px4fuse.position_source import POSITION_FILE
+from px4fuse.readers.common import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
-from px4fuse.trajectory.offset import STEP_S
+from px4fuse.trajectory.time_offset import STEP_S
 
 # indices of north, east, down in x, y, z, and their signs
 FRAMES = {

@@ -6,16 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from px4fuse.answers import form_name, form_text
-from px4fuse.assignment.drawing import AssignedFlight, Kinds, draw
+from px4fuse.answer_form import form_name, form_text
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key
+from px4fuse.assignment.random_assignment import AssignedFlight, Kinds, draw
 from px4fuse.assignment.roster import Person, normalise_text
 from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.input_files import own_files
-from px4fuse.plain import to_json_types
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
+from px4fuse.text import to_json_types
 from px4fuse.writing import write_all
 
 # numbers of the simulation that the answer key contains

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.answers import update_values
+from px4fuse.answer_form import update_values
 from px4fuse.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
 from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
@@ -42,7 +42,7 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
         Numbers that the log does not contain, such as ``sigma_z_m``, ``sigma_a_m_s2`` and
         ``clock_offset_to_add_s``.
     difficulty : float or None
-        See :class:`px4fuse.assignment.drawing.AssignedFlight`.
+        See :class:`px4fuse.assignment.random_assignment.AssignedFlight`.
     form : FormTruth or None
         Right answers to the form.
     """

@@ -18,7 +18,7 @@ def answers(log: Path, output: Path | None) -> None:
     The form has questions about the mistakes of the flight, the behaviour of EKF2, and three
     numbers. Complete it and give it to px4fuse compare --answers.
     """
-    from px4fuse.answers import form_name, form_text
+    from px4fuse.answer_form import form_name, form_text
     from px4fuse.reading import read_log_bytes
 
     target = output or log.with_name(form_name(log.name))

@@ -10,8 +10,8 @@ import click
 
 from px4fuse.cli.inputs import InputPath, comparison_request, json_option, recording_options
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
-from px4fuse.plain import join_first
 from px4fuse.record import Unavailable
+from px4fuse.text import join_first
 
 if TYPE_CHECKING:
     from px4fuse.inspect.inventory import Inventory, Source
@@ -155,7 +155,7 @@ def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
             f"{sender.system}/{sender.component}",
             sender.description + (" (this flight)" if sender.chosen else ""),
             f"{sender.messages}",
-            "unknown" if sender.lost_share is None else f"{sender.lost_share:.1%}",
+            "unknown" if sender.lost_fraction is None else f"{sender.lost_fraction:.1%}",
         )
         for sender in inventory.flight.log.senders
     ]
@@ -204,7 +204,7 @@ def _span_text(source: Source) -> str:
 
 
 def _clock_lines(inventory: Inventory) -> list[str]:
-    from px4fuse.report.words import format_clock_map
+    from px4fuse.report.phrases import format_clock_map
 
     names_by_clock: dict[str, dict[str, None]] = {}
     for source in inventory.sources:

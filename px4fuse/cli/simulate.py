@@ -26,7 +26,7 @@ from px4fuse.simulation.scenario import (
 )
 
 if TYPE_CHECKING:
-    from px4fuse.assignment.drawing import Kinds
+    from px4fuse.assignment.random_assignment import Kinds
     from px4fuse.report.page import Page
     from px4fuse.simulation.flights import Simulation
 
@@ -161,7 +161,7 @@ def _check_options(assignment: Path | None) -> None:
 
 
 def _read_secret(file: Path | None) -> bytes | None:
-    from px4fuse.assignment.drawing import encode_secret
+    from px4fuse.assignment.random_assignment import encode_secret
 
     if file is None:
         return None
@@ -185,7 +185,7 @@ def _write_assignment(
 ) -> None:
     """Write one flight per student and the answer key, or only print what would be drawn."""
     from px4fuse.assignment import assignment
-    from px4fuse.assignment.drawing import EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
+    from px4fuse.assignment.random_assignment import EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     from px4fuse.assignment.roster import read_roster
     from px4fuse.report.page import Page
 

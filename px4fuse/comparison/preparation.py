@@ -13,8 +13,7 @@ from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.origin import POSITION_FILE, PositionKind
-from px4fuse.plain import capitalise_first
+from px4fuse.position_source import POSITION_FILE, PositionKind
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
@@ -24,6 +23,7 @@ from px4fuse.readers.px4_innovations import (
 )
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 from px4fuse.request import HeightName
+from px4fuse.text import capitalise_first
 from px4fuse.trajectory.rotation import interpolate, matrix
 
 # Origins of external positions by their PX4 topic or MAVLink message

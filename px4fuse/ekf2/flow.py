@@ -15,7 +15,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_mean
-from px4fuse.ekf2.stretches import VELOCITY, SensorSamples, Stretch, low_passed
+from px4fuse.ekf2.replay_segments import VELOCITY, SensorSamples, Stretch, low_passed
 from px4fuse.flight import FLOW_SHARE
 
 

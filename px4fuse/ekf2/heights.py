@@ -17,7 +17,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
-from px4fuse.ekf2.stretches import (
+from px4fuse.ekf2.replay_segments import (
     HeightSamples,
     Stretch,
     pad_samples,

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import one_line_repr
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.stretches import (
+from px4fuse.ekf2.replay_segments import (
     BIASES,
     GRAVITY_M_S2,
     IMU_STATE_COUNT,
@@ -31,6 +30,7 @@ from px4fuse.ekf2.stretches import (
     VELOCITY,
     Stretch,
 )
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.rotation import skew
 
 # s; EKF2 never fuses a sample that arrives this long behind the fusion horizon (RingBuffer.h,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2.stretches import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
+from px4fuse.ekf2.replay_segments import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
 from px4fuse.trajectory.rotation import skew
 
 MIN_SD_GAUSS = 0.01  # lower limit of EKF2_MAG_NOISE
@@ -23,8 +23,8 @@ CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is the cross product matrix [v]×
 class EventSamples(NamedTuple):
     """Means of the samples that are fused at each event; shape (E, ...), or (E, S, ...).
 
-    ``value`` and ``turn`` as in :class:`~px4fuse.ekf2.stretches.SensorSamples`, with velocities at
-    the event. ``number``: samples that EKF2 received; ``noise``: R of one sample.
+    ``value`` and ``turn`` as in :class:`~px4fuse.ekf2.replay_segments.SensorSamples`, with
+    velocities at the event. ``number``: samples that EKF2 received; ``noise``: R of one sample.
     """
 
     value: Array
@@ -38,7 +38,8 @@ def mean_by_event(
 ) -> EventSamples:
     """Return means of the samples fused at each event; ``end`` is the step of each event.
 
-    Pass ``imu_velocity_m_s`` of :class:`~px4fuse.ekf2.stretches.Stretch` for velocity samples.
+    Pass ``imu_velocity_m_s`` of :class:`~px4fuse.ekf2.replay_segments.Stretch` for velocity
+    samples.
     """
     event = np.searchsorted(end, sensed.step)
     is_inside, size = event < len(end), len(end)

@@ -18,11 +18,7 @@ from msgspec import structs
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
-from px4fuse.display import one_line_repr
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, prepare_inputs, same_sample
-from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
-from px4fuse.ekf2.output_predictor import follow_attitude, publish
-from px4fuse.ekf2.recursion import (
+from px4fuse.ekf2.filter_recursion import (
     HEADING,
     POSITION_COLUMNS,
     StretchRun,
@@ -30,6 +26,9 @@ from px4fuse.ekf2.recursion import (
     run_stretch,
     with_correlation,
 )
+from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, prepare_inputs, same_sample
+from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
+from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
     REJECTING_SHARE,
     UPDATE_COLUMNS,
@@ -39,7 +38,7 @@ from px4fuse.ekf2.replay import (
     agreement_with_log,
     with_logged_rejections,
 )
-from px4fuse.ekf2.stretches import (
+from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     GYRO_BIAS,
@@ -62,6 +61,7 @@ from px4fuse.ekf2_parameters import (
 )
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 
 MAX_HORIZON_S = 1.0  # s, upper limit of EKF2_DELAY_MAX
@@ -145,7 +145,7 @@ def _open_without(
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
+    share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
         logged_agreement = agreement_with_log(flight, _make_replay(inputs, runs, variants[1], {}))
         if isinstance(logged_agreement, Agreement):
@@ -212,7 +212,7 @@ def replay_settings(
         unused_parameters["EKF2_DELAY_MAX"] = (
             f"in {firmware} the fusion horizon follows from the largest delay parameter"
         )
-    if inputs.received.own_times:
+    if inputs.received.uses_sender_times:
         unused_parameters[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
     for name in [name for change in changes for name in change if name in unused_parameters]:
         raise SettingsError(f"{name} has no effect in this log: {unused_parameters[name]}.")

@@ -18,7 +18,7 @@ from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SD
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import MAX_LATE_S
-from px4fuse.ekf2.stretches import Stretch, pad_samples, samples_by_event
+from px4fuse.ekf2.replay_segments import Stretch, pad_samples, samples_by_event
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 
 SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
@@ -41,8 +41,8 @@ def vision_samples(
 ) -> Array:
     """Return vision samples by the event at which they are fused, shape (8, k, E).
 
-    Rows: north and east as in :func:`~px4fuse.ekf2.stretches.samples_by_event`, age, measurement
-    time, fusion time, reported variances north and east, and 1.
+    Rows: north and east as in :func:`~px4fuse.ekf2.replay_segments.samples_by_event`, age,
+    measurement time, fusion time, reported variances north and east, and 1.
     """
     vision, time_s = inputs.vision, stretch.time_s
     assert vision is not None

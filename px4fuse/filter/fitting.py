@@ -18,7 +18,7 @@ from scipy.special import chdtri, comb, expit
 
 from px4fuse.arrays import Array
 from px4fuse.filter.likelihood import Preintegrated
-from px4fuse.filter.marginal import (
+from px4fuse.filter.marginal_likelihood import (
     FittedPositions,
     Positions,
     centre_on_path,

@@ -17,11 +17,11 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, make_timeline
+from px4fuse.notebook_display import one_line_repr
 
 Row = tuple[float, ...]
 # Columns of ``Replay.updates``

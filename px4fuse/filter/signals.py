@@ -14,9 +14,9 @@ from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, BoolArray, cumulative_integral
-from px4fuse.display import one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
+from px4fuse.notebook_display import one_line_repr
 
 AISLE = "aisle"
 # Ratio of length to width from which a track counts as flown along an aisle

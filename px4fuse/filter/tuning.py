@@ -1,9 +1,9 @@
 """Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals, and a held-out check.
 
 Constant errors are not noise: with IMU data, biases, tilt and time offset are fitted, too
-(:mod:`px4fuse.filter.motion`), so that SIGMA_A is the noise of the acceleration and SIGMA_Z that of
-the source. KF has no states for biases. The SIGMA_A that it needs to cover them is larger and is
-estimated separately.
+(:mod:`px4fuse.filter.imu_motion`), so that SIGMA_A is the noise of the acceleration and SIGMA_Z
+that of the source. KF has no states for biases. The SIGMA_A that it needs to cover them is larger
+and is estimated separately.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import one_line_repr
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
@@ -27,6 +26,7 @@ from px4fuse.filter.fitting import (
     filter_positions,
     maximise_likelihood,
 )
+from px4fuse.filter.imu_motion import SignalCache, prepare_motion
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -34,10 +34,10 @@ from px4fuse.filter.likelihood import (
     profile_ends,
     score_grid,
 )
-from px4fuse.filter.motion import SignalCache, prepare_motion
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight import Flight, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, OrUnavailable, Record
 
 HORIZONTAL = "horizontal"
@@ -104,7 +104,7 @@ class HeldOutCheck(Record, frozen=True):
         Estimates from the first half.
     count : int
         Measurements of the second half.
-    gain_nats : float
+    log_likelihood_gain_per_measurement : float
         Gain of log-likelihood per measurement of the second half over the chosen settings; positive
         if tuning improves data that were not used for it.
     """
@@ -112,7 +112,7 @@ class HeldOutCheck(Record, frozen=True):
     sigma_a_m_s2: NotNegative
     sigma_z_m: NotNegative
     count: Count
-    gain_nats: float
+    log_likelihood_gain_per_measurement: float
 
 
 class NoiseEstimate(Record, frozen=True, kw_only=True):
@@ -125,10 +125,10 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
     ----------
     sigma_a_m_s2, sigma_z_m : float or None
         Noise without biases and tilt, if the IMU data are sufficient to estimate these.
-    filter_sigma_a_m_s2 : float or None
+    sigma_a_two_state_m_s2 : float or None
         SIGMA_A that KF needs at this SIGMA_Z, since it has no states for biases.
-    gain_nats : float
-        Gain of log-likelihood per measurement of KF with ``filter_sigma_a`` and ``sigma_z`` over
+    log_likelihood_gain_per_measurement : float
+        Gain of log-likelihood per measurement of KF with ``sigma_a_two_state`` and ``sigma_z`` over
         the chosen settings.
     before, after : Consistency or Unavailable
         Consistency with the chosen and the estimated settings, without outliers; along the first
@@ -143,11 +143,11 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
 
     sigma_a_m_s2: NotNegative | None = None
     sigma_a_m_s2_interval: NoiseInterval | None = None
-    filter_sigma_a_m_s2: NotNegative | None = None
-    filter_sigma_a_m_s2_interval: NoiseInterval | None = None
+    sigma_a_two_state_m_s2: NotNegative | None = None
+    sigma_a_two_state_m_s2_interval: NoiseInterval | None = None
     sigma_z_m: NotNegative | None = None
     sigma_z_m_interval: NoiseInterval | None = None
-    gain_nats: float
+    log_likelihood_gain_per_measurement: float
     before: OrUnavailable[Consistency]
     after: OrUnavailable[Consistency]
     count: Count
@@ -161,9 +161,9 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
         return Noise.of(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
 
     @property
-    def filter_sigma_a(self) -> Noise:
+    def sigma_a_two_state(self) -> Noise:
         """SIGMA_A that KF needs (m/s²)."""
-        return Noise.of(self.filter_sigma_a_m_s2, self.filter_sigma_a_m_s2_interval)
+        return Noise.of(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
 
     @property
     def sigma_z(self) -> Noise:
@@ -223,7 +223,7 @@ def tune(
     drifts : bool
         True if the source may drift, as odometry does.
     signals : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
+        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
 
     Returns
     -------
@@ -267,7 +267,7 @@ def tune_axes(
     drifts : bool
         True if the source may drift, as odometry does.
     signals : dict, optional
-        IMU signals to reuse, see :func:`px4fuse.filter.motion.prepare_motion`.
+        IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
     """
     intervals = [preintegrate(axis, settings) for axis in axes]
     count = len(intervals[0].measurement_m)
@@ -327,8 +327,8 @@ def tune_axes(
         name=name,
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
-        **two_state_sigma_a.as_fields("filter_sigma_a_m_s2"),
-        gain_nats=gain / count,
+        **two_state_sigma_a.as_fields("sigma_a_two_state_m_s2"),
+        log_likelihood_gain_per_measurement=gain / count,
         before=_assess_innovations(intervals[0], chosen_noises, skip),
         after=_assess_innovations(intervals[0], after, skip),
         outlier_time_s=axes[0].measurement_time_s[-count:][skip],

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from px4fuse.comparison.interventions import is_inconsistent
+from px4fuse.comparison.causal_replays import is_inconsistent
 from px4fuse.comparison.model import FilterSummary
 from px4fuse.fleet.inputs import DiffInput, Progress, Results, read_inputs
 from px4fuse.fleet.measures import (
@@ -15,9 +15,9 @@ from px4fuse.fleet.measures import (
     numbers,
 )
 from px4fuse.fleet.rows import at
-from px4fuse.plain import format_factor, format_number
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
+from px4fuse.text import format_factor, format_number
 
 # Limit of √(mean NEES) of a consistent filter, and its inverse. The errors of one flight are
 # correlated, so there is no 95 % band

@@ -15,8 +15,8 @@ from px4fuse.results.build import outcome_results
 from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
 from px4fuse.results.reading import MAX_BYTES as MAX_RESULTS_BYTES
 from px4fuse.results.reading import read_results
-from px4fuse.verification.intake import MAX_BYTES as MAX_REPORT_BYTES
-from px4fuse.verification.intake import attached_results
+from px4fuse.verification.pdf_input import MAX_BYTES as MAX_REPORT_BYTES
+from px4fuse.verification.pdf_input import attached_results
 
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.answers import form_rows
+from px4fuse.answer_form import form_rows
 from px4fuse.assignment.sheet import number
 from px4fuse.grading.model import TOTAL, Entry, GradedReport, Item, Override, columns
-from px4fuse.plain import format_number
+from px4fuse.text import format_number
 from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Part, Row
 from px4fuse.webpage.safe import local_link, template

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
-from px4fuse.answers import Answers
+from px4fuse.answer_form import Answers
 from px4fuse.assignment.roster import Person
 from px4fuse.verification.model import Verdict
 

@@ -40,9 +40,9 @@ from px4fuse.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from px4fuse.grading.model import TOTAL, Entry, GradedReport, columns
 from px4fuse.grading.records import RECORDS, REDRAWN_SUFFIX
 from px4fuse.input_files import own_files
-from px4fuse.plain import join_first
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutralise_formulas, neutralise_id
+from px4fuse.text import join_first
 from px4fuse.webpage.safe import template
 from px4fuse.writing import write_all
 

@@ -16,8 +16,8 @@ from px4fuse.errors import ResultsError
 from px4fuse.results.contract import Reported, file_hashes_in, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
-from px4fuse.verification.intake import read_report
 from px4fuse.verification.model import Verdict
+from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import log_sha256, verify
 from px4fuse.writing import write_all
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Union
 import msgspec
 from msgspec import Meta
 
-from px4fuse.answers import Answers
+from px4fuse.answer_form import Answers
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import make_unique
 from px4fuse.errors import SettingsError

@@ -39,8 +39,8 @@ from px4fuse.input_files import add_input
 from px4fuse.reading import files_below
 from px4fuse.record import table
 from px4fuse.results.reading import clean_text, one_line
-from px4fuse.verification.intake import MAX_BYTES
 from px4fuse.verification.model import BAD_VALUES
+from px4fuse.verification.pdf_input import MAX_BYTES
 
 MAX_ENTRIES = 10_000
 # bytes; zipfile reads the whole table of contents before entries can be counted
@@ -174,7 +174,7 @@ def with_origins(
 
 
 def read(submission: Submission) -> bytes:
-    """Bytes of a submission, at most :data:`~px4fuse.verification.intake.MAX_BYTES` of them.
+    """Bytes of a submission, at most :data:`~px4fuse.verification.pdf_input.MAX_BYTES` of them.
 
     Raises
     ------

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.events import longest_s
+from px4fuse.comparison.flight_events import longest_s
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import flight_for_source
 from px4fuse.ekf2.aids import evaluate_aids
@@ -18,9 +18,9 @@ from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_ac
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
 from px4fuse.inspect.tables import NO_POSITION, unavailable_parts
-from px4fuse.plain import capitalise_first, to_json_types, utc_time
-from px4fuse.recording import Stream
+from px4fuse.log import Stream
 from px4fuse.request import with_options
+from px4fuse.text import capitalise_first, to_json_types, utc_time
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"

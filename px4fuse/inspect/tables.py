@@ -15,7 +15,7 @@ from px4fuse.comparison.preparation import choose_source, flight_for_source
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.plain import to_json_types
+from px4fuse.text import to_json_types
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"

@@ -15,7 +15,7 @@ from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.readers import read_log
-from px4fuse.readers.parts import finite_rows
+from px4fuse.readers.common import finite_rows
 from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.reading import display_name, read_head

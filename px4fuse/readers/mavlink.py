@@ -12,16 +12,16 @@ import pandas as pd
 
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force, valid_parameters
 from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
+from px4fuse.log import LogInfo, Unused
+from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
-from px4fuse.readers import parts
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
 from px4fuse.readers.mavlink_frames import MESSAGE_IDS, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
 from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, read_recording, unix_of_boot
 from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
-from px4fuse.recording import LogInfo, Unused
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 # MAV_PARAM_TYPE_REAL32; smaller values of MAV_PARAM_TYPE are integer types
@@ -69,7 +69,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     positions, missing_positions = read_positions(recording, mapped, remedies["position"], delay_s)
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
-    in_flight = parts.ends_in_flight(airborne, recording.duration_s)
+    in_flight = common.ends_in_flight(airborne, recording.duration_s)
     pressure = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
     modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
@@ -83,7 +83,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         airborne=airborne,
         barometer=barometer(pressure_altitude(pressure)),
         modes=modes,
-        missing=(*parts.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
+        missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
         clocks=senders.clock_maps(recording, mapped),
         unused=tuple(
@@ -107,7 +107,7 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
     del table
     imu = recording.read(layout, rows)
-    imu = parts.finite_rows(imu, imu.columns.tolist(), parts.BEYOND_IMU)
+    imu = common.finite_rows(imu, imu.columns.tolist(), common.BEYOND_IMU)
     if len(imu) < 2:
         return Unavailable(
             "IMU",
@@ -120,7 +120,7 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
 
 def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     layout = max(messages.ATTITUDE, key=lambda layout: len(recording.rows(layout.topic)))
-    attitude = parts.with_attitude(recording.read(layout))[Columns.QUATERNION]
+    attitude = common.with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
         *other_topics, last = (layout.topic for layout in messages.ATTITUDE)
         return Unavailable("attitude", f"no usable {', '.join(other_topics)} or {last}", remedy)
@@ -230,7 +230,7 @@ def _read_airborne(
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
     time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
     landed = pd.Series(table["landed_state"][known] == messages.LANDED, index=time_s)
-    return parts.flight_spans(landed, recording.duration_s)
+    return common.flight_spans(landed, recording.duration_s)
 
 
 def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
@@ -245,7 +245,7 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
         for mode in modes.tolist()
     ]
     time_s = recording.receipt_boot_s(rows) - recording.zero_s
-    return parts.mode_spans(pd.Series(names, index=time_s), recording.duration_s)
+    return common.mode_spans(pd.Series(names, index=time_s), recording.duration_s)
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
@@ -271,7 +271,7 @@ def _describe(
 ) -> LogInfo:
     frames = recording.frames
     end = (
-        (parts.format_truncation("frame", recording.duration_s, in_flight),)
+        (common.format_truncation("frame", recording.duration_s, in_flight),)
         if frames.in_frame
         else ()
     )
@@ -305,7 +305,7 @@ def _describe(
         parameters=MappingProxyType(parameters),
         notes=(*recording.notes, *faults, *dropped),
         restarts=recording.restarts,
-        receipt_went_back=recording.receipt_went_back,
+        receive_time_reversals=recording.receive_time_reversals,
         dropped=dict(sorted(recording.dropped.items())),
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from px4fuse.arrays import Array
-from px4fuse.recording import ClockMap
+from px4fuse.log import ClockMap
 
 # s; timestamps this close to the boot clock at receipt are assumed to be boot times
 SAME_CLOCK_S = 10.0

@@ -10,8 +10,8 @@ from typing import Any
 import msgspec
 
 from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
-from px4fuse.origin import Origin, find_origin
-from px4fuse.readers.layouts import Layout, expand_layouts
+from px4fuse.position_source import Origin, find_origin
+from px4fuse.readers.field_maps import Layout, expand_layouts
 from px4fuse.record import table
 
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1

@@ -10,15 +10,15 @@ from msgspec import structs
 from scipy import constants
 
 from px4fuse.flight import Columns, PositionTrack, Truth, Unavailable, sort_by_preference
-from px4fuse.origin import GNSS, with_orientation
+from px4fuse.position_source import GNSS, with_orientation
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
-from px4fuse.readers.layouts import GLOBAL_COLUMNS, Layout
+from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
+from px4fuse.readers.field_maps import GLOBAL_COLUMNS, Layout
 from px4fuse.readers.mavlink_clocks import ClockMapping
 from px4fuse.readers.mavlink_frames import Address
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recording
 from px4fuse.readers.mavlink_senders import senders_of
-from px4fuse.readers.parts import join_nearest, read_attitude, read_orientation
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
 # s; larger median distance between timestamp and receipt: the timestamp is not boot time

@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Columns
-from px4fuse.readers.layouts import IMPOSSIBLE, Layout
+from px4fuse.log import Stream
+from px4fuse.readers.common import MIN_NORM
+from px4fuse.readers.field_maps import IMPOSSIBLE, Layout
 from px4fuse.readers.mavlink_clocks import UNIX_FROM_S, Line, fit_least_delay, is_running_clock
 from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Address, Frames, message_name, wire_layout
 from px4fuse.readers.mavlink_messages import FRAMES_OF_REFERENCE, STAMPED_BY_BOOT_CLOCK
-from px4fuse.readers.parts import MIN_NORM
 from px4fuse.readers.ulog_topics import longest_increasing_run
-from px4fuse.recording import Stream
 
 BOOT_CLOCK = "autopilot boot clock"
 RECEIPT_CLOCK = "receive time minus minimum link delay"
@@ -55,8 +55,8 @@ class Recording:
     damage : tuple of str
         Sentences on unreadable parts.
     notes : list of str
-    restarts, receipt_went_back : int or None
-        As in :class:`~px4fuse.recording.LogInfo`.
+    restarts, receive_time_reversals : int or None
+        As in :class:`~px4fuse.log.LogInfo`.
     dropped : dict
         Samples dropped because of an invalid timestamp, by message; filled by :meth:`read`.
     streams : dict
@@ -73,7 +73,7 @@ class Recording:
     notes: list[str]
     damage: tuple[str, ...] = ()
     restarts: int | None = None
-    receipt_went_back: int | None = None
+    receive_time_reversals: int | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
 

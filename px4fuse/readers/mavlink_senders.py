@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from px4fuse.arrays import IntArray
 from px4fuse.errors import SettingsError
+from px4fuse.log import ClockMap, Sender
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import (
     MAX_SPEED_DIFFERENCE,
@@ -18,7 +19,6 @@ from px4fuse.readers.mavlink_clocks import (
 )
 from px4fuse.readers.mavlink_frames import Address, Frames
 from px4fuse.readers.mavlink_recording import RESTART_S, Recording, unix_of_boot
-from px4fuse.recording import ClockMap, Sender
 
 # Only the senders with most messages are read and described
 MAX_SENDERS = 32

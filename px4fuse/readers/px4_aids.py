@@ -15,8 +15,8 @@ import pandas as pd
 from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, Aid
 from px4fuse.flight import AidLog, step_values_at
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import Layout
-from px4fuse.readers.parts import join_nearest
+from px4fuse.readers.common import join_nearest
+from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.ulog_topics import Topics
 
 # s; innovations and variances are logged up to one interval of the default profile (0.5 s) apart,

@@ -20,15 +20,15 @@ from px4fuse.flight import (
     sample_rate,
     sort_by_preference,
 )
-from px4fuse.origin import Origin, with_orientation
+from px4fuse.log import ClockMap
+from px4fuse.position_source import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import GLOBAL_COLUMNS
-from px4fuse.readers.parts import finite_rows, join_nearest, read_attitude, read_orientation
+from px4fuse.readers.common import finite_rows, join_nearest, read_attitude, read_orientation
+from px4fuse.readers.field_maps import GLOBAL_COLUMNS
 from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.readers.ulog_topics import Topics
-from px4fuse.recording import ClockMap
 
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
@@ -40,7 +40,7 @@ ARRIVAL_SHARE = 0.9
 # s; largest time difference of height and position: 2.5 cm error at a climb rate of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
 # Hz; a lower GNSS rate means that the logger decimated the fixes (receivers send 5 to 20 Hz)
-MAX_THINNED_HZ = 4.0
+MAX_DOWNSAMPLED_HZ = 4.0
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
@@ -351,14 +351,14 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     samples = samples.assign(**_velocity(gps).set_axis(samples.index))
     samples = finite_rows(samples, Columns.POSITION)
     rate_hz, notes = sample_rate(samples), tuple[str, ...]()
-    if rate_hz < MAX_THINNED_HZ and not len(unlogged_fixes):
+    if rate_hz < MAX_DOWNSAMPLED_HZ and not len(unlogged_fixes):
         reconstructed_fixes, notes = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
         samples = (
             pd.concat([samples, reconstructed_fixes]).sort_index()
             if len(reconstructed_fixes)
             else samples
         )
-    if rate_hz < MAX_THINNED_HZ:
+    if rate_hz < MAX_DOWNSAMPLED_HZ:
         notes = (
             f"GNSS fixes are logged at {rate_hz:.1f} Hz, below the rate of receivers: the logger "
             "dropped fixes. Set SDLOG_PROFILE bit 1 to log all",

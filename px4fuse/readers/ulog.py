@@ -6,13 +6,13 @@ from msgspec import structs
 
 from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.flight import MODES_NOT_LOGGED, Columns, Flight, FlightMode, Truth, Unavailable
-from px4fuse.readers import parts
+from px4fuse.log import Unused
+from px4fuse.readers import common
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.layouts import Layout
+from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
 from px4fuse.readers.ulog_topics import Topics, dropped_note, longest_increasing_run, read_topics
-from px4fuse.recording import Unused
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 # s; longer intervals between IMU samples count as missing data
@@ -32,7 +32,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
     topics = read_topics(name, content)
     remedy = "Check that the sensors were running during logging."
     imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU, remedy)
-    logged = parts.with_attitude(topics.read(px4.LAYOUTS["attitude"]))
+    logged = common.with_attitude(topics.read(px4.LAYOUTS["attitude"]))
     remedy = "Check that the estimator was running during logging."
     attitude = _require_samples(topics, logged, "attitude", px4.LAYOUTS["attitude"], remedy)
     ekf2 = read_ekf2(topics)
@@ -43,7 +43,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
     airborne = _read_airborne(topics)
     altitude_m = topics.read(px4.LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
-    in_flight = parts.ends_in_flight(airborne, topics.log.duration_s)
+    in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
     dropped = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
     notes = (dropped_note(count, topic, "zero or go back") for topic, count in dropped)
     return Flight(
@@ -64,7 +64,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         modes=_read_modes(topics),
         tumble_spans=_read_tumbled(topics),
         barometer=barometer(altitude_m, delay_s),
-        missing=(*parts.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
+        missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=topics.streams,
         unused=tuple(
             Unused(name, len(table["timestamp"]), reason)
@@ -79,7 +79,7 @@ def _damage(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) ->
     end_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_cut:
-        damage_sentences.append(parts.format_truncation("message", end_s, in_flight))
+        damage_sentences.append(common.format_truncation("message", end_s, in_flight))
     if topics.is_damaged:
         missing = "all IMU data are missing"
         if not isinstance(imu, Unavailable):
@@ -124,7 +124,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
         keep = longest_increasing_run(time_us.astype(np.int64) + topics.zero_us)
         imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
     columns = Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
-    return parts.finite_rows(imu, columns, parts.BEYOND_IMU)
+    return common.finite_rows(imu, columns, common.BEYOND_IMU)
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
@@ -137,13 +137,13 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
             "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
         )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
-    return parts.flight_spans(detected["landed"], topics.log.duration_s)
+    return common.flight_spans(detected["landed"], topics.log.duration_s)
 
 
 def _read_tumbled(topics: Topics) -> tuple[tuple[float, float], ...]:
     """Read the intervals (s) in which PX4's failure detector reports roll or pitch."""
     upright = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
-    return parts.flight_spans(upright, topics.log.duration_s)
+    return common.flight_spans(upright, topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
@@ -151,4 +151,4 @@ def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:
     if states.empty:
         return MODES_NOT_LOGGED
     names = states.map(lambda state: px4.NAV_STATES.get(int(state), f"mode {state:.0f}"))
-    return parts.mode_spans(names, topics.log.duration_s)
+    return common.mode_spans(names, topics.log.duration_s)

@@ -24,10 +24,10 @@ from pyulog.exceptions import ULogException
 from px4fuse.arrays import IntArray
 from px4fuse.ekf2_parameters import REPORTED, valid_parameters
 from px4fuse.errors import LogError
-from px4fuse.plain import join_first
-from px4fuse.readers.layouts import IMPOSSIBLE, Layout
+from px4fuse.log import Dropout, LogInfo, Stream
+from px4fuse.readers.field_maps import IMPOSSIBLE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
-from px4fuse.recording import Dropout, LogInfo, Stream
+from px4fuse.text import join_first
 
 _MICROSECOND = 1e-6
 # s; a measurement time further than this from publication is not boot time (GPS topics before

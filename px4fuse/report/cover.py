@@ -8,16 +8,23 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.interventions import error_beyond_reported_sigma
+from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, within
 from px4fuse.findings import Finding, by_root, finding_title
 from px4fuse.flight import Ekf2, Truth, Unavailable
-from px4fuse.plain import capitalise_first, format_number
-from px4fuse.recording import LogInfo
-from px4fuse.report.marks import LANDING_MARK, TAKE_OFF_MARK
-from px4fuse.report.page import PAGE_WIDTH, Page, halves, legend_above, words
+from px4fuse.log import LogInfo
+from px4fuse.report.event_marks import LANDING_MARK, TAKE_OFF_MARK
+from px4fuse.report.page import PAGE_WIDTH, Page, halves, legend_above, styled_text
+from px4fuse.report.phrases import (
+    filters_by_name,
+    format_clock_map,
+    format_consequences,
+    format_settings,
+    format_verdict,
+    write_errors,
+)
 from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_COLOUR,
@@ -28,16 +35,9 @@ from px4fuse.report.style import (
     Axes,
     set_map_axes,
 )
-from px4fuse.report.words import (
-    filters_by_name,
-    format_clock_map,
-    format_consequences,
-    format_settings,
-    format_verdict,
-    write_errors,
-)
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
+from px4fuse.text import capitalise_first, format_number
 
 # Ratio of length and width above which the track is drawn along the page; else north is up
 MIN_LONG_RATIO = 2.2
@@ -53,7 +53,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     page = Page("EKF2 check: comparison with a two-state Kalman filter (KF)")
     page.foot(_map_and_facts(analysis, facts(analysis)))
     page.write(flight_line(results.student, analysis.flight.log), colour=MUTED_COLOUR, above=-4.0)
-    for sentence in results.story:
+    for sentence in results.summary:
         page.write(sentence, size=10.5, above=2.0)
     _write_verdict(page, analysis)
     write_errors(page, analysis)
@@ -155,11 +155,11 @@ def write_finding(page: Page, group: list[Finding]) -> None:
     """Write severity, time, title with id, message, action and consequences of a finding."""
     finding, *followers = group
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
-    texts = [words(title, 8.0, bold=True), words(finding.message, 8.0)]
+    texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
     if finding.remedy:
-        texts.append(words(f"Action: {finding.remedy}", 7.5, MUTED_COLOUR))
+        texts.append(styled_text(f"Action: {finding.remedy}", 7.5, MUTED_COLOUR))
     if followers:
-        texts.append(words(format_consequences(followers), 7.5, MUTED_COLOUR))
+        texts.append(styled_text(format_consequences(followers), 7.5, MUTED_COLOUR))
     page.labelled(
         f"{finding.severity}\n{finding.when}".strip(),
         *texts,

@@ -13,11 +13,11 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Unavailable
 from px4fuse.record import Span
-from px4fuse.report import marks, panels, style
+from px4fuse.report import event_marks, panels, style
+from px4fuse.report.difference_page import unexplained_note
 from px4fuse.report.page import PAGE_WIDTH, Page
+from px4fuse.report.phrases import filters_by_name, format_verdict, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
-from px4fuse.report.why import unexplained_note
-from px4fuse.report.words import filters_by_name, format_verdict, verdict_notes
 
 COLUMN_GAP = 14.0  # points between columns
 ZOOM_UPDATES = 15  # updates in the zoom
@@ -58,7 +58,7 @@ def _write_legend(page: Page, analysis: Analysis) -> None:
     for name, frame in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
         if isinstance(frame, pd.DataFrame):
             lines.append(Line2D([], [], **LINES[name], label=name))
-    page.legend(lines, marks.legend_entries(analysis))
+    page.legend(lines, event_marks.legend_entries(analysis))
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -176,7 +176,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
             f"{name} {format_verdict(one)}" for name, one in filters_by_name(result).items()
         )
         if isinstance(result.difference, Difference):
-            verdicts += f"; KF - EKF2 {result.difference.position_rmse_m:.3f} m RMS"
+            verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
         column.heading(result.axis.name)
         column.write(f"{verdicts}.", size=7.5)
     page.beside(*columns, gap=COLUMN_GAP)

@@ -12,13 +12,13 @@ from px4fuse.loop import corrections
 from px4fuse.loop.analysis import SMALLEST_STAMP_S
 from px4fuse.loop.corrections import SINGLE_LOOP
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
-from px4fuse.plain import capitalise_first, format_p_value
 from px4fuse.report import style
 from px4fuse.report.cover import student_line, write_finding
 from px4fuse.report.evaluation import describe_score, format_interval, plot_path
 from px4fuse.report.page import AXIS_LABEL_HEIGHT, TICKS_HEIGHT, Cell, Page, appendix
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
+from px4fuse.text import capitalise_first, format_p_value
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
@@ -168,7 +168,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     page.labelled("Track", track_text)
     page.labelled("Part", f"{_format_span(loop)}, {loop.part_reason}")
     page.labelled("Closure", describe_closure_error(loop))
-    end = loop.known_end
+    end = loop.true_end
     page.labelled("True end", "not used" if isinstance(end, Unavailable) else end.source)
     for closure in loop.closures[:1]:
         page.labelled("Gate", describe_gate(closure))
@@ -230,7 +230,7 @@ def write_scores(page: Page, loop: Loop) -> None:
         if not known:
             continue
         first = next(iter(known.values()))
-        head = ["path", *(f"{e.delta_words} (m)" for e in first.rpe), "rotation (°)"]
+        head = ["path", *(f"{e.delta_text} (m)" for e in first.rpe), "rotation (°)"]
         page.table(
             head,
             [
@@ -325,9 +325,9 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 def format_correction(correction: CorrectedPath) -> str:
     """Format RMS and maximum (m) of a correction."""
-    if not correction.moved_max_m:
+    if not correction.correction_max_m:
         return "–"
-    return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
+    return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
 
 
 def graph_summary(solved: SolvedGraph) -> Page:

@@ -13,7 +13,7 @@ from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from px4fuse.analysis import Analysis
-from px4fuse.answers import Answers, form_rows
+from px4fuse.answer_form import Answers, form_rows
 from px4fuse.errors import SettingsError
 from px4fuse.report.page import Page, appendix
 from px4fuse.report.style import MUTED_COLOUR

@@ -13,10 +13,10 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight import Unavailable
-from px4fuse.report import marks, style
+from px4fuse.report import event_marks, style
 from px4fuse.report.page import Page
+from px4fuse.report.phrases import filters_by_name, format_verdict
 from px4fuse.report.style import DOTS, LINES, Axes, draw_curve, draw_sigma_band, set_log_scale
-from px4fuse.report.words import filters_by_name, format_verdict
 
 NARROW_HEIGHT = 72.0  # points; height of the axes in the three-column appendix
 # Half height of the innovation axes: EDGE_FACTOR times the larger of 2√S and the 99 % quantile,
@@ -82,7 +82,7 @@ class Panel(NamedTuple):
         )
         # this panel already shows the rejected innovations as hollow dots
         rejected = "" if self is INNOVATIONS else result.axis.name
-        axes = marks.panel(
+        axes = event_marks.panel(
             page,
             analysis,
             self.full_title(result),
@@ -218,7 +218,7 @@ def _position_numbers(result: AxisComparison) -> str:
     if isinstance(part, Unavailable):
         return f"{part.what}: {part.reason}"
     return (
-        f"KF - EKF2: RMS {part.position_rmse_m:.3f} m, mean {part.position_mean_m:+.3f} m, "
+        f"KF - EKF2: RMS {part.position_rms_m:.3f} m, mean {part.position_mean_m:+.3f} m, "
         f"maximum {part.position_maximum_m:.2f} m"
     )
 
@@ -226,7 +226,7 @@ def _position_numbers(result: AxisComparison) -> str:
 def _velocity_numbers(result: AxisComparison) -> str:
     texts = [_error_numbers(result, VELOCITIES)]
     if isinstance(result.difference, Difference):
-        texts.append(f"KF - EKF2: RMS {result.difference.velocity_rmse_m_s:.3f} m/s")
+        texts.append(f"KF - EKF2: RMS {result.difference.velocity_rms_m_s:.3f} m/s")
     return "; ".join(filter(None, texts))
 
 
@@ -289,8 +289,8 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
             sentences.append(f"{name}: {one.reason}.")
         else:
             sentences.append(
-                f"{name}: {one.outside_two_sigma:.1%} of {one.count} innovations outside ±2√S "
-                f"(expected 5 %): {format_verdict(one)}."
+                f"{name}: {one.fraction_outside_two_sigma:.1%} of {one.count} innovations outside "
+                f"±2√S (expected 5 %): {format_verdict(one)}."
             )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")

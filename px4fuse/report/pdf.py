@@ -19,6 +19,7 @@ from px4fuse.report import (
     clock,
     consistency,
     cover,
+    difference_page,
     evaluation,
     flight,
     fonts,
@@ -26,7 +27,6 @@ from px4fuse.report import (
     notes,
     provenance,
     sensitivity,
-    why,
 )
 from px4fuse.report.cover import student_line
 from px4fuse.report.page import Page, data, replace_unprintable
@@ -42,7 +42,7 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
         cover.draw,
         flight.draw,
         flight.draw_innovations,
-        why.draw,
+        difference_page.draw,
         flight.draw_other_axes,
         consistency.draw,
         sensitivity.draw,

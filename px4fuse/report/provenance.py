@@ -9,8 +9,8 @@ from px4fuse.flight import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.report import clock, fonts
 from px4fuse.report.page import Page
+from px4fuse.report.phrases import describe_alignment, format_clock_map
 from px4fuse.report.style import MUTED_COLOUR
-from px4fuse.report.words import describe_alignment, format_clock_map
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
@@ -58,7 +58,7 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
             *(one.own_parameters for one in (EV_POS, GNSS_POS) if one != aid)
         )
         facts["position source"] = (
-            f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
+            f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
     parameters = (

@@ -15,12 +15,19 @@ from dataclasses import replace
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.ekf2.filter_recursion import (
+    EAST,
+    HEADING,
+    NORTH,
+    POSITION_COLUMNS,
+    StretchRun,
+    Variant,
+)
 from px4fuse.ekf2.heights import barometer_samples_inside
 from px4fuse.ekf2.inputs import UNLIMITED_RESETS, FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.model import delayed_states, run_variants
 from px4fuse.ekf2.output_predictor import delay_by, follow_attitude, publish
-from px4fuse.ekf2.recursion import EAST, HEADING, NORTH, POSITION_COLUMNS, StretchRun, Variant
-from px4fuse.ekf2.stretches import (
+from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     GYRO_BIAS,

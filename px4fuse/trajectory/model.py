@@ -11,7 +11,7 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import one_line_repr
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, Record
 
 # source; "slam": SLAM whose frame is that of its first key frame (such as ORB-SLAM3)

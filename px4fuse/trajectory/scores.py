@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.display import one_line_repr
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, OrUnavailable, Record
 from px4fuse.trajectory.correlation import autocovariance
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
@@ -98,7 +98,7 @@ class RelativeError(Record, frozen=True):
     rotation_deg: OrUnavailable[Statistics]
 
     @property
-    def delta_words(self) -> str:
+    def delta_text(self) -> str:
         """Distance of a pair, with unit."""
         return str(Delta(self.delta, self.unit))
 

@@ -1,4 +1,4 @@
-"""Speed of trajectory files and scores; nothing here can fail: run it, read it.
+"""Speed of trajectory files and scores; prints times and asserts nothing.
 
 A file of 20,000 poses, then reading, association, scores with intervals, and the time offset, on a
 ten-minute flight: 30 Hz of an estimate against 200 Hz of a reference.
@@ -27,8 +27,8 @@ def main() -> None:
     from px4fuse.readers.trajectory import read_trajectory, tum_text
     from px4fuse.trajectory.association import associate
     from px4fuse.trajectory.evaluation import evaluate
-    from px4fuse.trajectory.offset import estimate_time_offset
     from px4fuse.trajectory.scores import rmse_interval
+    from px4fuse.trajectory.time_offset import estimate_time_offset
 
     reference = flight(600.0, 200.0)
     estimate = flight(600.0, 30.0, "vio")

@@ -36,10 +36,10 @@ if str(TESTS) not in sys.path:
 
 import mavlink_tools  # noqa: E402
 import ulog_tools  # noqa: E402
-from class_tools import in_turn  # noqa: E402
-from conftest import page_of  # noqa: E402
+from class_tools import run_in_turn  # noqa: E402
+from conftest import blank_page  # noqa: E402
 
-from px4fuse import answers, workers  # noqa: E402
+from px4fuse import answer_form, workers  # noqa: E402
 from px4fuse.analysis import run_or_evaluate_aids  # noqa: E402
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
 from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
@@ -58,12 +58,12 @@ from px4fuse.results.build import outcome_results  # noqa: E402
 from px4fuse.results.contract import to_json  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402
 from px4fuse.trajectory.graph.analysis import analyse_graph  # noqa: E402
-from px4fuse.verification.intake import read_report  # noqa: E402
+from px4fuse.verification.pdf_input import read_report  # noqa: E402
 
 REPOSITORY = TESTS.parent
 REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
 SLOW_S, COMMAND_S = 5.0, 15.0
-# Numbers and words that parsers may handle incorrectly
+# Numbers and texts that parsers may handle incorrectly
 ODD = (
     b"nan", b"-inf", b"1e999", b"-1e-400", b"1.8e308", b"0", b"-0", b"", b"9" * 400, b"0x1p3",
     "١٢".encode(), "−1".encode(), b"1,5", b"1_0", b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"#",
@@ -162,7 +162,7 @@ def _recordings() -> list[bytes]:
 def _reports() -> list[bytes]:
     """Return the example report, and its results attached to an empty page."""
     report = REPORT
-    return [report.read_bytes(), page_of(None, report.with_suffix(".json").read_text())]
+    return [report.read_bytes(), blank_page(None, report.with_suffix(".json").read_text())]
 
 
 def _report(path: Path) -> object:
@@ -218,8 +218,8 @@ TARGETS = (
     Target("g2o", _text(_GRAPH_2D, _GRAPH_3D), read_g2o, ".g2o", True, 1800, 20.0),
     Target("pose graph", _text(_GRAPH_2D, _GRAPH_3D), _graph, ".g2o", True, 180, 2.0),
     Target(
-        "answers", lambda: [answers.form_text("a.ulg", "0" * 64).encode()], answers.read_answers,
-        ".toml", True, 900, 8.0,
+        "answers", lambda: [answer_form.form_text("a.ulg", "0" * 64).encode()],
+        answer_form.read_answers, ".toml", True, 900, 8.0,
     ),
     Target(
         "results", lambda: [(REPORT.with_suffix(".json")).read_bytes()],
@@ -243,7 +243,7 @@ def _command(*words: str) -> Callable[[Path], object]:
         given = [word.format(path=path, out=out) for word in words]
         with contextlib.ExitStack() as stack:
             for module in (grading, workers):
-                stack.enter_context(mock.patch.object(module, "run_bounded", in_turn))
+                stack.enter_context(mock.patch.object(module, "run_bounded", run_in_turn))
             done = CliRunner().invoke(cli, given)
         if done.exception is not None and not isinstance(done.exception, SystemExit):
             raise done.exception

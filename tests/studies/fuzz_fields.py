@@ -435,7 +435,11 @@ def impossible(value: Any, path: str = "") -> Iterator[str]:
             yield f"{path} {value} is negative"
         elif "correlation" in name and "time" not in name and abs(value) > 1.0:
             yield f"{path} {value} is no correlation"
-        elif name.endswith("share") and not -1e-9 <= value <= 1.0 + 1e-9:
+        elif (
+            name.endswith("fraction")
+            and name != "explained_fraction"
+            and not -1e-9 <= value <= 1.0 + 1e-9
+        ):
             yield f"{path} {value} is no share"
         elif name.endswith("_m") and abs(value) > LONGEST_M:
             yield f"{path} {value} is no length"

@@ -9,8 +9,8 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import one_line_repr
 from px4fuse.errors import TrajectoryError
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.graph import lie
 
 # eigenvalue of an information matrix, scaled to unit diagonal, above which a direction is observed

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.display import one_line_repr
 from px4fuse.errors import TrajectoryError
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph, Residuals

@@ -1,9 +1,9 @@
 """Time correlation of the source's errors: a low pass, or time-correlated noise.
 
 All models are compared by the likelihood of the same positions over the motion from the IMU, with
-biases, tilt and scale factor error marginalised (:mod:`px4fuse.filter.motion`), and each with its
-own maximum-likelihood noises. The SIGMA_A of KF is not used: it covers the biases and would hide
-slow errors.
+biases, tilt and scale factor error marginalised (:mod:`px4fuse.filter.imu_motion`), and each with
+its own maximum-likelihood noises. The SIGMA_A of KF is not used: it covers the biases and would
+hide slow errors.
 
 A low pass of first order, z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ), correlates the noise of
 successive positions and makes the positions lag. Its inverse, u_k = (z_k - ρ z_(k-1)) / (1 - ρ),
@@ -31,10 +31,10 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from px4fuse.arrays import Array
-from px4fuse.filter.causes import Jump, unit_steps
 from px4fuse.filter.fitting import NoiseFit, Noises, fit_noises, maximise_likelihood
+from px4fuse.filter.hypotheses import Jump, unit_steps
+from px4fuse.filter.imu_motion import PreparedMotion, SignalCache, prepare_motion
 from px4fuse.filter.likelihood import PROFILE_DROP
-from px4fuse.filter.motion import PreparedMotion, SignalCache, prepare_motion
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight import Flight, Unavailable

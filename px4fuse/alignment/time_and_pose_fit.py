@@ -9,7 +9,7 @@ from px4fuse.alignment import tracks
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
 from px4fuse.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
-from px4fuse.trajectory.offset import STEP_S
+from px4fuse.trajectory.time_offset import STEP_S
 
 WINDOW_S = 1.0  # largest shift of the least squares from the correlation peak
 # concordance correlation below which a match is rejected

@@ -1,6 +1,6 @@
-/* Sentences and verdicts on the flight with the current settings, worded as in findings/story.py. */
-const Story = (() => {
-  // format_number and format_factor of plain.py, format_metres of findings/story.py
+/* Sentences and verdicts on the flight with the current settings, worded as in findings/summary.py. */
+const Summary = (() => {
+  // format_number and format_factor of text.py, format_metres of findings/summary.py
   const formatNumber = (x, digits = 3) =>
     Number(x.toPrecision(digits)).toLocaleString("en", { maximumFractionDigits: 20 });
   const formatFactor = (x) => formatNumber(x, x < 2 ? 3 : 2);

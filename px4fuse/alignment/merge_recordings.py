@@ -10,8 +10,8 @@ from msgspec import structs
 
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preference
-from px4fuse.readers.parts import collect_unavailable
-from px4fuse.recording import InputFile
+from px4fuse.log import InputFile
+from px4fuse.readers.common import collect_unavailable
 
 # names of fields that contain times
 TIMES = ("time_s", "start_s", "end_s")
@@ -86,7 +86,7 @@ def join(flight: Flight, other: Flight) -> Flight:
             ),
             senders=log.senders or other_log.senders,
             restarts=log.restarts or other_log.restarts,
-            receipt_went_back=log.receipt_went_back or other_log.receipt_went_back,
+            receive_time_reversals=log.receive_time_reversals or other_log.receive_time_reversals,
             dropped={
                 **{f"{other_log.name}: {k}": n for k, n in other_log.dropped.items()},
                 **log.dropped,

@@ -13,13 +13,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.display import one_line_repr
 from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SD, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import FusionRules, Inputs
 from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing, make_intervals
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_field, mean_by_event
-from px4fuse.ekf2.stretches import (
+from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     BIASES,
     GRAVITY_M_S2,
@@ -32,6 +31,7 @@ from px4fuse.ekf2.stretches import (
 )
 from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
+from px4fuse.notebook_display import one_line_repr
 
 # s; length of the first pass, which estimates the initial correlations
 CORRELATION_PASS_S = 8.0
@@ -86,7 +86,7 @@ class Variant:
         True if logged rejections and resets replace the gate.
     without : mapping from PX4's name of an aid to float
         Time (s) from which the aid is not fused.
-    stamp_offset_s : float or None
+    timestamp_offset_s : float or None
         Added to the timestamps; None: EKF2's delay parameter is used.
     """
 
@@ -98,12 +98,12 @@ class Variant:
     gated: bool = True
     as_logged: bool = False
     without: Mapping[str, float] = field(default_factory=dict)
-    stamp_offset_s: float | None = None
+    timestamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
         """Return the total age of a position at its timestamp, and the fusion horizon (s)."""
-        if self.stamp_offset_s is not None:
-            return Timing(-self.stamp_offset_s - 0.5 * inputs.step_s, np.inf)
+        if self.timestamp_offset_s is not None:
+            return Timing(-self.timestamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         known = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
         most_ms = max(self.settings[name] for name in known)

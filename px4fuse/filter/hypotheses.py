@@ -28,7 +28,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from px4fuse.arrays import Array, BoolArray, IntArray, cumulative_integral
-from px4fuse.display import one_line_repr
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -40,6 +39,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, ned_acceleration, too_few_measurements
 from px4fuse.filter.steps import Timeline, make_timeline
 from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.notebook_display import one_line_repr
 
 ANALYSIS_NAME = "causes beyond noise"
 MIN_MEASUREMENTS = 50

@@ -6,9 +6,9 @@ their delay. To first order the acceleration is linear in ten constants of each 
 the initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body) and
 the scale of the positions. The signal of each constant is integrated once; a time offset only
 changes the times at which the integrals are read. The signal of the scale is the acceleration of
-the smooth path, inserted by :func:`px4fuse.filter.marginal.centre_on_path`. The IMU's acceleration
-would contain the noise to be estimated and explain much of it as scale (errors in variables, Fuller
-1987).
+the smooth path, inserted by :func:`px4fuse.filter.marginal_likelihood.centre_on_path`. The IMU's
+acceleration would contain the noise to be estimated and explain much of it as scale (errors in
+variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array, IntArray, cumulative_integral
 from px4fuse.filter.fitting import Noises, fit_ratios
-from px4fuse.filter.marginal import Positions, centre_on_path
+from px4fuse.filter.marginal_likelihood import Positions, centre_on_path
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable

@@ -10,45 +10,45 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import interventions
-from px4fuse.comparison.interventions import Intervention, Of, cause_of, interventions_on
+from px4fuse.comparison import causal_replays
+from px4fuse.comparison.causal_replays import Intervention, Statistic, cause_of, interventions_on
 from px4fuse.comparison.model import FILTERS, AgainstTruth, Difference, FilterName
-from px4fuse.ekf2.walk import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at
-from px4fuse.findings.causes import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
+from px4fuse.findings.cause_grouping import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
+from px4fuse.findings.cause_text import FINDINGS_OF_CAUSE, format_rerun, kind_of
 from px4fuse.findings.model import Finding, format_percent
-from px4fuse.findings.since import FINDINGS_OF_CAUSE, format_rerun, kind_of
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.plain import capitalise_first, format_factor
 from px4fuse.readers.px4_ekf2 import OTHER_AIDING
+from px4fuse.text import capitalise_first, format_factor
 
 MAX_PARAGRAPHS = 3  # paragraphs of the summary
 # Findings whose content is in the first paragraph
-IN_FIRST_PARAGRAPH = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
+IN_FIRST_PARAGRAPH = VARIANCES | {"error_exceeds_reported_sigma", "ekf2_not_logged"}
 # Faults of the source that no noise setting and no outlier removal corrects
 NOISE_SHAPE_FINDINGS = frozenset(
     (
-        "source_axes_unequal",
-        "source_clock_changes",
-        "source_coloured",
-        "source_jumps",
-        "source_noise_changes",
-        "source_repeats",
-        "source_scale_wrong",
-        "source_smoothed",
+        "source_noise_unequal_axes",
+        "source_time_offset_changes",
+        "source_noise_time_correlated",
+        "source_position_jump",
+        "source_noise_varies",
+        "source_samples_repeated",
+        "source_scale_error",
+        "source_low_pass_filtered",
     )
 )
 # Faults that rotate the acceleration, which looks like process noise
-MISALIGNMENT_FINDINGS = frozenset(("ekf2_heading_wrong", "source_frame_turned"))
+MISALIGNMENT_FINDINGS = frozenset(("ekf2_heading_error", "source_frame_misaligned"))
 # Findings listed after the explanation of the difference KF - EKF2
-EFFECT_FINDINGS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
+EFFECT_FINDINGS = frozenset({"ekf2_resets", "ekf2_rejects_positions", "ekf2_fusion_interrupted"})
 NAMES: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
 
 
-def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
+def summarise(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     """Summarise a flight, the most important first.
 
     Parameters
@@ -68,12 +68,12 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
         for owner in FILTERS
     }
     shapes = {
-        one.id for one in findings if one.id in NOISE_SHAPE_FINDINGS and one.severity != "info"
+        one.id for one in findings if one.id in NOISE_SHAPE_FINDINGS and one.severity != "note"
     }
     # a low pass also delays the positions, so a time offset is then not the cause
-    allowed_kinds = (FRAME,) if "source_smoothed" in shapes else (CLOCK, FRAME)
+    allowed_kinds = (FRAME,) if "source_low_pass_filtered" in shapes else (CLOCK, FRAME)
     is_misaligned = any(
-        one.id in MISALIGNMENT_FINDINGS and one.severity != "info" for one in findings
+        one.id in MISALIGNMENT_FINDINGS and one.severity != "note" for one in findings
     )
     for owner, cause in cause_by_filter.items():
         kind = kind_of(analysis, cause)
@@ -82,17 +82,17 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     known = IN_FIRST_PARAGRAPH
     for cause in filter(None, cause_by_filter.values()):
         known |= FINDINGS_OF_CAUSE.get(kind_of(analysis, cause), frozenset())
-    if cause_by_filter["kf"] is not None and not interventions.SETTING_CHANGES.isdisjoint(
+    if cause_by_filter["kf"] is not None and not causal_replays.SETTING_CHANGES.isdisjoint(
         cause_by_filter["kf"].change
     ):
         known |= SETTINGS
     causes = [
         one
         for one in findings
-        if one.caused_by is None and one.severity != "info" and one.id not in known
+        if one.caused_by is None and one.severity != "note" and one.id not in known
     ]
     has_explanation = bool(shapes) or any(
-        one.id == "errors_larger_than_claimed" and one.caused_by for one in findings
+        one.id == "error_exceeds_reported_sigma" and one.caused_by for one in findings
     )
     sentences = [
         _verdict_paragraph(analysis, cause_by_filter, has_explanation),
@@ -104,10 +104,12 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     return tuple(sentences[:MAX_PARAGRAPHS])
 
 
-def _failed_statistic(analysis: Analysis, owner: FilterName) -> Of:
+def _failed_statistic(analysis: Analysis, owner: FilterName) -> Statistic:
     """Statistic that a cause has to explain: mean NEES if the error exceeds σ, else mean NIS."""
     return (
-        "nees" if interventions.error_beyond_reported_sigma(analysis.main.filters[owner]) else "nis"
+        "nees"
+        if causal_replays.error_beyond_reported_sigma(analysis.main.filters[owner])
+        else "nis"
     )
 
 
@@ -133,7 +135,7 @@ def _verdict_paragraph(
     elif not all(isinstance(result.filters[owner].truth, AgainstTruth) for owner in filters):
         difference_text = f"{along} KF and EKF2 are compared"
         if isinstance(result.difference, Difference):
-            difference_m = format_metres(result.difference.position_rmse_m)
+            difference_m = format_metres(result.difference.position_rms_m)
             difference_text = f"{along} KF and EKF2 differ by {difference_m} RMS"
         sentences.append(f"{difference_text}. The log contains no ground truth.")
         if source.origin.may_drift:
@@ -162,17 +164,13 @@ def _filter_sentence(analysis: Analysis, owner: FilterName) -> str:
     elif statement.verdict == "consistent":
         verdict = "is consistent"
     else:
-        confidence, size = (
-            ("underconfident", "large")
-            if statement.sigma_factor > 1.0
-            else ("overconfident", "small")
-        )
+        size = "large" if statement.verdict == "underconfident" else "small"
         factor = format_factor(statement.sigma_error_factor)
-        verdict = f"is {confidence}: σ is {factor} times too {size}"
+        verdict = f"is {statement.verdict}: σ is {factor} times too {size}"
     if not isinstance(statement.truth, AgainstTruth):
         return f"By its innovations along {along} {name} {verdict}."
     rmse = format_metres(statement.truth.position_rmse_m)
-    if hidden := interventions.error_beyond_reported_sigma(statement):
+    if hidden := causal_replays.error_beyond_reported_sigma(statement):
         verdict = f"reports σ {format_metres(hidden.reported_sigma_m)}"
         return f"Along {along} {name} has a position RMSE of {rmse}, but {verdict}."
     return f"Along {along} {name} has a position RMSE of {rmse} and {verdict}."
@@ -183,13 +181,13 @@ def _explanation(
 ) -> str:
     """Re-run that explains an inconsistent filter, or a note that no change does, else ""."""
     statement, axis = analysis.main.filters[owner], analysis.main.axis.name
-    is_hidden = interventions.error_beyond_reported_sigma(statement)
+    is_hidden = causal_replays.error_beyond_reported_sigma(statement)
     if isinstance(statement, Unavailable) or (statement.verdict == "consistent" and not is_hidden):
         return ""
     if cause is not None:
         return f"{capitalise_first(format_rerun(analysis, cause))}."
     tested = interventions_on(analysis.causes, owner, axis, _failed_statistic(analysis, owner))
-    if any(each.denied_by_truth for each in tested):
+    if any(each.contradicts_truth for each in tested):
         return "The errors against ground truth need this σ."
     # drift and faults of the source are listed as findings
     is_explained_elsewhere = has_explanation or analysis.source.origin.may_drift
@@ -201,7 +199,7 @@ def _finding_sentence(analysis: Analysis, finding: Finding) -> str:
     if finding.id == "source_gap":
         return _gap_sentence(analysis, finding)
     when = finding.when if finding.when and not finding.has_time_in_message else ""
-    return f"{finding.headline}{f' ({when})' if when else ''}."
+    return f"{finding.title}{f' ({when})' if when else ''}."
 
 
 def _gap_sentence(analysis: Analysis, finding: Finding) -> str:
@@ -252,12 +250,13 @@ def _difference_after_change(
         intervention
         for owner, cause in causes.items()
         for intervention in interventions_on(
-            analysis.causes, owner, analysis.main.axis.name, "apart"
+            analysis.causes, owner, analysis.main.axis.name, "difference"
         )
-        if cause is not None and intervention.explains >= interventions.MIN_EXPLAINED_SHARE
+        if cause is not None
+        and intervention.explained_fraction >= causal_replays.MIN_EXPLAINED_SHARE
     ]
     if reductions:
-        most = max(reductions, key=lambda intervention: intervention.explains)
+        most = max(reductions, key=lambda intervention: intervention.explained_fraction)
         yield (
             f"Re-run of {NAMES[most.filter]} with this correction: difference KF - EKF2 "
             f"{most.before:.2f} → {most.after:.2f} m RMS."
@@ -266,12 +265,12 @@ def _difference_after_change(
 
 def _differences(analysis: Analysis, *, has_difference_text: bool) -> Iterator[str]:
     """Loop closure error, and the explanation of the difference KF - EKF2."""
-    loop, why = analysis.loop, analysis.why.get(analysis.main.axis.name)
+    loop, why = analysis.loop, analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(loop, Loop) and (gap := loop.closure_error_m) is not None:
         length = loop.path_length_m
         yield (
             f"The odometry has a loop closure error of {format_metres(gap)} after {length:.0f} m "
             f"({format_percent(gap / length, 1)})."
         )
-    if isinstance(why, Why) and not has_difference_text:
+    if isinstance(why, DifferenceExplanation) and not has_difference_text:
         yield why.cause

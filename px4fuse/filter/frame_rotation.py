@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, cumulative_integral
-from px4fuse.display import one_line_repr
+from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, continuous_noise_unit
-from px4fuse.filter.motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
+from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import NotNegative, Record, Share
 
 # s; averaging time of the parts
@@ -70,7 +70,7 @@ class HeadingError(Record, frozen=True):
 
     Attributes
     ----------
-    turn_deg : float
+    misalignment_deg : float
         Mean over the flight.
     sigma_deg : float
         Standard deviation of the mean; not reduced by averaging, as errors are common to all parts.
@@ -84,7 +84,7 @@ class HeadingError(Record, frozen=True):
         Data from which the angle is estimated.
     """
 
-    turn_deg: float
+    misalignment_deg: float
     sigma_deg: NotNegative
     drifts: bool
     parts: tuple[HeadingPart, ...]
@@ -107,7 +107,7 @@ def combine_heading_parts(
     """Combine the parts of a flight into one result."""
     turns_deg = [heading_part.heading_error_deg for heading_part in parts]
     return HeadingError(
-        turn_deg=float(np.mean(turns_deg)),
+        misalignment_deg=float(np.mean(turns_deg)),
         sigma_deg=float(np.mean([heading_part.sigma_deg for heading_part in parts])),
         drifts=drift_p < MAX_DRIFT_P and max(turns_deg) - min(turns_deg) >= MIN_DRIFT_DEG,
         parts=parts,
