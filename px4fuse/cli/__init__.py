@@ -7,6 +7,7 @@ import importlib
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 
 import click
@@ -174,6 +175,8 @@ def main() -> None:
     for signal_number in TERMINATION_SIGNALS:
         if signal.getsignal(signal_number) is signal.SIG_DFL:  # nohup ignores SIGHUP
             signal.signal(signal_number, _interrupt)
+    if hasattr(signal, "pthread_kill"):  # not on Windows
+        sys.unraisablehook = _interrupt_again
     try:
         if not {*HELP_OPTIONS, "--version"} & set(sys.argv):
             _check_memory()
@@ -254,6 +257,17 @@ def _print_error(text: str) -> None:
 def _interrupt(signal_number: int, _: object) -> None:
     """Handle a termination signal like Ctrl-C, so that temporary files are deleted."""
     raise KeyboardInterrupt(signal_number)
+
+
+def _interrupt_again(ignored: "sys.UnraisableHookArgs") -> None:
+    """Repeat a signal that arrived in a finaliser or callback, whose exceptions Python ignores."""
+    stopped = ignored.exc_value
+    if isinstance(stopped, KeyboardInterrupt):
+        number = stopped.args[0] if stopped.args else signal.SIGINT
+        # 0.1 s later the callback has ended; a signal also ends a wait of the main thread
+        threading.Timer(0.1, signal.pthread_kill, [threading.main_thread().ident, number]).start()
+    else:
+        sys.__unraisablehook__(ignored)
 
 
 def _abandon_output() -> None:
