@@ -190,22 +190,21 @@ def has_effect(trial: Trial) -> bool:
 def improvement(trial: Trial) -> Improvement:
     """Return which numbers a re-run improves.
 
-    Position: RMSE lower by 20 %. σ: |ln ratio| halves or enters the band, against ground truth if
-    it is available.
+    Position: RMSE lower by 20 %. σ: |ln ratio| halves or enters the band, against the source or
+    ground truth, and gets worse against neither.
     """
     before_m, after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     is_position_better = bool(
         before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
     )
-    before, after = ratios(trial.before), ratios(trial.after)
-    against = "truth" if before.keys() & after.keys() & {"truth"} else "source"
-    is_sigma_better = False
-    if against in before and against in after:
-        was, becomes = before[against], after[against]
-        low, high = BANDS[against]
-        is_sigma_better = not low <= was <= high and (
-            low <= becomes <= high or abs(math.log(becomes)) <= 0.5 * abs(math.log(was))
-        )
+    changes = [
+        (abs(math.log(was)), abs(math.log(becomes)), word_of(was, name), word_of(becomes, name))
+        for name, was, becomes in _pairs(trial)
+    ]
+    is_sigma_better = any(
+        word != "consistent" and (word_after == "consistent" or becomes <= 0.5 * was)
+        for was, becomes, word, word_after in changes
+    ) and all(becomes <= was or word_after == "consistent" for was, becomes, _, word_after in changes)
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"
     return "σ only" if is_sigma_better else "nothing"
