@@ -49,7 +49,7 @@ from px4fuse.flight import (
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
-from px4fuse.readers.px4_positions import MAX_THINNED_HZ
+from px4fuse.readers.px4_positions import MIN_COMPLETE_GNSS_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
@@ -380,7 +380,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     track = _gnss_track(flight)
     if track is None or track.velocity is None:
         return Unavailable(ANALYSIS_NAME, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
-    if track.rate_hz < MAX_THINNED_HZ:
+    if track.rate_hz < MIN_COMPLETE_GNSS_HZ:
         return Unavailable(
             "EKF2 replay",
             f"GNSS is logged at {track.rate_hz:.1f} Hz, below the rate that EKF2 fused",

@@ -25,7 +25,7 @@ MIN_PATH_M = 2.0
 LOOP_MIN_PATH_M = 10.0
 LOOP_MAX_GAP_SHARE = 0.10
 # m or degrees; limit of options
-MAX_VALUE = 100.0
+MAX_COORDINATE_M = 100.0
 
 
 def analyse(
@@ -179,8 +179,10 @@ def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
 
 
 def _require_in_range(name: str, value: float, least: float) -> None:
-    if not least <= value <= MAX_VALUE:
-        raise SettingsError(f"`{name}` {value:g} is out of range ({least:g} to {MAX_VALUE:g}).")
+    if not least <= value <= MAX_COORDINATE_M:
+        raise SettingsError(
+            f"`{name}` {value:g} is out of range ({least:g} to {MAX_COORDINATE_M:g})."
+        )
 
 
 def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
@@ -192,7 +194,7 @@ def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
             f"{label}: the times must be in ascending order and on the path "
             f"({low:.2f} s to {high:.2f} s)."
         )
-    if not 1e-4 <= closure.sigma_m <= MAX_VALUE:
+    if not 1e-4 <= closure.sigma_m <= MAX_COORDINATE_M:
         raise TrajectoryError(
             f"{label}: SIGMA {closure.sigma_m:g} is out of range (0.0001 to 100 m)."
         )
