@@ -20,7 +20,7 @@ from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter import settings as allowed
-from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
@@ -208,7 +208,7 @@ def _nis_bands(count: int, packer: Packer) -> list[int]:
     The number changes with the clock offset, which moves measurements across the segment's ends.
     """
     freedom = np.arange(1, 2 * count + 1)
-    ends = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
+    ends = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)
     return [
         packer.add(np.asarray(stats.chi2.ppf(end, freedom)) / freedom, COARSE_SCALE) for end in ends
     ]

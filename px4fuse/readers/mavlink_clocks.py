@@ -115,7 +115,7 @@ def _is_rate_ratio(slope: float) -> bool:
 
 
 def is_running_clock(stamp_s: Array) -> bool:
-    """Return True if enough timestamps are distinct (see MIN_DISTINCT_SHARE)."""
+    """Return True if enough timestamps are distinct (see MIN_DISTINCT_FRACTION)."""
     return len(np.unique(stamp_s)) >= max(MIN_DISTINCT_FRACTION * len(stamp_s), 2)
 
 

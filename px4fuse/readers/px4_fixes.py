@@ -70,7 +70,7 @@ def reconstruct_fixes(
 
     An innovation belongs to the last fix before its log time (2 Hz up to v1.15). That fix is a
     whole number n of receiver intervals after a logged fix. For n = 0 the fix is also logged, which
-    gives the reconstruction error. If the error exceeds EXACT_M, nothing is returned.
+    gives the reconstruction error. Nothing is returned if it exceeds MAX_RECONSTRUCTION_ERROR_M.
 
     Parameters
     ----------

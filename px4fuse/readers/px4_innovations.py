@@ -79,7 +79,7 @@ def innovations_by_axis(
         Fusion flags, as in :class:`~px4fuse.flight.Ekf2`.
     gate : float
         Innovation gate (in √S), used if rejections are not logged.
-    source : FusedSource
+    source : Ekf2Source
     """
     innovations: Innovations = {}
     used_topics: dict[str, None] = {}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
 from px4fuse.comparison.model import UnjudgedFilter as Unjudged
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, Consistency
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
@@ -134,11 +134,12 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     small_deviations = [
         f"{filter_name} {axis} ({format_factor(statement.sigma_error_factor)}×)"
         for axis, filter_name, statement in statements
-        if statement.verdict != "consistent" and statement.sigma_error_factor < SIGMA_FACTOR_FINDING
+        if statement.verdict != "consistent"
+        and statement.sigma_error_factor < MIN_FINDING_SIGMA_FACTOR
     ]
     if small_deviations:
         notes.append(
-            f"Significant, but below the limit of {SIGMA_FACTOR_FINDING:g}× for a finding: "
+            f"Significant, but below the limit of {MIN_FINDING_SIGMA_FACTOR:g}× for a finding: "
             f"{', '.join(small_deviations)}."
         )
     correlated = [

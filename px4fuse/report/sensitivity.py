@@ -8,7 +8,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.filter.fitting import FIRST_WIDTH
+from px4fuse.filter.fitting import START_OUTLIER_WIDTH
 from px4fuse.filter.likelihood import FilterStates, filter_states, preintegrate, score_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
@@ -32,7 +32,7 @@ REGION_95 = float(-np.log(0.05))
 LEVELS = (0.0, REGION_95, 10.0, 100.0, 1000.0, 10_000.0)
 SHADES = ("#0b2a55", "#3f6aa8", "#86a7d3", "#c3d4ea", "#e6edf6")
 SHADE_LABELS = ("95 % region", "10 below", "100", "1,000", "10,000")
-COARSE_POINTS, FINE_POINTS = 14, 11
+COARSE_OFFSETS, FINE_POINTS = 14, 11
 # Margin of the map (factor), and range of the fine grid as a multiple of the 95 % interval
 MAP_MARGIN, FINE_REACH = 1.3, 2.3
 MAP_HEIGHT, MAP_LEFT = 140.0, 40.0  # points; height of the axes, margin left of them
@@ -115,13 +115,13 @@ def _noise_grid(chosen: float, noise: Noise) -> tuple[Array, tuple[float, float]
     low, high = min(needed) / MAP_MARGIN, max(needed) * MAP_MARGIN
     spread = max(most / best, best / least, 1.02)
     fine = best * spread ** np.linspace(-FINE_REACH, FINE_REACH, FINE_POINTS)
-    grid = np.concatenate([np.geomspace(low, high, COARSE_POINTS), fine])
+    grid = np.concatenate([np.geomspace(low, high, COARSE_OFFSETS), fine])
     return np.unique(grid[(low <= grid) & (grid <= high)]), (low, high)
 
 
 def _map_sentence(tuned_noises: AxisTuning) -> str:
     drop = format_number(max(tuned_noises.gain_nats * tuned_noises.count, 0.0), 2)
-    has_random_walk = tuned_noises.noises.walk_m > tuned_noises.noises.sigma_z_m
+    has_random_walk = tuned_noises.noises.random_walk_m > tuned_noises.noises.sigma_z_m
     walk_note = " The random walk of the source is not included." if has_random_walk else ""
     return (
         "Maximum-likelihood estimate: SIGMA_A "
@@ -157,7 +157,7 @@ def _log_likelihood_drop(
     ]
     legs = [preintegrate(axis, comparison.settings) for axis in axes]
     time = axes[0].measurement_time_s[-len(legs[0].measurement_m) :]
-    weight = np.where(np.isin(time, tuned_noises.outlier_time_s), FIRST_WIDTH**-2.0, 1.0)
+    weight = np.where(np.isin(time, tuned_noises.outlier_time_s), START_OUTLIER_WIDTH**-2.0, 1.0)
     total = score_grid(legs, a[:, None], z[None, :], weight)
     return np.asarray(total - total.min())
 
