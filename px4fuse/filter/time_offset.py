@@ -78,7 +78,7 @@ class Clock(Record, frozen=True, kw_only=True):
         Standard deviation from the curvature at the maximum, widened by the noise of the IMU.
     applied_s : float
         Offset already added to the timestamps.
-    determinable : bool
+    is_determinable : bool
         True if the interval is closed and narrow enough.
     reason : str
         Reason if not determinable, else empty.
@@ -86,7 +86,7 @@ class Clock(Record, frozen=True, kw_only=True):
         Offsets of consecutive parts.
     drift_ppm, drift_sigma_ppm : float or None
         Drift of the source's clock relative to the autopilot's; None with fewer than three parts.
-    change_p : float or None
+    change_p_value : float or None
         p-value of a constant offset (likelihood ratio test); None with fewer than two parts.
     count : int
         Number of measurements.
@@ -96,11 +96,11 @@ class Clock(Record, frozen=True, kw_only=True):
     interval_s: Span
     sigma_s: NotNegative
     applied_s: float
-    determinable: bool
+    is_determinable: bool
     reason: str = ""
     drift_ppm: float | None = None
     drift_sigma_ppm: NotNegative | None = None
-    change_p: Share | None = None
+    change_p_value: Share | None = None
     parts: tuple[PartOffset, ...]
     count: Count
 
@@ -223,10 +223,10 @@ def estimate_time_offset(
         )
         reason = f"{range_text}: too little acceleration, or too much position noise"
     parts: tuple[PartOffset, ...] = ()
-    change_p = None
+    change_p_value = None
     if not reason:
         progress("changes of the time offset")
-        parts, change_p = _offset_per_part(prepared_motion, offset_s, noises, variance_factor)
+        parts, change_p_value = _offset_per_part(prepared_motion, offset_s, noises, variance_factor)
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
     applied_s = settings.clock_offset_s
     return ClockOffset(
@@ -234,14 +234,14 @@ def estimate_time_offset(
         interval_s=(applied_s + low_s, applied_s + high_s),
         applied_s=applied_s,
         sigma_s=float(np.hypot(sigma_s * np.sqrt(variance_factor), resolution_s)),
-        determinable=not reason,
+        is_determinable=not reason,
         reason=reason,
         curve_s=applied_s + curve_s,
         curve_drop=scores - scores.min(),
         parts=tuple(structs.replace(part, offset_s=applied_s + part.offset_s) for part in parts),
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
-        change_p=change_p,
+        change_p_value=change_p_value,
         sigma_a_m_s2=noises.sigma_a_m_s2,
         sigma_z_m=noises.sigma_z_m,
         count=len(prepared_motion.time_s),

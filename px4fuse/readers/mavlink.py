@@ -330,7 +330,7 @@ def _describe_log(
         parameters=MappingProxyType(parameters),
         notes=(*recording.notes, *parameter_faults, *dropped_notes),
         restarts=recording.restarts,
-        receipt_went_back=recording.receipt_went_back,
+        receive_time_reversals=recording.receive_time_reversals,
         dropped=dict(sorted(recording.dropped.items())),
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),

@@ -187,10 +187,12 @@ def _step_s(topics: Topics) -> float:
         return target_s
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
     step_ends_s = topics.primary_samples(layout).index
-    return samples_per_step(target_s, interval_s, rows_of_stamps(imu_s, step_ends_s)) * interval_s
+    return (
+        samples_per_step(target_s, interval_s, rows_of_timestamps(imu_s, step_ends_s)) * interval_s
+    )
 
 
-def rows_of_stamps(times_s: Array, known_s: ArrayLike) -> IntArray:
+def rows_of_timestamps(times_s: Array, known_s: ArrayLike) -> IntArray:
     """Return the rows of ``times_s`` whose time is in ``known_s``, rounded to 1 µs."""
     known_us = np.rint(np.asarray(known_s, dtype=float) * 1e6)
     return np.flatnonzero(np.isin(np.rint(times_s * 1e6), known_us))
