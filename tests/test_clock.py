@@ -140,7 +140,7 @@ def test_motion_increments_equal_constant_acceleration() -> None:
     np.testing.assert_allclose(speed[1, :, 0, inside], 1.5 * 0.25, atol=1e-9)
     np.testing.assert_array_equal(np.flatnonzero(~positions.is_joined) + 1, moved.edges[1:-1])
     # positions are relative to the first measured one of each stretch
-    for begin, end in positions.stretches:
+    for begin, end in positions.segments:
         known = positions.measurement_m[begin:end, 0]
         known = known[np.isfinite(known)]
         np.testing.assert_allclose(known, 0.25 * np.arange(len(known)), atol=1e-12)
@@ -215,7 +215,7 @@ class JointNormal:
 
 @pytest.fixture(scope="module")
 def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
-    """Return 50 s with an ideal IMU and wind that it does not measure, and its stretches."""
+    """Return 50 s with an ideal IMU and wind that it does not measure, and its segments."""
     flight, _ = made_flight(duration_s=50.0, offset_s=0.07)
     time = np.arange(0.0, 50.005, 1.0 / IMU_HZ)
     h = 0.0005
@@ -235,22 +235,22 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
         positions=(replace(track, samples=samples),),
     )
     found = estimate(flight)
-    # positions that the search can shift, in equal stretches of at most 30 s
+    # positions that the search can shift, in equal segments of at most 30 s
     used = samples[(samples.index >= 0.6) & (samples.index <= 49.4)]
     first = used.index < (used.index[0] + used.index[-1]) / 2.0
     parts = used[first], used[~first]
-    stretches = [(part.index.to_numpy(), part[Columns.POSITION].to_numpy()) for part in parts]
+    segments = [(part.index.to_numpy(), part[Columns.POSITION].to_numpy()) for part in parts]
     assert found.count == len(used)
-    return flight, found, stretches
+    return flight, found, segments
 
 
 def test_clock_profile_equals_joint_normal_density(exact_imu) -> None:
     """Both noises are maximised at each offset."""
-    _, found, stretches = exact_imu
+    _, found, segments = exact_imu
     profile, best = [], []
     within = [24, 60, 90]  # further out the Newton step is too coarse
     for offset in found.curve_s[within]:
-        normals = [JointNormal(*stretch, offset) for stretch in stretches]
+        normals = [JointNormal(*segment, offset) for segment in segments]
 
         def cost(logs: Array, normals: list[JointNormal] = normals) -> float:
             return sum(normal.solved(*np.exp(logs))[0] for normal in normals)
@@ -295,11 +295,14 @@ def test_clock_parts_and_change_follow_profiles(monkeypatch, offset_s, factor) -
 
     def fit_noises(grid: Array, *_: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
-        return SimpleNamespace(by_stretch=lambda: 0.5 * square[None])
+        return SimpleNamespace(scores_by_segment=lambda: 0.5 * square[None])
 
     monkeypatch.setattr(time_offset, "fit_noises", fit_noises)
     moved = SimpleNamespace(
-        edges=np.arange(5) * 2, time_s=np.arange(8.0), blocks=lambda grid: grid, weight=None
+        edges=np.arange(5) * 2,
+        time_s=np.arange(8.0),
+        position_batches=lambda grid: grid,
+        weight=None,
     )
     parts, p = time_offset._offset_per_part(moved, offset_s, Noises(0.1, 0.1), factor)
     # the last part has a σ above the limit

@@ -166,7 +166,7 @@ def _solve_graph(
     outputs.check_targets([json_path, g2o])
     with outputs.progress(json_path) as step:
         step(f"reading {display_name(source)}")
-        solved = analyse_graph(display_name(source), read_g2o(path), step, robust=robust)
+        solved = analyse_graph(display_name(source), read_g2o(path), step, run_robust=robust)
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
     contents |= outputs.result_files(graph_results(solved, command), json_path)

@@ -29,7 +29,7 @@ from px4fuse.filter.marginal_likelihood import Positions, centre_on_path
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
+from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, to_matrix
 
 # Prior σ of the constants, wide for consumer sensors: tilt and heading (rad), gyro bias (rad/s),
 # accelerometer bias (m/s²), scale of the positions (1)
@@ -319,7 +319,7 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
     attitude_quaternion = _integrate_gyros(step_times_s, angle, attitude)
     # rotation by the attitude in the middle of each step
     mean_force = np.diff(force, axis=0) / INTEGRATION_STEP_S
-    body_to_ned = matrix(
+    body_to_ned = to_matrix(
         multiply(attitude_quaternion[:-1], from_vector(np.diff(angle, axis=0) / 2.0))
     )
     force_ned = np.einsum("nij,nj->ni", body_to_ned, mean_force)
@@ -357,5 +357,5 @@ def _integrate_gyros(step_times_s: Array, angle: Array, attitude: pd.DataFrame) 
     start_s = np.clip(step_times_s[0], attitude_s[near_rows][0], attitude_s[near_rows][-1])
     slerp = Slerp(attitude_s[near_rows], Rotation.from_quat(logged_quaternions, scalar_first=True))
     start_quaternion = slerp(start_s).as_quat(scalar_first=True)
-    rotation_since_start = running_product(from_vector(np.diff(angle, axis=0)))
+    rotation_since_start = cumulative_product(from_vector(np.diff(angle, axis=0)))
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

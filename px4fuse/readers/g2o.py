@@ -125,7 +125,7 @@ def g2o_text(graph: PoseGraph) -> str:
     """
     kind = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
-    upper_triangle = np.triu_indices(graph.freedom)
+    upper_triangle = np.triu_indices(graph.degrees_of_freedom)
     poses = zip(ids, graph.poses.tolist(), strict=True)
     lines = [f"VERTEX_{kind} {vertex_id} {' '.join(map(repr, pose))}" for vertex_id, pose in poses]
     lines.append(f"FIX {ids[0]}")

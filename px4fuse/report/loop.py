@@ -9,8 +9,8 @@ from px4fuse.analysis import Analysis
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
-from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.loop.corrections import SINGLE_LOOP
+from px4fuse.loop.analysis import MIN_UNIX_TIME_S
+from px4fuse.loop.corrections import SINGLE_LOOP_REASON
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.report import style
 from px4fuse.report.cover import student_line, write_finding
@@ -172,7 +172,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     page.labelled("True end", "not used" if isinstance(end, Unavailable) else end.source)
     for closure in loop.closures[:1]:
         page.labelled("Gate", describe_gate(closure))
-    single = SINGLE_LOOP if len(loop.closures) == 1 else ""
+    single = SINGLE_LOOP_REASON if len(loop.closures) == 1 else ""
     for text in (by_distance_sentence(loop), single, *missing_corrections(loop)):
         page.write(text, colour=MUTED_COLOUR, above=2.0)
     for group in by_root(findings):
@@ -247,7 +247,7 @@ def write_scores(page: Page, loop: Loop) -> None:
 
 
 def _format_span(part: Loop) -> str:
-    if part.start_s > SMALLEST_STAMP_S:
+    if part.start_s > MIN_UNIX_TIME_S:
         return f"{part.end_s - part.start_s:.1f} s from timestamp {part.start_s:.2f} s"
     return f"{part.start_s:.1f} s to {part.end_s:.1f} s"
 
@@ -282,7 +282,7 @@ def closure_name(closure: Closure, loop: Loop) -> str:
     """Format the two times of a closure; UNIX timestamps are counted from the first pose."""
     if closure.source == LANDING:
         return "take-off and landing"
-    zero = loop.start_s if loop.start_s > SMALLEST_STAMP_S else 0.0
+    zero = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
     return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
 
 
@@ -304,7 +304,7 @@ def missing_corrections(loop: Loop) -> list[str]:
     """Return the missing corrections with their reasons, without repetitions."""
     unavailable = [p for p in loop.corrections.values() if isinstance(p, Unavailable)]
     reasons = [f"{p.what}: {p.reason}" for p in unavailable]
-    return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
+    return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP_REASON not in r]
 
 
 def _format_ate(score: Evaluation | Unavailable) -> str:
@@ -350,7 +350,7 @@ def graph_summary(solved: SolvedGraph) -> Page:
         lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected[:MAX_ROWS]]
         lines += [f"and {len(rejected) - MAX_ROWS} more"] if len(rejected) > MAX_ROWS else []
         page.labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *lines)
-    if len(solved.solutions) == 1 and (~solved.graph.successive).sum() > MAX_ROBUST_CLOSURES:
+    if len(solved.solutions) == 1 and (~solved.graph.is_successive).sum() > MAX_ROBUST_CLOSURES:
         page.labelled(
             "Robust", "not solved for this many closures; add --robust (takes some minutes)"
         )
