@@ -10,7 +10,7 @@ from flights import line
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
-from px4fuse.cli.tune import noise_text
+from px4fuse.cli.tune import format_noise_estimate
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -250,4 +250,4 @@ def test_format_noise_at_search_end_is_a_bound(noise: Noise, said: str) -> None:
     ],
 )
 def test_tune_noise_text_has_interval_or_bound(noise: Noise, expected: str) -> None:
-    assert noise_text(noise) == expected
+    assert format_noise_estimate(noise) == expected
