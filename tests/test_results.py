@@ -151,16 +151,16 @@ def test_read_results_schema_violation_is_refused(values, said):
 
 
 def test_read_results_fields_of_a_newer_minor_version_are_ignored():
-    known = decoded(changed(schema__version="4.9999"))
-    more = changed(
+    known = decode_results(changed_results(schema__version="4.9999"))
+    more = changed_results(
         schema__version="4.9999", new=1, log__new={}, axes__aisle__filters__kf__new=[0.0],
         tuning__horizontal__held_out__new=None, source__available=[
             {**one, "new": "x"} for one in EXAMPLE["source"]["available"]],
     )  # fmt: skip
-    assert decoded(more) == known
-    assert replace(known, schema=decoded(EXAMPLE).schema) == decoded(EXAMPLE)
+    assert decode_results(more) == known
+    assert replace(known, schema=decode_results(EXAMPLE).schema) == decode_results(EXAMPLE)
     with pytest.raises(ResultsError, match="unknown field `new`"):
-        decoded({**more, "schema": EXAMPLE["schema"]})
+        decode_results({**more, "schema": EXAMPLE["schema"]})
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_read_results_fields_of_a_newer_minor_version_are_ignored():
 )
 def test_read_results_of_schema_3_names_the_version_to_use(provenance, said):
     with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:
-        decoded(changed(schema__version="3.0", provenance=provenance))
+        decode_results(changed_results(schema__version="3.0", provenance=provenance))
     assert str(raised.value).endswith(f"Create the report again, or read it with {said}")
 
 
