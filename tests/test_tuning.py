@@ -196,7 +196,7 @@ def test_tune_separates_biases_and_tilt_from_noise() -> None:
     assert without.sigma_a == without.sigma_a_two_state
     assert without.sigma_a.value == pytest.approx(found.sigma_a_two_state.value, rel=0.1)
     assert len(found.outlier_time_s) == 0
-    assert found.noises.walk_m == 0.0
+    assert found.noises.random_walk_m == 0.0
 
 
 def test_tune_weak_motion_scale_does_not_bias_sigma_a() -> None:
@@ -217,7 +217,7 @@ def test_tune_drifting_source_gets_random_walk() -> None:
     samples[Columns.POSITION] += np.cumsum(steps, axis=0)
     drifting = replace(flight, positions=(replace(track, samples=samples),))
     with_walk, without_walk = horizontal(drifting, drifts=True), horizontal(drifting)
-    assert with_walk.noises.walk_m == pytest.approx(0.1, rel=0.25)
+    assert with_walk.noises.random_walk_m == pytest.approx(0.1, rel=0.25)
     assert with_walk.noises.sigma_z_m == pytest.approx(0.1, rel=0.15)
     assert without_walk.noises.sigma_a_m_s2 > 1.5 * with_walk.noises.sigma_a_m_s2
 

@@ -19,7 +19,7 @@ from px4fuse.comparison.causal_replays import (
 from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.packing import COARSE_SCALE, Packer
-from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import (
     CLOCK_OFFSET_RANGE_S,
@@ -222,7 +222,7 @@ def _nis_bands(count: int, packer: Packer) -> list[int]:
     The number depends on the clock offset, which moves measurements into or out of the segment.
     """
     counts = np.arange(1, 2 * count + 1)
-    probabilities = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
+    probabilities = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)
     return [
         packer.add(np.asarray(stats.chi2.ppf(probability, counts)) / counts, COARSE_SCALE)
         for probability in probabilities

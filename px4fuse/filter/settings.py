@@ -31,7 +31,7 @@ class Settings:
     dt_s : float
         Prediction interval DT.
     input : {"imu", "zero"}
-        Acceleration measured by the IMU, or the lesson's constant-velocity case.
+        Acceleration measured by the IMU, or zero: the lesson's constant-velocity model.
     clock_offset_s : float
         Added to the timestamps of the position source.
 

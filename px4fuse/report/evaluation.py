@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
-from px4fuse.loop.analysis import SMALLEST_STAMP_S
+from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
 from px4fuse.report.page import PAGE_WIDTH, Page, halves
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes, Colormap
@@ -273,7 +273,7 @@ def format_metres(value: float) -> str:
 def time_origin_s(evaluation: Evaluation) -> float:
     """Return the origin of the time axes: the first pose if timestamps are UNIX time, else 0 s."""
     start = float(evaluation.time_s[0])
-    return start if start > SMALLEST_STAMP_S else 0.0
+    return start if start > MIN_UNIX_TIME_S else 0.0
 
 
 def summary(evaluation: Evaluation) -> str:

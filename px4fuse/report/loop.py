@@ -9,8 +9,8 @@ from px4fuse.analysis import Analysis
 from px4fuse.findings import Finding, by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
-from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.loop.corrections import SINGLE_LOOP
+from px4fuse.loop.analysis import MIN_UNIX_TIME_S
+from px4fuse.loop.corrections import SINGLE_LOOP_REASON
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.report import style
 from px4fuse.report.cover import student_line, write_finding
@@ -186,7 +186,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     )
     for closure in loop.closures[:1]:
         page.write_labelled("Gate", describe_gate(closure))
-    single_loop_note = SINGLE_LOOP if len(loop.closures) == 1 else ""
+    single_loop_note = SINGLE_LOOP_REASON if len(loop.closures) == 1 else ""
     for text in (by_distance_sentence(loop), single_loop_note, *missing_corrections(loop)):
         page.write(text, colour=MUTED_COLOUR, above=2.0)
     for group in by_root(findings):
@@ -272,7 +272,7 @@ def write_scores(page: Page, loop: Loop) -> None:
 
 
 def _format_span(loop: Loop) -> str:
-    if loop.start_s > SMALLEST_STAMP_S:
+    if loop.start_s > MIN_UNIX_TIME_S:
         return f"{loop.end_s - loop.start_s:.1f} s from timestamp {loop.start_s:.2f} s"
     return f"{loop.start_s:.1f} s to {loop.end_s:.1f} s"
 
@@ -307,7 +307,7 @@ def closure_name(closure: Closure, loop: Loop) -> str:
     """Format the two times of a closure; UNIX timestamps are counted from the first pose."""
     if closure.source == LANDING:
         return "take-off and landing"
-    origin_s = loop.start_s if loop.start_s > SMALLEST_STAMP_S else 0.0
+    origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
     return f"{closure.time_1_s - origin_s:.2f} s and {closure.time_2_s - origin_s:.2f} s"
 
 
@@ -333,7 +333,7 @@ def missing_corrections(loop: Loop) -> list[str]:
         if isinstance(correction, Unavailable)
     ]
     reasons = [f"{correction.what}: {correction.reason}" for correction in unavailable]
-    return [reason for reason in dict.fromkeys(reasons) if SINGLE_LOOP not in reason]
+    return [reason for reason in dict.fromkeys(reasons) if SINGLE_LOOP_REASON not in reason]
 
 
 def _format_ate(score: Evaluation | Unavailable) -> str:
@@ -386,7 +386,7 @@ def graph_summary(solved: SolvedGraph) -> Page:
             else []
         )
         page.write_labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *lines)
-    if len(solved.solutions) == 1 and (~solved.graph.successive).sum() > MAX_ROBUST_CLOSURES:
+    if len(solved.solutions) == 1 and (~solved.graph.is_successive).sum() > MAX_ROBUST_CLOSURES:
         page.write_labelled(
             "Robust", "not solved for this many closures; add --robust (takes some minutes)"
         )

@@ -12,7 +12,7 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UnjudgedFilter,
 )
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, Consistency
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
@@ -153,12 +153,12 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         f"{filter_name} {axis} ({format_factor(consistency.sigma_error_factor)}×)"
         for axis, filter_name, consistency in consistencies
         if consistency.verdict != "consistent"
-        and consistency.sigma_error_factor < SIGMA_FACTOR_FINDING
+        and consistency.sigma_error_factor < MIN_FINDING_SIGMA_FACTOR
     ]
     if small_deviations:
         notes.append(
-            f"Inconsistent, but no finding, because σ is less than {SIGMA_FACTOR_FINDING:g}× too "
-            f"small or too large: {', '.join(small_deviations)}."
+            f"Inconsistent, but no finding, because σ is less than {MIN_FINDING_SIGMA_FACTOR:g}× "
+            f"too small or too large: {', '.join(small_deviations)}."
         )
     correlated = [
         f"{filter_name} {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"

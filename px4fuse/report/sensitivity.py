@@ -8,7 +8,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.filter.fitting import FIRST_WIDTH
+from px4fuse.filter.fitting import START_OUTLIER_WIDTH
 from px4fuse.filter.likelihood import FilterStates, filter_states, preintegrate, score_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
@@ -128,7 +128,7 @@ def _map_sentence(tuned_noises: AxisTuning) -> str:
     drop = format_number(
         max(tuned_noises.log_likelihood_gain_per_measurement * tuned_noises.count, 0.0), 2
     )
-    has_random_walk = tuned_noises.noises.walk_m > tuned_noises.noises.sigma_z_m
+    has_random_walk = tuned_noises.noises.random_walk_m > tuned_noises.noises.sigma_z_m
     walk_note = " The random walk of the source is not included." if has_random_walk else ""
     return (
         "Maximum-likelihood estimate: SIGMA_A "
@@ -165,7 +165,7 @@ def _log_likelihood_drop(
     ]
     preintegrated = [preintegrate(axis, comparison.settings) for axis in axes]
     time = axes[0].measurement_time_s[-len(preintegrated[0].measurement_m) :]
-    weight = np.where(np.isin(time, tuned_noises.outlier_time_s), FIRST_WIDTH**-2.0, 1.0)
+    weight = np.where(np.isin(time, tuned_noises.outlier_time_s), START_OUTLIER_WIDTH**-2.0, 1.0)
     total = score_grid(preintegrated, a[:, None], z[None, :], weight)
     return np.asarray(total - total.min())
 
