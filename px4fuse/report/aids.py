@@ -10,10 +10,9 @@ from px4fuse.ekf2.aids import AidResult, flight_span
 from px4fuse.findings import Finding
 from px4fuse.flight import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
-from px4fuse.report.cover import flight_line, write_findings
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
-from px4fuse.report.phrases import format_sigma_verdict
+from px4fuse.report.phrases import flight_line, format_sigma_verdict, write_findings
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults
 from px4fuse.text import format_number
@@ -68,6 +67,7 @@ def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Find
     page.write(f"No comparison with KF: {missing_data.reason}.", above=2.0)
     page.write(with_options(missing_data.remedy), colour=style.MUTED_COLOUR)
     write_aids(page, analysis.aids)
+    page.heading("Findings", 10.5, above=12.0)
     write_findings(page, findings)
 
 

@@ -63,7 +63,7 @@ def _write_legend(page: Page, analysis: Analysis) -> None:
     for name, frame in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
         if isinstance(frame, pd.DataFrame):
             lines.append(Line2D([], [], **LINES[name], label=name))
-    page.legend(lines, event_marks.legend_entries(analysis))
+    page.legend([*lines, *event_marks.legend_entries(analysis)])
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:

@@ -8,8 +8,9 @@ from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.report import clock, fonts
+from px4fuse.report.cover import ALL_FINDINGS
 from px4fuse.report.page import Page
-from px4fuse.report.phrases import describe_alignment, format_clock_map
+from px4fuse.report.phrases import describe_alignment, format_clock_map, write_findings
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
@@ -21,6 +22,9 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the provenance of a comparison."""
     flight, source = analysis.flight, analysis.source
     alignment = source.alignment
+    findings = Page(ALL_FINDINGS)
+    write_findings(findings, results.findings)
+    yield findings
     page = _start_page("Appendix: provenance", results)
     _write_log(page, flight, source)
     clocks = map(format_clock_map, flight.clocks)
