@@ -44,7 +44,7 @@ MAX_FILE_LENGTH = 56  # characters
 SIGNS = {"error": "■", "warning": "▲", "note": "●", "clean": "✓"}
 SEVERITY_WORDS = {"error": "ERROR", "warning": "WARNING", "note": "NOTE", "clean": "NO FAULT"}
 AXIS_TITLE = "Is the reported uncertainty right?"
-AXIS_TEXT = "RMS over all samples of actual ÷ reported"
+AXIS_TEXT = "RMS of actual ÷ reported"
 TERMS = (
     "Source: positions that both filters fuse. σ: reported standard deviation of the position. "
     "√S: of the innovation. KF: position and velocity along one axis, IMU acceleration as input, "

@@ -35,6 +35,7 @@ from px4fuse.report.page import (
     Page,
     halves,
     line_count,
+    text_width,
 )
 from px4fuse.report.style import LINES, Artist, Axes, draw_curve
 
@@ -43,12 +44,14 @@ MM = 72.0 / 25.4
 MIN_LONG_RATIO = 2.2
 # pt; heights of panels with their titles and labels
 MAP_HEIGHTS = 40.0 * MM, 53.0 * MM
+MIN_HALVES_HEIGHT = 50.0 * MM
 INNOVATION_HEIGHTS = 27.0 * MM, 38.0 * MM
 MIN_ERROR_HEIGHT = 17.0 * MM
 # pt; height of all panels if the card fills its page
 NEXT_PAGE_HEIGHT = 160.0 * MM
 # pt; title with its gaps, each further line of it, gap above the legend, and what is left free
-TITLE_HEIGHT, TITLE_LINE, LEGEND_GAP, SPARE = 15.0, 10.5, 11.0, 4.0
+TITLE_HEIGHT, TITLE_LINE, LEGEND_GAP, SPARE = 16.5, 10.5, 11.0, 4.0
+MIN_TICKS_HEIGHT = 48.0  # pt; lower axes of the innovations have ticks at -4, 0 and 4 only
 LEFT = 38.0  # pt; tick and axis labels left of the axes
 # Share of the free height for the innovations and for the map
 INNOVATION_SHARE, MAP_SHARE = 0.22, 0.25
@@ -56,9 +59,12 @@ MAX_DRAWN = 400  # innovations per filter; more are thinned evenly, those beyond
 MAX_NORMALISED = 4.0
 # pt; height below the axes, without and with labels of the x axis
 BELOW = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
-MAP_MARGIN = 1.08
+MAP_MARGIN, MAP_REACH, MIN_MAP_LENGTH_M = 1.08, 0.25, 0.5
+# Fraction of the map's length between two triangles of a track
+MIN_EXIT_DISTANCE = 0.02
 # A curve that fills less of its scale than this is called flat
 FLAT_SHARE = 0.1
+FLAT_INNOVATIONS = 1.0
 # σ is printed as one value if its largest is below this multiple of its smallest
 MAX_SIGMA_SPREAD = 1.5
 # Quantiles of σ in the titles: the first seconds, in which σ settles, do not count
@@ -70,6 +76,7 @@ INNOVATION_DOTS: Mapping[str, dict[str, Any]] = {
 }
 # Fraction of the axes: of marks closer than this, one is drawn
 MIN_MARK_DISTANCE = 1.0 / 150.0
+GAP_HATCH: dict[str, Any] = {**GAP_BAND, "facecolor": "none"}  # σ in the gap stays visible
 RESET_LINE: dict[str, Any] = {"color": style.EKF2_COLOUR, "lw": 1.0, "ls": (0, (1, 1))}
 REJECTED_MARK: dict[str, Any] = {
     "color": "black",
@@ -79,6 +86,7 @@ REJECTED_MARK: dict[str, Any] = {
     "ls": "none",
 }
 Coordinates = tuple[Array, Array]
+MapLimits = tuple[tuple[float, float], tuple[float, float]]
 DrawStrip = Callable[[Axes], None]
 
 
@@ -90,10 +98,14 @@ class Strip(NamedTuple):
 
 
 class FlightMap(NamedTuple):
-    """Flight from above: tracks (m, right and up), and the labels of both axes."""
+    """Flight from above: tracks (m, right and up), and the labels of both axes.
+
+    Of ``right_labels`` the first that fits is used.
+    """
 
     tracks: Mapping[str, Coordinates]
-    labels: tuple[str, str]
+    right_labels: Sequence[str]
+    up_label: str
     to_map: Callable[[Any, Any], Coordinates]
 
     @property
@@ -116,12 +128,13 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float | Non
     """
     page = Page()
     block["blocks"] = page.blocks
-    page.legend(_legend_entries(analysis))
+    legend = page.legend(_legend_entries(analysis))
     errors, innovations = _error_strips(analysis, card), _innovation_strip(analysis.main)
     flight_map = _flight_map(analysis, card)
-    rest = (free or 0.0) - page.blocks[0]["height"] - LEGEND_GAP - SPARE
-    if rest < INNOVATION_HEIGHTS[0] + MAP_HEIGHTS[0]:
+    rest = (free or 0.0) - legend["height"] - LEGEND_GAP - SPARE
+    if rest < MIN_HALVES_HEIGHT:
         rest = NEXT_PAGE_HEIGHT
+        page.blocks.insert(0, {"kind": "break"})
     least = MAP_HEIGHTS[0] + INNOVATION_HEIGHTS[0] + len(errors) * MIN_ERROR_HEIGHT
     innovation_height = float(np.clip(INNOVATION_SHARE * rest, *INNOVATION_HEIGHTS))
     if flight_map.is_long and rest >= least:
@@ -149,7 +162,7 @@ def _draw_strips(
     for strip, height in zip(strips, heights, strict=True):
         is_last = strip is strips[-1]
         axes_height = height - _head_height(page, strip.title) - BELOW[is_last]
-        axes = page.panel(strip.title, "", axes_height, above=1.0, left=LEFT, is_compact=True)
+        axes = page.panel(strip.title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
         axes.set_xlim(analysis.segment.start_s, analysis.segment.end_s)
         axes.locator_params(axis="x", nbins=6)
         strip.draw(axes)
@@ -221,7 +234,7 @@ def _error_drawing(
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-half_height, half_height)
-        _draw_sigma(axes, errors["sigma_m"], style.BANDS[name])
+        _draw_sigma(axes, errors["sigma_m"], name)
         axes.axhline(0.0, color="black", lw=0.5)
         draw_curve(axes, errors["error_m"], **LINES[name])
         _draw_spans(axes, analysis)
@@ -256,9 +269,9 @@ def _difference_strip(analysis: Analysis, card: Card) -> list[Strip]:
     def draw(axes: Axes) -> None:
         axes.set_ylim(-half_height, half_height)
         for name, sigma in sigmas.items():
-            _draw_sigma(axes, sigma, style.BANDS[name])
+            _draw_sigma(axes, sigma, name)
         axes.axhline(0.0, color="black", lw=0.5)
-        draw_curve(axes, difference, **LINES["KF"])
+        draw_curve(axes, difference, color="black", lw=1.0)
         _draw_spans(axes, analysis)
         _draw_ekf2_events(axes, analysis)
 
@@ -266,12 +279,12 @@ def _difference_strip(analysis: Analysis, card: Card) -> list[Strip]:
     return [Strip(f"KF − EKF2 (m): {title}", draw)]
 
 
-def _draw_sigma(axes: Axes, sigma: pd.Series[float], colour: str) -> None:
-    """Draw ±2σ; where it leaves the scale, a triangle and the largest value."""
+def _draw_sigma(axes: Axes, sigma: pd.Series[float], name: str) -> None:
+    """Draw ±2σ of a filter; where it leaves the scale, a triangle and the largest value."""
     known = sigma.dropna()
     if known.empty:
         return
-    style.draw_sigma_band(axes, 0.0 * known, known, colour)
+    style.draw_sigma_band(axes, 0.0 * known, known, style.BANDS[name])
     top = axes.get_ylim()[1]
     largest = 2.0 * float(known.max())
     if largest <= top:
@@ -282,7 +295,7 @@ def _draw_sigma(axes: Axes, sigma: pd.Series[float], colour: str) -> None:
     low, high = axes.get_xlim()
     is_right = at > 0.5 * (low + high)
     axes.annotate(
-        f"±2σ up to ±{format_metres(largest)} m",
+        f"±2σ of {name} up to ±{format_metres(largest)} m",
         (at, -top),
         xytext=(-6.0 if is_right else 6.0, 3.0),
         textcoords="offset points",
@@ -294,11 +307,11 @@ def _draw_sigma(axes: Axes, sigma: pd.Series[float], colour: str) -> None:
 
 def _draw_spans(axes: Axes, analysis: Analysis) -> None:
     for spans, band in (
-        (analysis.events.gaps, GAP_BAND),
+        (analysis.events.gaps, GAP_HATCH),
         (analysis.events.dropouts, DROPOUT_BAND),
     ):
         for start, end in spans:
-            axes.axvspan(start, end, **band, zorder=0.5)
+            axes.axvspan(start, end, **band, zorder=1.5)
 
 
 def _draw_ekf2_events(axes: Axes, analysis: Analysis) -> None:
@@ -352,19 +365,25 @@ def _innovation_strip(result: AxisComparison) -> Strip:
     }
     signs = {"KF": "●", "EKF2": "□"}
     beyond = [
-        f"{name} {format_ratio(largest)}"
+        f"{name} {format_ratio(size)}"
         for name, values in series.items()
-        if len(values) and (largest := float(values.abs().max())) > MAX_NORMALISED
+        if len(values) and (size := float(values.abs().max())) > MAX_NORMALISED
     ]
     strides = {name: -(-len(values) // MAX_DRAWN) for name, values in series.items()}
     marks = ", ".join(f"{signs[name]} {name}" for name in series)
     title = f"Innovations ÷ √S ({marks}): 95 % belong inside ±2"
+    largest = max(
+        (float(values.abs().max()) for values in series.values() if len(values)), default=0
+    )
+    if largest < FLAT_INNOVATIONS:
+        title += f"; all are inside ±{format_ratio(largest)}"
     if beyond:
         title += f"; ▲▼ beyond ±{MAX_NORMALISED:g}, up to {', '.join(beyond)}"
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-1.12 * MAX_NORMALISED, 1.12 * MAX_NORMALISED)
-        axes.set_yticks([-4.0, -2.0, 0.0, 2.0, 4.0])
+        height = axes.bbox.height * 72.0 / axes.figure.dpi
+        axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_TICKS_HEIGHT else 4.0))
         axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.5)
         axes.axhline(0.0, color="black", lw=0.5)
         for name in reversed(series):
@@ -407,19 +426,21 @@ def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
     """Return the map along the aisle, at a heading below 180°; else north up."""
     aisle = next((line for line in analysis.lines if line.name == AISLE), None)
-    heading, labels = np.pi / 2.0, ("east (m)", "north (m)")
+    heading, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
     if aisle is not None and aisle.heading_deg is not None:
-        along = card.effect.axis if card.effect else "along the aisle"
-        heading, labels = np.deg2rad(aisle.heading_deg % 180.0), (f"{along} (m)", "left (m)")
+        heading, up_label = np.deg2rad(aisle.heading_deg % 180.0), "left (m)"
+        axis = card.effect.axis if card.effect else "along the aisle"
+        right_labels = [f"{text} (m)" for text in (axis, axis.partition(", ")[2], "main axis")]
     elif analysis.source.frame == "FRD":
-        labels = (f"y of {analysis.source.name} (m)", f"x of {analysis.source.name} (m)")
+        name = analysis.source.name
+        right_labels, up_label = [f"y of {name} (m)", "y (m)"], f"x of {name} (m)"
     c, s = np.cos(heading), np.sin(heading)
 
     def to_map(north: Any, east: Any) -> Coordinates:
         return c * north + s * east, s * north - c * east
 
     tracks = {name: to_map(*track) for name, track in _tracks(analysis).items()}
-    return FlightMap(tracks, labels, to_map)
+    return FlightMap(tracks, right_labels, up_label, to_map)
 
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
@@ -431,10 +452,9 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         title = f"Map; triangles: {leaving} outside"
         axes_height = height - _head_height(page, title) - BELOW[True]
         limits = _map_limits(tracks, width / axes_height)
-    axes = page.panel(title, "", axes_height, above=1.0, left=LEFT, is_compact=True)
-    axes.set(
-        xlim=limits[0], ylim=limits[1], xlabel=flight_map.labels[0], ylabel=flight_map.labels[1]
-    )
+    axes = page.panel(title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
+    right_label = next(text for text in flight_map.right_labels if text_width(text) < page.width)
+    axes.set(xlim=limits[0], ylim=limits[1], xlabel=right_label, ylabel=flight_map.up_label)
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(True, axis="both")
     for name, (right, up) in tracks.items():
@@ -456,9 +476,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
             axes.plot(*place, **{**mark, "ms": 9.0, "mec": "white", "mew": 0.8, "zorder": 3.0})
 
 
-def _leaving(
-    tracks: Mapping[str, Coordinates], limits: tuple[tuple[float, float], tuple[float, float]]
-) -> str:
+def _leaving(tracks: Mapping[str, Coordinates], limits: MapLimits) -> str:
     """Format the tracks that leave the map, each with its largest distance outside."""
     sizes = {name: _distance_outside(track, limits) for name, track in tracks.items()}
     return ", ".join(
@@ -470,22 +488,22 @@ def _track_colour(name: str) -> str:
     return style.MEASUREMENT_COLOUR if name == "positions" else str(LINES[name]["color"])
 
 
-def _map_limits(
-    tracks: Mapping[str, Coordinates], ratio: float
-) -> tuple[tuple[float, float], tuple[float, float]]:
+def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> MapLimits:
     """Return the limits of both map axes at equal scales.
 
-    They show all ground truth and 98 % of the positions in each direction; a filter that is far
-    off does not shrink the flight.
+    They show all ground truth and 98 % of the positions, and the other tracks up to
+    :data:`MAP_REACH` outside of these; a filter that is far off does not shrink the flight.
     """
     spans = []
     for side in (0, 1):
         ends = [np.percentile(tracks["positions"][side], (1.0, 99.0))]
         if "ground truth" in tracks:
-            values = tracks["ground truth"][side]
-            ends.append(np.array([np.nanmin(values), np.nanmax(values)]))
+            ends.append(_ends(tracks["ground truth"][side]))
+        reach = MAP_REACH * (np.max(ends) - np.min(ends))
+        shown = np.min(ends) - reach, np.max(ends) + reach
+        ends += [np.clip(_ends(track[side]), *shown) for track in tracks.values()]
         low, high = np.min(ends), np.max(ends)
-        spans.append((0.5 * (low + high), max(MAP_MARGIN * (high - low), 0.5)))
+        spans.append((0.5 * (low + high), max(MAP_MARGIN * (high - low), MIN_MAP_LENGTH_M)))
     (x, length), (y, breadth) = spans
     length = max(length, breadth * ratio)
     breadth = length / ratio
@@ -495,32 +513,38 @@ def _map_limits(
     )
 
 
+def _ends(values: Array) -> Array:
+    return np.array([np.nanmin(values), np.nanmax(values)])
+
+
 def _overshoot(values: Array, limits: tuple[float, float]) -> Array:
     """Return the signed distance beyond limits; 0 inside."""
     return np.asarray(values - np.clip(values, *limits))
 
 
-def _distance_outside(
-    track: Coordinates, limits: tuple[tuple[float, float], tuple[float, float]]
-) -> float:
+def _distance_outside(track: Coordinates, limits: MapLimits) -> float:
     return max(
         float(np.nanmax(np.abs(_overshoot(values, ends))))
         for values, ends in zip(track, limits, strict=True)
     )
 
 
-def _exits(
-    track: Coordinates, limits: tuple[tuple[float, float], tuple[float, float]]
-) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Yield a triangle and its place on the frame for each time that a track leaves the map."""
+def _exits(track: Coordinates, limits: MapLimits) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Yield a triangle and its place on the frame where a track leaves or enters the map."""
     over = [_overshoot(values, ends) for values, ends in zip(track, limits, strict=True)]
     is_outside = (over[0] != 0.0) | (over[1] != 0.0)
-    first = np.flatnonzero(is_outside & ~np.concatenate(([False], is_outside[:-1])))
-    for index in first:
+    changes = np.flatnonzero(np.diff(is_outside, prepend=False, append=False))
+    spacing = MIN_EXIT_DISTANCE * (limits[0][1] - limits[0][0])
+    last = np.full(2, np.inf)
+    for change in changes:
+        # the outside sample next to the change
+        index = change if change < len(is_outside) and is_outside[change] else change - 1
         x, y = over[0][index], over[1][index]
         marker = ("^" if y > 0.0 else "v") if abs(y) >= abs(x) else (">" if x > 0.0 else "<")
-        place = [float(np.clip(track[side][index], *limits[side])) for side in (0, 1)]
-        yield marker, (place[0], place[1])
+        place = np.array([np.clip(track[side][index], *limits[side]) for side in (0, 1)])
+        if np.abs(place - last).max() >= spacing:
+            yield marker, (float(place[0]), float(place[1]))
+            last = place
 
 
 # -------------------------------------------------------------------------------------- legend
@@ -547,7 +571,7 @@ def _legend_entries(analysis: Analysis) -> list[Artist]:
     entries += [Line2D([], [], **mark, label=label) for label, found, mark in marks if len(found)]
     bands: Sequence[tuple[str, Any, dict[str, Any]]] = (
         ("±2σ reported", names, {"facecolor": "#c9c9c9", "lw": 0.0}),
-        ("gap", events.gaps, GAP_BAND),
+        ("gap", events.gaps, GAP_HATCH),
         ("log dropout", events.dropouts, DROPOUT_BAND),
     )
     entries += [Patch(**band, label=label) for label, found, band in bands if len(found)]

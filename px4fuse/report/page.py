@@ -18,7 +18,7 @@ PAGE_WIDTH, AXIS_LEFT, LABEL_WIDTH = 178.0 * 72.0 / 25.4, 30.0, 52.0
 # points; gap between two columns of 86.5 mm, margin right of axes
 COLUMN_GAP, AXES_RIGHT = 5.0 * 72.0 / 25.4, 8.0
 # points; of a legend: height of a line, and width of the line and the gaps of an entry
-LEGEND_LINE, LEGEND_HANDLE = 12.0, 32.0
+LEGEND_LINE, LEGEND_HANDLE = 12.0, 30.0
 # points; heights below axes for tick labels, for the axis label, and without tick labels
 TICKS_HEIGHT, AXIS_LABEL_HEIGHT, UNLABELLED_HEIGHT = 12.0, 11.0, 3.0
 ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"  # printed, although str.isprintable is False
@@ -230,9 +230,10 @@ def text_width(text: str, size: float = 8.0) -> float:
     from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     font = font_manager.get_font(font_manager.findfont(FONT))
-    font.set_size(size, 72.0)
+    # at a large size, because glyphs of a small one are rounded to whole points
+    font.set_size(100.0, 72.0)
     font.set_text(text, 0.0)
-    return float(font.get_width_height()[0]) / 64.0
+    return float(font.get_width_height()[0]) / 64.0 * size / 100.0
 
 
 def line_count(text: str, width: float, size: float = 8.0) -> int:
