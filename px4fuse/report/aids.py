@@ -121,14 +121,12 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         ],
         rows,
         right=(2, 3, 4, 5, 7, 8, 10),
-        size=6.8,
     )
     disabled_labels = [aid.label for aid in aids.values() if aid.verdict == "disabled"]
     if disabled_labels:
         page.write(
             f"Disabled in flight (logged, never fused): {', '.join(disabled_labels)}.",
             colour=style.MUTED_COLOUR,
-            size=7.0,
         )
 
 

@@ -16,11 +16,10 @@ from px4fuse.flight import Unavailable
 from px4fuse.record import Span
 from px4fuse.report import event_marks, panels, style
 from px4fuse.report.difference_page import unexplained_note
-from px4fuse.report.page import PAGE_WIDTH, Page
+from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import filters_by_name, format_verdict, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
 
-COLUMN_GAP = 14.0  # points between columns
 ZOOM_UPDATES = 15
 MIN_ZOOM_S = 1.0
 ZOOM_HEIGHT = 125.0  # points; height of the axes
@@ -194,8 +193,8 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         if isinstance(result.difference, Difference):
             verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
         column.heading(result.axis.name)
-        column.write(f"{verdicts}.", size=7.5)
-    page.add_columns(*columns, gap=COLUMN_GAP)
+        column.write(f"{verdicts}.")
+    page.add_columns(*columns)
     shown_panels = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
     if any(isinstance(panels.error_reference(axis), pd.DataFrame) for axis in others):
         shown_panels.insert(2, panels.ERROR)
@@ -205,5 +204,5 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
             panel.draw_on_page(
                 column, analysis, result, with_time_label=panel is shown_panels[-1], is_narrow=True
             )
-        page.add_columns(*columns, gap=COLUMN_GAP)
+        page.add_columns(*columns)
     yield page

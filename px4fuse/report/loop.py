@@ -247,7 +247,7 @@ def write_scores(page: Page, loop: Loop) -> None:
             score.reason for score in scores.values() if isinstance(score, Unavailable)
         )
         for reason in dict.fromkeys(missing_reasons):
-            page.write(reason, size=7.5)
+            page.write(reason)
         if not evaluations:
             continue
         first_evaluation = next(iter(evaluations.values()))

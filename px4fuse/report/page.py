@@ -70,7 +70,7 @@ class Page:
 
     def write_small(self, text: str) -> None:
         """Write a text in small print, such as the numbers of the panel above."""
-        self.write(text, size=7.0, colour=MUTED_COLOUR, above=-1.0)
+        self.write(text, colour=MUTED_COLOUR, above=-1.0)
 
     def write_labelled(
         self,
@@ -101,7 +101,7 @@ class Page:
         *,
         column_widths: Sequence[float] | None = None,
         right: Sequence[int] = (),
-        size: float = 7.4,
+        size: float = 8.0,
     ) -> None:
         """Write a table.
 

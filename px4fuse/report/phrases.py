@@ -296,13 +296,12 @@ def write_finding(page: Page, group: list[Finding]) -> None:
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
     texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
     if finding.remedy:
-        texts.append(styled_text(f"Action: {finding.remedy}", 7.5, MUTED_COLOUR))
+        texts.append(styled_text(f"Action: {finding.remedy}", 8.0, MUTED_COLOUR))
     if consequences:
-        texts.append(styled_text(format_consequences(consequences), 7.5, MUTED_COLOUR))
+        texts.append(styled_text(format_consequences(consequences), 8.0, MUTED_COLOUR))
     page.write_labelled(
         f"{finding.severity}\n{finding.when}".strip(),
         *texts,
-        size=7.0,
         above=2.0,
         colour=SEVERITY_COLOURS[finding.severity],
     )
