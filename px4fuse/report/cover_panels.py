@@ -67,8 +67,7 @@ FLAT_SHARE = 0.1
 FLAT_INNOVATIONS = 1.0
 # σ is printed as one value if its largest is below this multiple of its smallest
 MAX_SIGMA_SPREAD = 1.5
-# Quantiles of σ in the titles: the first seconds, in which σ settles, do not count
-SIGMA_QUANTILES = [0.02, 0.98]
+SETTLING_S = 2.0  # at the start, σ settles; its values do not count in the titles
 # Markers of the innovations, as in the title
 INNOVATION_DOTS: Mapping[str, dict[str, Any]] = {
     "KF": style.KF_DOTS,
@@ -219,9 +218,10 @@ def _error_title(
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
     known = sigma.dropna()
+    known = known[known.index >= known.index.min() + SETTLING_S]
     if known.empty:
         return ""
-    low, high = known.quantile(SIGMA_QUANTILES).tolist()
+    low, high = float(known.min()), float(known.max())
     if high < MAX_SIGMA_SPREAD * low:
         return format_metres(float(known.median()))
     return f"{format_metres(low)} to {format_metres(high)}"
@@ -302,6 +302,7 @@ def _draw_sigma(axes: Axes, sigma: pd.Series[float], name: str) -> None:
         ha="right" if is_right else "left",
         va="bottom",
         size=8.0,
+        bbox={"facecolor": "white", "alpha": 0.8, "lw": 0.0, "pad": 1.0},
     )
 
 

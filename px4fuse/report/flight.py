@@ -183,7 +183,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         "Appendix: other axes",
         "The same panels for the other axes, with the same lines, bands and marks.",
     )
-    width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 3)
+    width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 2)
     columns = [Page(width=width) for _ in others]
     for column, result in zip(columns, others, strict=True):
         verdicts = "; ".join(

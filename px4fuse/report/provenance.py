@@ -89,7 +89,9 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
         "file": f"{log.name}, {log.bytes} bytes, {log.format}",
         "SHA-256": log.sha256,
     }
-    _write_section(page, "Log", facts.items())
+    section = Page()
+    _write_section(section, "Log", facts.items())
+    page.add_columns(section)  # one column is not divided
 
 
 def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
