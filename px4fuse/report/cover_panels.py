@@ -29,6 +29,8 @@ from px4fuse.report.event_marks import (
 from px4fuse.report.page import (
     AXES_RIGHT,
     AXIS_LABEL_HEIGHT,
+    COLUMN_GAP,
+    PAGE_WIDTH,
     TICKS_HEIGHT,
     UNLABELLED_HEIGHT,
     Block,
@@ -44,7 +46,8 @@ MM = 72.0 / 25.4
 MIN_LONG_RATIO = 2.2
 # pt; heights of panels with their titles and labels
 MAP_HEIGHTS = 40.0 * MM, 53.0 * MM
-MIN_HALVES_HEIGHT = 50.0 * MM
+# pt; least heights of all panels in two columns and in three
+MIN_HALVES_HEIGHT, MIN_THIRDS_HEIGHT = 50.0 * MM, 38.0 * MM
 INNOVATION_HEIGHTS = 27.0 * MM, 38.0 * MM
 MIN_ERROR_HEIGHT = 17.0 * MM
 # pt; height of all panels if the card fills its page
@@ -52,6 +55,7 @@ NEXT_PAGE_HEIGHT = 160.0 * MM
 # pt; title with its gaps, each further line of it, gap above the legend, and what is left free
 TITLE_HEIGHT, TITLE_LINE, LEGEND_GAP, SPARE = 16.5, 10.5, 11.0, 4.0
 MIN_TICKS_HEIGHT = 48.0  # pt; lower axes of the innovations have ticks at -4, 0 and 4 only
+MIN_WIDE = 200.0  # pt; narrower panels have fewer ticks
 LEFT = 38.0  # pt; tick and axis labels left of the axes
 # Share of the free height for the innovations and for the map
 INNOVATION_SHARE, MAP_SHARE = 0.22, 0.25
@@ -131,7 +135,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float | Non
     errors, innovations = _error_strips(analysis, card), _innovation_strip(analysis.main)
     flight_map = _flight_map(analysis, card)
     rest = (free or 0.0) - legend["height"] - LEGEND_GAP - SPARE
-    if rest < MIN_HALVES_HEIGHT:
+    if rest < MIN_THIRDS_HEIGHT:
         rest = NEXT_PAGE_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
     least = MAP_HEIGHTS[0] + INNOVATION_HEIGHTS[0] + len(errors) * MIN_ERROR_HEIGHT
@@ -143,15 +147,18 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float | Non
         heights = [error_height] * len(errors) + [innovation_height]
         _draw_strips(page, analysis, [*errors, innovations], heights)
         return
-    left, right = halves()
-    if errors:
-        _draw_map(left, analysis, flight_map, rest - innovation_height)
-        _draw_strips(left, analysis, [innovations], [innovation_height])
-        _draw_strips(right, analysis, errors, [rest / len(errors)] * len(errors))
-    else:
-        _draw_map(left, analysis, flight_map, rest)
-        _draw_strips(right, analysis, [innovations], [rest])
-    page.add_columns(left, right, above=0.0)
+    columns = list(halves())
+    left_strips = [innovations] if errors else []
+    if errors and rest < MIN_HALVES_HEIGHT:
+        columns = [Page(width=(PAGE_WIDTH - 2.0 * COLUMN_GAP) / 3.0) for _ in range(3)]
+        _draw_strips(columns[2], analysis, left_strips, [rest])
+        left_strips = []
+    heights = [innovation_height] * len(left_strips)
+    _draw_map(columns[0], analysis, flight_map, rest - sum(heights))
+    _draw_strips(columns[0], analysis, left_strips, heights)
+    strips = errors or [innovations]
+    _draw_strips(columns[1], analysis, strips, [rest / len(strips)] * len(strips))
+    page.add_columns(*columns, above=0.0)
 
 
 def _draw_strips(
@@ -163,7 +170,7 @@ def _draw_strips(
         axes_height = height - _head_height(page, strip.title) - BELOW[is_last]
         axes = page.panel(strip.title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
         axes.set_xlim(analysis.segment.start_s, analysis.segment.end_s)
-        axes.locator_params(axis="x", nbins=6)
+        axes.locator_params(axis="x", nbins=6 if page.width > MIN_WIDE else 4)
         strip.draw(axes)
         style.label_time_axis(axes, is_last)
 
