@@ -143,9 +143,10 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float | Non
     if flight_map.is_long and rest >= least:
         map_height = float(np.clip(MAP_SHARE * rest, *MAP_HEIGHTS))
         _draw_map(page, analysis, flight_map, map_height)
-        error_height = (rest - map_height - innovation_height) / max(len(errors), 1)
-        heights = [error_height] * len(errors) + [innovation_height]
-        _draw_strips(page, analysis, [*errors, innovations], heights)
+        heights = _equal_heights(
+            page, errors, rest - map_height - innovation_height, is_labelled=False
+        )
+        _draw_strips(page, analysis, [*errors, innovations], [*heights, innovation_height])
         return
     columns = list(halves())
     left_strips = [innovations] if errors else []
@@ -157,7 +158,8 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float | Non
     _draw_map(columns[0], analysis, flight_map, rest - sum(heights))
     _draw_strips(columns[0], analysis, left_strips, heights)
     strips = errors or [innovations]
-    _draw_strips(columns[1], analysis, strips, [rest / len(strips)] * len(strips))
+    heights = _equal_heights(columns[1], strips, rest, is_labelled=True)
+    _draw_strips(columns[1], analysis, strips, heights)
     page.add_columns(*columns, above=0.0)
 
 
@@ -173,6 +175,20 @@ def _draw_strips(
         axes.locator_params(axis="x", nbins=6 if page.width > MIN_WIDE else 4)
         strip.draw(axes)
         style.label_time_axis(axes, is_last)
+
+
+def _equal_heights(
+    page: Page, strips: Sequence[Strip], total: float, *, is_labelled: bool
+) -> list[float]:
+    """Return heights of strips that add up to a total (pt), with axes of equal height.
+
+    If ``is_labelled``, the last strip has the labels of the time axis.
+    """
+    extras = [_head_height(page, strip.title) + BELOW[False] for strip in strips]
+    if is_labelled:
+        extras[-1] += BELOW[True] - BELOW[False]
+    axes_height = (total - sum(extras)) / max(len(strips), 1)
+    return [axes_height + extra for extra in extras]
 
 
 def _head_height(page: Page, title: str) -> float:
@@ -461,7 +477,9 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         axes_height = height - _head_height(page, title) - BELOW[True]
         limits = _map_limits(tracks, width / axes_height)
     axes = page.panel(title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
-    right_label = next(text for text in flight_map.right_labels if text_width(text) < page.width)
+    right_label = next(
+        text for text in flight_map.right_labels if text_width(text) < page.width - LEFT
+    )
     axes.set(xlim=limits[0], ylim=limits[1], xlabel=right_label, ylabel=flight_map.up_label)
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(True, axis="both")
