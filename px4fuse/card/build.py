@@ -7,7 +7,7 @@ from importlib import metadata
 from msgspec.structs import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.causes import FILTER_NAMES, RankedCause, make_cause, rank_causes
+from px4fuse.card.causes import FILTER_NAMES, RankedCause, improvement, make_cause, rank_causes
 from px4fuse.card.model import (
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
@@ -36,6 +36,7 @@ MAX_NOTES = 3
 MAX_ACTIONS = 3
 # Rejected fraction and resets from which the effect names them
 MIN_NAMED_REJECTION = 0.01
+BETTER_POSITION = ("position and σ", "position")
 NO_FAULT = "No fault found: KF and EKF2 are consistent"
 # Findings of a source whose errors the innovations cannot show
 SHIFTED_SOURCE = frozenset(
@@ -78,7 +79,7 @@ def build_card(
         effect_text=_effect_text(analysis, effect, verdicts),
         do_this=_do_this(causes),
         verdicts=verdicts,
-        reconcile=_reconcile(analysis, verdicts, [one.id for one in findings]),
+        reconcile=_reconcile(analysis, verdicts, causes, [one.id for one in findings]),
         difference=_difference(effect, ranked),
         causes=causes,
         more_causes=max(len(ranked) - MAX_CAUSES, 0),
@@ -257,12 +258,23 @@ def _mark_explained(verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> tup
     )
 
 
-def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], ids: Sequence[str]) -> str:
-    """Explain two verdicts of one filter that differ."""
+def _reconcile(
+    analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause], ids: Sequence[str]
+) -> str:
+    """Explain two verdicts of one filter that differ, or ratios of which one is far larger."""
+    corrected = {
+        "ekf2" if rerun.is_prediction else "kf"
+        for cause in causes[:1]
+        for rerun in cause.reruns
+        if rerun.improves == "position and σ"
+    }
     differing = [
         owner
         for owner in FILTER_NAMES
-        if _differ(*(verdict for verdict in verdicts if verdict.filter == owner))
+        if _differ(
+            *(verdict for verdict in verdicts if verdict.filter == owner),
+            is_corrected=owner in corrected,
+        )
     ]
     if not differing:
         return ""
@@ -290,10 +302,11 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], ids: Sequence[st
     return "The two verdicts differ, and no tested change explains it."
 
 
-def _differ(source: Verdict, truth: Verdict) -> bool:
+def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
     if source.ratio is None or truth.ratio is None:
         return False
-    return source.word != truth.word or truth.ratio > 2.0 * source.ratio
+    is_far_larger = truth.ratio > 2.0 * source.ratio and not is_corrected
+    return source.word != truth.word or is_far_larger
 
 
 def _gate_sentence(analysis: Analysis) -> str:
@@ -318,14 +331,16 @@ def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
         return ""
     text = f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
     trials = ranked[0].trials
-    owners = {trial.filter for trial in trials}
+    owners = {trial.filter for trial in trials if improvement(trial) in BETTER_POSITION}
     if len(owners) == 2:
         return f"{text}. Both filters have the fault, so this difference does not show it."
-    after = [trial.after.difference_rms_m for trial in trials]
-    if not after or after[0] is None:
+    after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
+    owner: FilterName = "ekf2" if owners == {"ekf2"} or set(after) == {"ekf2"} else "kf"
+    after_m = after.get(owner)
+    if after_m is None:
         return f"{text}."
-    predicted = "predicted " if owners == {"ekf2"} else ""
-    return f"{text}; {format_metres(after[0])} m {predicted}after the fix."
+    predicted = "predicted " if owner == "ekf2" else ""
+    return f"{text}; {format_metres(after_m)} m {predicted}after the fix."
 
 
 def _notes(roots: Sequence[Finding]) -> tuple[Note, ...]:
@@ -362,16 +377,12 @@ def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
         ("sigma_z_m", "SIGMA_Z", "m"),
         ("dt_s", "DT", "s"),
     ):
-        origin = (
-            "default" if (getattr(chosen, name) == getattr(Settings(), name)) else "set by option"
-        )
-        if (
-            name == "sigma_z_m"
-            and request.sigma_z_m is None
-            and not (getattr(chosen, name) == getattr(Settings(), name))
-        ):
+        value, origin = getattr(chosen, name), "set by option"
+        if value == getattr(Settings(), name):
+            origin = "default"
+        elif name == "sigma_z_m" and request.sigma_z_m is None:
             origin = f"from {aid_of(analysis).noise}"
-        texts.append(f"{label} {getattr(chosen, name):g} {unit} ({origin})")
+        texts.append(f"{label} {value:g} {unit} ({origin})")
     return ", ".join(texts)
 
 

@@ -476,7 +476,9 @@ def _try_on_main_axis(changed: _FilterChanges) -> list[Trial]:
     def run(change: Change) -> Trial:
         return Trial(
             filter=owner,
-            kinds=tuple(
+            kinds=("defaults",)
+            if change == changed.default_change()
+            else tuple(
                 dict.fromkeys(
                     changed.kind_of(name) for name in change if name not in ACCOMPANYING_CHANGES
                 )
@@ -568,6 +570,10 @@ class _FilterChanges:
         """Time (s) from which a re-run is evaluated; None for the whole segment."""
         return None
 
+    def default_change(self) -> Change:
+        """Return the change to the default settings; empty if there is none."""
+        return {}
+
     def flown_outcome(self, result: AxisComparison) -> Outcome | None:
         """Return the statistics as flown, of the same samples as a re-run.
 
@@ -633,14 +639,18 @@ class _KfChanges(_FilterChanges):
         noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
         if len(noises) > 1:
             changes.append({name: value for change in noises for name, value in change.items()})
+        defaults = self.default_change()
+        return [*changes, *([defaults] if defaults and noises else [])]
+
+    def default_change(self) -> Change:
+        """Return the default of each noise that was set; SIGMA_Z of GNSS is that of EKF2."""
         chosen, default = self.comparison.settings, Settings()
         names = (SIGMA_A,) if self.comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
-        defaults = {
+        return {
             name: getattr(default, name)
             for name in names
             if getattr(chosen, name) != getattr(default, name)
         }
-        return [*changes, *([defaults] if defaults and noises else [])]
 
     def noise_candidates(
         self, statement: FilterSummary, tuned: AxisTuning, over: bool

@@ -235,6 +235,8 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
     sides = f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks()}")
+    if any(verdict.is_explained for verdict in card.verdicts):
+        yield Line("  In brackets: explained below, nothing has to be changed.")
     for verdict in card.verdicts:
         yield _verdict_line(verdict)
 
@@ -245,7 +247,7 @@ def _verdict_line(verdict: Verdict) -> Line:
     head = f"  {owner:4} {quantity:25}"
     if verdict.ratio is None:
         return Line(f"{head}{'–':>7}  not evaluated: {verdict.reason}")
-    word = f"{verdict.word}{' (explained)' if verdict.is_explained else ''}"
+    word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{head}{format_ratio(verdict.ratio):>7}  {word}"
     is_loud = verdict.word != "consistent" and not verdict.is_explained
     style = "bold" if is_loud else ""
