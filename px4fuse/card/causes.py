@@ -146,9 +146,7 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
     kinds |= {"defaults"} if "noises" in kinds else set()
     best: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in kinds | (
-            {"defaults"} & _default_kind(kinds)
-        ):
+        if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
             key = trial.filter, trial.kinds[0]
             best[key] = min(trial, best.get(key, trial), key=_preference)
     return tuple(best.values())
