@@ -25,11 +25,11 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
     input.
     """
     from px4fuse.fleet.changes import diff as compared
-    from px4fuse.fleet.terminal import differences
+    from px4fuse.fleet.terminal import format_differences
 
     outputs.check_targets([json_path])  # fail early if the output cannot be written
     with outputs.progress(json_path) as step:
         results = compared(a, b, progress=step)
-    outputs.write_and_print(outputs.result_files(results, json_path), differences(results))
+    outputs.write_and_print(outputs.result_files(results, json_path), format_differences(results))
     if results.worse:
         sys.exit(1)
