@@ -25,7 +25,7 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import ResultsError
 from px4fuse.grading.model import GradedReport
-from px4fuse.grading.rubric import Rubric, assess, read_rubric, refused_report
+from px4fuse.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
 from px4fuse.report import pdf as pdf_module
 from px4fuse.results.contract import Reported
 from px4fuse.simulation import flights
@@ -69,10 +69,12 @@ class Flight:
         self, report: Reported | ResultsError, verdict: Verdict, rubric: Rubric
     ) -> GradedReport:
         if isinstance(report, ResultsError):
-            made = refused_report(rubric, self.key, f"{report.reason}.", report.remedy)
-            return GradedReport("a.pdf", "", "", verdict, made.items, pending=made.pending)
-        made = assess(report, verdict, rubric, self.key)
-        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
+            made = grade_unreadable(rubric, self.key, f"{report.reason}.", report.remedy)
+            return GradedReport(
+                "a.pdf", "", "", verdict, made.items, pending_action=made.pending_action
+            )
+        made = score_report(report, verdict, rubric, self.key)
+        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending_action)
 
     def with_notes(self, text: str, rubric: Rubric) -> GradedReport:
         """As if the report had been made with these notes, which verifies."""
@@ -127,9 +129,9 @@ def honest(flight: Flight, rubric: Rubric) -> GradedReport:
 
 def test_the_honest_report_is_verified_and_names_both(honest: GradedReport) -> None:
     assert honest.status == "verified"
-    assert honest.pending == ""
+    assert honest.pending_action == ""
     assert honest.flags == ()
-    points = {item.title: item.points / item.of for item in honest.items}
+    points = {item.title: item.points / item.max_points for item in honest.items}
     assert points["Mistakes of the flight"] > 0.4, honest.items
 
 
@@ -231,11 +233,11 @@ def test_files(
         report, verdict = error, cannot_verify(str(error))
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
-    assert not graded.counted
+    assert not graded.counted_points
     assert graded.status == status
     assert not any("Error" in reason for reason in graded.verdict.reasons), graded.verdict.reasons
-    assert pending in graded.pending
-    assert bool(graded.pending) == bool(pending)
+    assert pending in graded.pending_action
+    assert bool(graded.pending_action) == bool(pending)
     assert graded.points <= honest.points + 1e-9
 
 
@@ -249,7 +251,7 @@ def test_pages_that_were_painted_over(flight: Flight, honest: GradedReport, rubr
     assert graded.points == honest.points
     for rule, counted in (("pending", None), ("zero", 0.0)):
         strict = flight.graded(report_of(pdf), verdict, replace(rubric, pages=rule))
-        assert strict.counted == counted
+        assert strict.counted_points == counted
 
 
 # ------------------------------------------------------------------ loops
@@ -272,9 +274,9 @@ def looped(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> GradedR
     results = decoded(changed(LOOP, student__id="s01", **values))
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
-    made = assess(results, verdict, read_rubric(None), key)
+    made = score_report(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "Loop" in item.title)
-    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.pending)
+    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.pending_action)
 
 
 LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}

@@ -64,7 +64,7 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
         [handed_in, tmp_path / "more.zip"], Course(read_rubric(None)), output, processes=1
     )
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)} == before
-    assert len(outcome.graded) == 6
+    assert len(outcome.reports) == 6
     text = (output / "class.csv").read_text(encoding="utf-8-sig")
     table = list(csv.DictReader(io.StringIO(text)))
     assert len(table) == 6
@@ -96,9 +96,9 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
     )
     (only,) = grade(
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
-    ).graded
+    ).reports
     assert only.status == "cannot verify"
-    assert only.pending.startswith("Ask for the PDF that px4fuse wrote")
+    assert only.pending_action.startswith("Ask for the PDF that px4fuse wrote")
     assert any("not compared within the limits" in flag for flag in only.flags)
 
 
@@ -114,7 +114,7 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     (folder / "c.pdf").write_bytes(forged(pdf, lambda writer: writer.remove_page(7)))
     output = tmp_path / "class"
     outcome = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
-    first, second, third = outcome.graded
+    first, second, third = outcome.reports
     assert first.verdict.status == "verified"
     assert first.verdict.with_log
     assert first.numbers["SIGMA_Z (m)"] == 0.1
@@ -136,8 +136,8 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     assert first.flags == ()
     # a second run does nothing again, and says the same
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
-    assert again.reused == 3
-    assert again.graded == outcome.graded
+    assert again.reused_count == 3
+    assert again.reports == outcome.reports
 
 
 @pytest.mark.usefixtures("at_once")
@@ -150,7 +150,7 @@ def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
             Course(read_rubric(None), title=title),
             output,
             processes=2,
-        ).reused
+        ).reused_count
 
     assert reused() == 2  # of one report there are three copies
     assert reused("Lab 4") == 3  # what is no report is read again
@@ -177,7 +177,7 @@ def test_another_log_at_hand_verifies_again(tmp_path) -> None:
         outcome = grade(
             [tmp_path / "in"], Course(read_rubric(None), logs=logs), tmp_path / "out", processes=1
         )
-        said.append((outcome.graded[0].verdict.status, outcome.reused))
+        said.append((outcome.reports[0].verdict.status, outcome.reused_count))
         # the redrawn report, and nothing of the run before
         assert len([*(tmp_path / "out" / "records").glob("*.p*")]) == len(logs)
     assert said == [
@@ -196,11 +196,11 @@ def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tm
     for given, status in ((sha256, "cannot verify"), ("0" * 64, "other log")):
         key = AnswerKey("aisle", (Answer("1", "Ada", "1.ulg", given),))
         outcome = grade([tmp_path / "in"], Course(rubric, key, logs), tmp_path / "out", processes=1)
-        (one,) = outcome.graded
+        (one,) = outcome.reports
         assert one.verdict.status == status
         assert one.points > 0
-        assert one.counted is None
-        assert "aisle_uwb.ulg" in one.pending
+        assert one.counted_points is None
+        assert "aisle_uwb.ulg" in one.pending_action
 
 
 @pytest.mark.usefixtures("at_once")
@@ -249,7 +249,7 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
     assert course.worksheets[0].head == ("id", "Grade")
     assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")
     assert course.due.isoformat() == "2026-11-20T23:59:59+01:00"
-    assert (course.late.text, course.include_pending) == ("5%/hour", False)
+    assert (course.late_rule.text, course.include_pending) == ("5%/hour", False)
 
 
 def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:

@@ -13,7 +13,7 @@ from px4fuse.assignment.roster import Person, Register, read_people, read_roster
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import ExportOrigin
-from px4fuse.grading.outputs import fill_grades, grade_column
+from px4fuse.grading.outputs import fill_grades, find_grade_column
 
 SUBMITTED = "Friday, 20 November 2026, 11:58 PM"
 # As mod/assign/gradingtable.php of Moodle writes it
@@ -48,9 +48,9 @@ PEOPLE = [
     Person("44", "Pending Pat", "pat@x.edu", "ppat"),
 ]
 ENTRIES = (
-    entry("0042", "Jane Doe", 87.5, of=120.0),
-    entry("43", "Max Roe", 104.0, of=120.0),
-    entry("44", "Pending Pat", None, of=120.0),
+    entry("0042", "Jane Doe", 87.5, max_points=120.0),
+    entry("43", "Max Roe", 104.0, max_points=120.0),
+    entry("44", "Pending Pat", None, max_points=120.0),
 )
 TEXTS = ("Points 87.5\n  <b>=1+1</b>\n", "Well done.\n", "Pending.\n")
 
@@ -230,7 +230,7 @@ def test_a_platforms_table_comes_back_with_two_columns_filled(
     if text is MOODLE:
         assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"
     if text is not BLACKBOARD:
-        assert any("above the maximum of the platform (100)" in note for note in notes)
+        assert any("above the maximum of 100 on the platform" in note for note in notes)
 
 
 def test_a_row_is_found_by_the_participant_alone(tmp_path) -> None:
@@ -243,7 +243,7 @@ def test_a_row_is_found_by_the_participant_alone(tmp_path) -> None:
 def test_who_is_not_in_the_table_is_said(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
     _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
-    assert notes == ("table.csv: no row for Max Roe.",)
+    assert notes == ("table.csv has no row for Max Roe. These grades were not entered.",)
 
 
 def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
@@ -269,5 +269,5 @@ def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
 )
 def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column, says) -> None:
     with pytest.raises(SettingsError, match=says) as caught:
-        grade_column(table(tmp_path, text), column)
+        find_grade_column(table(tmp_path, text), column)
     assert "\n" not in str(caught.value)
