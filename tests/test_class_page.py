@@ -53,7 +53,7 @@ def row(name: str, points: float | None, **more: Any) -> Entry:
     """A student with one report; what Entry has goes there, the rest to the report."""
     own = {key: more.pop(key) for key in OF_ENTRY if key in more}
     one = graded(name, points, **more)
-    own["handed_in"] = own.pop("handed_in_at", "")
+    own["submission_time"] = own.pop("handed_in_at", "")
     own.setdefault("total", None if points is None else one.counted_points)
     return Entry(name, one.student_id, one, max_points=one.max_points, flags=one.flags, **own)
 

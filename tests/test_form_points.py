@@ -157,7 +157,7 @@ def test_a_constant_form_does_not_pay_on_loops() -> None:
     truths = []
     for number in range(300):
         drawn = draw(b"constant forms", f"s{number}", "loop")
-        sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.typed]
+        sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.mistake_options]
         measured = [size + rng.normal(0.0, 0.4) for size in sizes]
         wrong = [TrueMistake("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
         verdicts = VerdictTruth("underconfident", 7.0), VerdictTruth("overconfident", 1.1)

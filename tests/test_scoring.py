@@ -162,7 +162,7 @@ class TestForm:
         points, comment = checked("answers", found, key=key())
         assert points == 0.3
         assert "mistakes 30 of 30, sizes 0 of 15" in comment
-        assert "You found dropout." in comment
+        assert "You named dropout, which is right." in comment
         points, comment = checked("answers", filled(["yaw"], student__id="s01"), key=key())
         assert points == 0.0
         assert (

@@ -196,13 +196,13 @@ def _write_assignment(
     drawn_flights: list[tuple[tuple[str, ...], float | None]]
     if preview:
         previews = assignment.preview(students, key_file, secret, kind, count)
-        drawn_flights = [(drawing.typed, drawing.difficulty) for drawing in previews]
+        drawn_flights = [(drawing.mistake_options, drawing.difficulty) for drawing in previews]
         rows = [
             (
                 student.student_id,
                 student.name,
                 drawing.scenario.kind,
-                " ".join(drawing.typed) or "none",
+                " ".join(drawing.mistake_options) or "none",
                 f"{drawing.difficulty:.2f}",
             )
             for student, drawing in zip(students, previews, strict=True)

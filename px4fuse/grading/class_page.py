@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.answer_form import form_rows
-from px4fuse.assignment.sheet import number
+from px4fuse.assignment.sheet import format_cell_number
 from px4fuse.grading.model import TOTAL_TITLE, Entry, GradedReport, Item, Override, list_titles
 from px4fuse.text import format_number
 from px4fuse.webpage import frame
@@ -88,10 +88,10 @@ def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
         counts=counts,
         averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
         totals=count_tenths(totals, max_points) if totals else (),
-        max_points_text=number(max_points),
+        max_points_text=format_cell_number(max_points),
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.pending_action],
-        number=number,
+        number=format_cell_number,
         items=list(_item_statistics(reports)),
     )
 
@@ -112,7 +112,14 @@ def _item_statistics(reports: Sequence[GradedReport]) -> Iterator[tuple[Any, ...
             sum(share <= 0.0 for share in shares),
             sum(share >= 1.0 for share in shares),
         )
-        yield title, count_tenths(shares, 1.0), mean, number(max_points), zero_count, full_count
+        yield (
+            title,
+            count_tenths(shares, 1.0),
+            mean,
+            format_cell_number(max_points),
+            zero_count,
+            full_count,
+        )
 
 
 def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
@@ -183,7 +190,12 @@ def _details(entry: Entry) -> Iterator[Part]:
         for difference in verdict.differences
     ]
     items = [
-        (item.title, number(item.points), number(item.max_points), item.comment)
+        (
+            item.title,
+            format_cell_number(item.points),
+            format_cell_number(item.max_points),
+            item.comment,
+        )
         for item in report.items
     ]
     named_texts = [
@@ -214,15 +226,17 @@ def _points_cell(entry: Entry) -> Cell:
     report = entry.counted_report
     if entry.total is None:
         proposed_text = (
-            f"{number(report.points)} proposed" if report and report.counted_points is None else ""
+            f"{format_cell_number(report.points)} proposed"
+            if report and report.counted_points is None
+            else ""
         )
         return Cell("pending" if proposed_text else "–", None, proposed_text)
     share = min(max(entry.total / entry.max_points, 0.0), 1.0) if entry.max_points > 0.0 else None
-    notes = [f"{number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
+    notes = [f"{format_cell_number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
     notes += ["set by instructor"] * any(
         override.points is not None for override in entry.overrides.values()
     )
-    text = f"{number(entry.total)} / {number(entry.max_points)}"
+    text = f"{format_cell_number(entry.total)} / {format_cell_number(entry.max_points)}"
     return Cell(text, entry.total, ", ".join(notes), "", share)
 
 

@@ -19,7 +19,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import Person, Register, normalise_text, read_people
-from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
+from px4fuse.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.flags import flag_equal_contents
 from px4fuse.grading.model import TOTAL_TITLE, Entry, GradedReport, Item, Override, Submission
@@ -378,7 +378,7 @@ def _override_item(item: Item, override: Override | None) -> Item:
     if override.points is None:
         return replace(item, comment=comment)
     if override.points != item.points:
-        comment = f"{comment} (Your instructor gave {number(override.points)} points.)"
+        comment = f"{comment} (Your instructor gave {format_cell_number(override.points)} points.)"
     return replace(item, points=override.points, comment=comment, awaits_points=False)
 
 
@@ -410,7 +410,7 @@ def read_overrides(path: Path) -> Overrides:
         student, item, points, comment = (
             sheet.cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
         )
-        value = decimal(points)
+        value = parse_decimal(points)
         problem = ""
         if item in overrides[student]:
             item_text = one_line(item, 40) or "(whole report)"

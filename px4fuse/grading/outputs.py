@@ -32,7 +32,7 @@ from px4fuse.assignment.roster import (
     normalise_text,
     read_student,
 )
-from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
+from px4fuse.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.checks import shorten_text
 from px4fuse.grading.class_page import html_text
@@ -273,7 +273,8 @@ def csv_text(entries: Sequence[Entry]) -> str:
             report.log_sha256 if report else "",
         ]
         cells = [
-            neutralise_formulas(value) if isinstance(value, str) else number(value) for value in row
+            neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
+            for value in row
         ]
         cells[FIRST_COLUMNS.index("id")] = neutralise_id(entry.student_id)
         rows.append(tuple(cells))
@@ -298,7 +299,7 @@ def feedback_text(entry: Entry, class_name: str = "") -> str:
         reasons="; ".join(filter(None, reasons)),
         is_total_set=TOTAL_TITLE in entry.overrides,
         line=shorten_text,
-        number=number,
+        number=format_cell_number,
         wrapped=_wrap_text,
     )
     return text.rstrip("\n") + "\n"
@@ -402,10 +403,10 @@ def fill_grades(
         max_points = _max_points(sheet, row, grade_index)
         if max_points is not None and total > max_points:
             notes.append(
-                f"{sheet.path.name}: {names[student_index]} has {number(total)} points, above the "
-                f"maximum of {number(max_points)} on the platform. Increase the maximum there."
+                f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the maximum "
+                f"of {max_points:.10g} on the platform. Increase the maximum there."
             )
-        row[grade_index] = number(total).replace(".", "," if has_decimal_comma else ".")
+        row[grade_index] = format_cell_number(total).replace(".", "," if has_decimal_comma else ".")
         if feedback_index is not None and feedback_index != grade_index:
             row[feedback_index] = format_feedback(feedback[student_index])
     missing_names = [
@@ -426,7 +427,7 @@ def _max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | N
     maximum_texts = (
         cells[grade_index] for cells in sheet.rows[:3] if "points possible" in cells[0].casefold()
     )
-    return decimal(next(maximum_texts, sheet.cell(row, MAX_GRADE_TITLES)))
+    return parse_decimal(next(maximum_texts, sheet.cell(row, MAX_GRADE_TITLES)))
 
 
 def escape_html(text: str) -> str:

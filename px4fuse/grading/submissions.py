@@ -345,7 +345,7 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
         (entry.file_size > MAX_BYTES, _TOO_LARGE_REASON),
         (
             not is_small,
-            f"the zip entry is compressed more than {MAX_COMPRESSION_RATIO} times, unlike a report.",
+            f"the zip entry is compressed more than {MAX_COMPRESSION_RATIO} times, unlike reports.",
         ),
     ):
         if has_problem:
