@@ -8,9 +8,8 @@ import click
 
 from px4fuse.cli import inputs, outputs
 from px4fuse.request import settings_name
-from px4fuse.writing import STANDARD_OUTPUT
 
-Severity = Literal["error", "warning", "info"]
+Severity = Literal["error", "warning", "note"]
 SEVERITIES = get_args(Severity)
 
 
@@ -50,13 +49,13 @@ def compare(
         outcome = run_or_evaluate_aids(request, step)
         results = outcome_results(request, outcome, person)
         release_free_memory()  # the import of the report modules needs memory
-        if output is None and json_path != STANDARD_OUTPUT:
+        if output is None and json_path is None:
             output = outputs.default_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, outcome, step)
     outputs.write_and_print(contents, summary(outcome, results, output), request)
     bad = failed_checks(outcome) if checks else {}
     for name, verdict in bad.items():
-        click.echo(f"{name}: {verdict}", err=True)
+        click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
     if bad:
         sys.exit(1)
     if fail_on is not None:

@@ -86,7 +86,7 @@ class Variant:
         True if logged rejections and resets replace the gate.
     without : mapping from PX4's name of an aid to float
         Time (s) from which the aid is not fused.
-    stamp_offset_s : float or None
+    timestamp_offset_s : float or None
         Added to the timestamps; None: EKF2's delay parameter is used.
     """
 
@@ -98,12 +98,12 @@ class Variant:
     gated: bool = True
     as_logged: bool = False
     without: Mapping[str, float] = field(default_factory=dict)
-    stamp_offset_s: float | None = None
+    timestamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
         """Return the total age of a position at its timestamp, and the fusion horizon (s)."""
-        if self.stamp_offset_s is not None:
-            return Timing(-self.stamp_offset_s - 0.5 * inputs.step_s, np.inf)
+        if self.timestamp_offset_s is not None:
+            return Timing(-self.timestamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         known = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
         most_ms = max(self.settings[name] for name in known)

@@ -145,7 +145,7 @@ def _open_without(
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
+    share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
     if share > REJECTING_SHARE and np.isfinite(inputs.received.rejected).any():
         logged_agreement = agreement_with_log(flight, _make_replay(inputs, runs, variants[1], {}))
         if isinstance(logged_agreement, Agreement):
@@ -212,7 +212,7 @@ def replay_settings(
         unused_parameters["EKF2_DELAY_MAX"] = (
             f"in {firmware} the fusion horizon follows from the largest delay parameter"
         )
-    if inputs.received.own_times:
+    if inputs.received.uses_sender_times:
         unused_parameters[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
     for name in [name for change in changes for name in change if name in unused_parameters]:
         raise SettingsError(f"{name} has no effect in this log: {unused_parameters[name]}.")

@@ -118,7 +118,7 @@ class UnreplayedPart(Record, frozen=True):
     at_s: float
 
 
-class WhySteps(Record, frozen=True, kw_only=True):
+class DifferenceSteps(Record, frozen=True, kw_only=True):
     """Difference KF - EKF2 along one axis, as the sum of the steps and a remainder.
 
     Attributes
@@ -128,12 +128,12 @@ class WhySteps(Record, frozen=True, kw_only=True):
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Mean square difference of KF to the logged EKF2.
     steps : tuple of Step
-    position_left_mean_square_m2, velocity_left_mean_square_m2_s2 : float
+    unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
         Mean square difference of the model to the logged EKF2.
     position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
     spans_s : tuple of (float, float)
         Parts of the flight in the means.
-    coast : RejectionRun or None
+    longest_rejection : RejectionRun or None
         None without rejections.
     outside : UnreplayedPart or None
         None if the replay covers the segment.
@@ -145,22 +145,22 @@ class WhySteps(Record, frozen=True, kw_only=True):
     position_mean_square_m2: NotNegative
     velocity_mean_square_m2_s2: NotNegative
     steps: tuple[Step, ...]
-    position_left_mean_square_m2: NotNegative
-    velocity_left_mean_square_m2_s2: NotNegative
+    unexplained_mean_square_m2: NotNegative
+    unexplained_velocity_mean_square_m2_s2: NotNegative
     position_rmse_to_truth_m: Mapping[str, NotNegative | Unavailable]
     spans_s: Spans
-    coast: RejectionRun | None = None
+    longest_rejection: RejectionRun | None = None
     outside: UnreplayedPart | None = None
     sentences: tuple[str, ...] = ()
 
     @property
-    def position_left_share(self) -> float:
+    def unexplained_fraction(self) -> float:
         """Unexplained share of the mean square difference."""
-        return self.position_left_mean_square_m2 / self.position_mean_square_m2
+        return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
-class Why(WhySteps, frozen=True, kw_only=True, eq=False):
-    """:class:`WhySteps` with the time series.
+class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False):
+    """:class:`DifferenceSteps` with the time series.
 
     Attributes
     ----------
@@ -170,7 +170,7 @@ class Why(WhySteps, frozen=True, kw_only=True, eq=False):
         Sentence of the largest step, without its time.
     """
 
-    schema_type = WhySteps
+    schema_type = DifferenceSteps
     times_s: Array
     kf_minus_ekf2_m: Array
     unexplained_m: Array
@@ -181,7 +181,7 @@ class Why(WhySteps, frozen=True, kw_only=True, eq=False):
 
 def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
-) -> dict[str, Why] | Unavailable:
+) -> dict[str, DifferenceExplanation] | Unavailable:
     """Compute the steps from KF to the logged EKF2, without explanations.
 
     Parameters
@@ -195,7 +195,7 @@ def explain_by_steps(
 
     Returns
     -------
-    dict from axis name to Why, or Unavailable
+    dict from axis name to DifferenceExplanation, or Unavailable
         Unavailable if the replay does not agree with the log.
     """
     if not model.agreement.good:
@@ -207,7 +207,7 @@ def explain_by_steps(
         delayed_variants(model, list(variants.values())),
         replay_with_logged_rejections(model),
     )
-    evaluated_spans, times = model.flown.judged_s, ekf2.state.index.to_numpy()
+    evaluated_spans, times = model.flown.evaluated_s, ekf2.state.index.to_numpy()
     is_inside = inside_spans(times, evaluated_spans)
     # all steps have the times of the replay
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
@@ -241,7 +241,7 @@ def explain_by_steps(
         ):  # the last step without a gate
             ungated = track
     spans = Segment(*span, "").cut(evaluated_spans)
-    coast = _longest_rejection(flown, ungated, span, evaluated_spans)
+    longest_rejection = _longest_rejection(flown, ungated, span, evaluated_spans)
     truth, steps_by_axis = model.flight.truth, {}
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
@@ -264,18 +264,18 @@ def explain_by_steps(
             for step_index, name in enumerate((*variants, OUTPUT), start=1)
         )
         filter_errors = {"kf": errors[0], "ekf2": errors[-1]}
-        steps_by_axis[axis] = Why(
+        steps_by_axis[axis] = DifferenceExplanation(
             count=len(times),
             position_mean_square_m2=position[0],
             velocity_mean_square_m2_s2=velocity[0],
             steps=steps,
-            position_left_mean_square_m2=position[-1],
-            velocity_left_mean_square_m2_s2=velocity[-1],
+            unexplained_mean_square_m2=position[-1],
+            unexplained_velocity_mean_square_m2_s2=velocity[-1],
             position_rmse_to_truth_m={
                 name: no_truth if error is None else error for name, error in filter_errors.items()
             },
             spans_s=spans,
-            coast=coast,
+            longest_rejection=longest_rejection,
             times_s=times,
             # copies: a view would keep all steps in memory
             kf_minus_ekf2_m=difference[0, 0].copy(),
@@ -309,7 +309,7 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
         without=dict.fromkeys((MAG.name, *others), 0.0),
     )
     variants = {
-        SAMPLES: replace(kf_variant, settings=without_lever_arm, stamp_offset_s=offset_s),
+        SAMPLES: replace(kf_variant, settings=without_lever_arm, timestamp_offset_s=offset_s),
         STAMPS: kf_variant,
         NOISE: (
             noise := replace(kf_variant, settings={**flown, **kf_process_noise}, reported=True)

@@ -107,21 +107,21 @@ class HeightSummary(Record, frozen=True):
     nis_mean : float
     nis_band : (float, float)
     innovation_std_m : float
-    rejected_share : float
+    rejected_fraction : float
     longest_without_fusion_s : float
     """
 
     nis_mean: NotNegative
     nis_band: tuple[NotNegative, NotNegative]
     innovation_std_m: NotNegative
-    rejected_share: Share
+    rejected_fraction: Share
     longest_without_fusion_s: NotNegative
 
     @property
-    def steady(self) -> bool:
+    def is_predictable(self) -> bool:
         """Return True if predictable: no height reset (not modelled), and few rejections."""
         is_without_reset = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
-        return is_without_reset and self.rejected_share <= MAX_REJECTED_SHARE
+        return is_without_reset and self.rejected_fraction <= MAX_REJECTED_SHARE
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
@@ -135,7 +135,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
         Time (s) from which the aid is not fused.
     north, east : AxisSummary
     samples : int
-    rejected_share : float
+    rejected_fraction : float
     longest_without_fusion_s : float or Unavailable
     resets : int
         Resets of horizontal position.
@@ -148,7 +148,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     height_rmse_to_truth_m : float or Unavailable
     late, lost : int
         Samples that arrived behind the fusion horizon: fused late, and never fused.
-    steady : bool
+    is_predictable : bool
         False if the result is not predictable: single rejections change it.
     """
 
@@ -156,7 +156,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     north: AxisSummary
     east: AxisSummary
     samples: Count
-    rejected_share: Share
+    rejected_fraction: Share
     longest_without_fusion_s: NotNegative | Unavailable
     resets: Count
     heading_error_mean_deg: float | Unavailable = OWN_HEADING
@@ -165,7 +165,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     height_rmse_to_truth_m: NotNegative | Unavailable = OWN_HEIGHT
     late: Count = 0
     lost: Count = 0
-    steady: bool = True
+    is_predictable: bool = True
     without: Mapping[str, float] = {}
 
     @property
@@ -201,7 +201,7 @@ class WhatIf:
         As flown, from the log and from the model.
     whatif : tuple of Summary
         One per change of parameters.
-    judged : tuple of (float, float)
+    evaluated_s : tuple of (float, float)
         Evaluated times (s), equal for all columns.
     notes : tuple of str
         One sentence each.
@@ -211,7 +211,7 @@ class WhatIf:
     logged: Summary
     replayed: Summary
     whatif: tuple[Summary, ...]
-    judged: Spans
+    evaluated_s: Spans
     notes: tuple[str, ...]
 
     __repr__ = one_line_repr
@@ -246,33 +246,40 @@ def what_if(
         return model.agreement.as_unavailable(ANALYSIS_NAME)
     without = without or {}
     replays = replay_settings(model, settings, without=without)
-    flight, judged = model.flight, model.flown.judged_s
+    flight, evaluated_s = model.flight, model.flown.evaluated_s
     if without:
         since = min(without.values())
         # a further stretch would start from the log, in which the aid was fused
         remaining_spans = [
-            (max(start, since), end) for start, end in judged if end - since > MIN_EVALUATED_S
+            (max(start, since), end) for start, end in evaluated_s if end - since > MIN_EVALUATED_S
         ]
-        judged = tuple(remaining_spans[:1])
-        if not judged:
+        evaluated_s = tuple(remaining_spans[:1])
+        if not evaluated_s:
             raise SettingsError(
                 f"--from {since:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
-                f"flight, which ends at {model.flown.judged_s[-1][1]:.0f} s. Choose an "
+                f"flight, which ends at {model.flown.evaluated_s[-1][1]:.0f} s. Choose an "
                 "earlier time."
             )
     gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
-        logged=_summarise_log(flight, model.flown, judged),
-        replayed=_summarise_replay(flight, model.flown, judged),
+        logged=_summarise_log(flight, model.flown, evaluated_s),
+        replayed=_summarise_replay(flight, model.flown, evaluated_s),
         whatif=_mark_unpredictable(
-            model, [_summarise_replay(flight, r, judged) for r in replays], judged, without
+            model,
+            [_summarise_replay(flight, r, evaluated_s) for r in replays],
+            evaluated_s,
+            without,
         ),
-        judged=judged,
+        evaluated_s=evaluated_s,
         notes=(
             *(_heading_and_height_notes(model) if replays and gnss else ()),
             *(note for replay in replays for note in _notes(model, replay)),
-            *(_deviation_note(model, replay, without, judged) for replay in replays if without),
+            *(
+                _deviation_note(model, replay, without, evaluated_s)
+                for replay in replays
+                if without
+            ),
         ),
     )
 
@@ -310,7 +317,7 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
 
 
 def _mark_unpredictable(
-    model: Model, summaries: Sequence[Summary], judged: Spans, without: Mapping[str, float]
+    model: Model, summaries: Sequence[Summary], evaluated_s: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
     """Mark the results that change when noise is added to the positions."""
     runs = [[summary] for summary in summaries]
@@ -318,7 +325,7 @@ def _mark_unpredictable(
         repeated_runs
         for repeated_runs in runs
         if repeated_runs[0].changed
-        and MIN_REJECTED_SHARE < repeated_runs[0].rejected_share <= MAX_REJECTED_SHARE
+        and MIN_REJECTED_SHARE < repeated_runs[0].rejected_fraction <= MAX_REJECTED_SHARE
     ]
     for seed in range(DISTURBED_RUNS if uncertain_runs else 0):
         disturbed_model = with_position_noise(model, DISTURBED_M, seed)
@@ -328,18 +335,18 @@ def _mark_unpredictable(
             without=without,
         )
         for repeated_runs, replay in zip(uncertain_runs, repeated_replays, strict=True):
-            repeated_runs.append(_summarise_replay(model.flight, replay, judged))
+            repeated_runs.append(_summarise_replay(model.flight, replay, evaluated_s))
     return tuple(
         replace(
             summary,
-            steady=all(height.steady for height in summary.heights.values())
+            is_predictable=all(height.is_predictable for height in summary.heights.values())
             and all(
-                disturbed_model.rejected_share <= MAX_REJECTED_SHARE
+                disturbed_model.rejected_fraction <= MAX_REJECTED_SHARE
                 for disturbed_model in summary.others.values()
             )
             and (
                 not summary.changed
-                or (summary.rejected_share <= MAX_REJECTED_SHARE and _agree(repeated_runs))
+                or (summary.rejected_fraction <= MAX_REJECTED_SHARE and _agree(repeated_runs))
             ),
             without=without,
         )
@@ -350,7 +357,7 @@ def _mark_unpredictable(
 def _agree(runs: Sequence[Summary]) -> bool:
     """Return True if consistency, rejections and RMSE of all runs agree within the limits."""
     rmse = [e for summary in runs if isinstance(e := summary.position_rmse_to_truth_m, float)]
-    shares = [summary.rejected_share for summary in runs]
+    shares = [summary.rejected_fraction for summary in runs]
     nis = [[summary.axes[axis].nis_mean for summary in runs] for axis in HORIZONTAL]
     return (
         all(max(values) <= MAX_NIS_RATIO * min(values) for values in nis)
@@ -359,12 +366,18 @@ def _agree(runs: Sequence[Summary]) -> bool:
     )
 
 
-def _summarise_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
+def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     updates = replay.updates
     evaluated_updates, fused_at_s = (
-        updates[inside_spans(updates.index, judged)],
+        updates[inside_spans(updates.index, evaluated_s)],
         updates["fused_at_s"].to_numpy(),
     )
+    if evaluated_updates.empty:
+        raise SettingsError(
+            f"{_change_text(replay)}: {replay.source} would never be fused in the evaluated time; "
+            f"{replay.lost} samples arrive after the fusion horizon",
+            "Choose another value.",
+        )
     # the variance grows between two samples; both ends define the interpolation
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
@@ -376,33 +389,33 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summ
     ]
     resets = evaluated_updates["reset"].sum()
     if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
-        resets += vision["reset"][inside_spans(vision["fused_at_s"], judged)].sum()
+        resets += vision["reset"][inside_spans(vision["fused_at_s"], evaluated_s)].sum()
     return _make_summary(
         flight,
         replay,
-        judged,
+        evaluated_s,
         evaluated_updates,
         replay.published,
         variance,
         replay.other_aid_updates,
         replay.delayed["heading_rad"],
         changed=replay.changed,
-        longest_without_fusion_s=_longest_between_fusions(fused.to_numpy(), judged),
+        longest_without_fusion_s=_longest_between_fusions(fused.to_numpy(), evaluated_s),
         resets=int(resets),
         late=replay.late,
         lost=replay.lost,
     )
 
 
-def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
+def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = logged_innovations(ekf2)
-    evaluated_updates = logged[inside_spans(logged.index, judged)]
+    evaluated_updates = logged[inside_spans(logged.index, evaluated_s)]
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
     resets = horizontal_resets_s(ekf2) - horizon_s
-    resets = resets[inside_spans(resets, judged)]
-    replayed = int(inside_spans(replay.updates.index, judged).sum())
+    resets = resets[inside_spans(resets, evaluated_s)]
+    replayed = int(inside_spans(replay.updates.index, evaluated_s).sum())
     longest: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log contains only {len(evaluated_updates)} of about {replayed} innovations",
@@ -410,7 +423,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
     )
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
         fused = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
-        longest = _longest_between_fusions(np.concatenate([fused, resets]), judged)
+        longest = _longest_between_fusions(np.concatenate([fused, resets]), evaluated_s)
     assert isinstance(flight.attitude, pd.DataFrame)  # a replay requires the attitude
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
@@ -419,7 +432,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
     return _make_summary(
         flight,
         replay,
-        judged,
+        evaluated_s,
         evaluated_updates,
         ekf2.state,
         None,
@@ -434,7 +447,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
 def _make_summary(
     flight: Flight,
     replay: Ekf2Replay,
-    judged: Spans,
+    evaluated_s: Spans,
     evaluated_updates: pd.DataFrame,
     published: pd.DataFrame,
     variance: pd.DataFrame | None,
@@ -449,7 +462,7 @@ def _make_summary(
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = ekf2.variance
-    times = ekf2.state.index[inside_spans(ekf2.state.index, judged)].to_numpy()
+    times = ekf2.state.index[inside_spans(ekf2.state.index, evaluated_s)].to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
         position = along(published, Columns.POSITION, direction, times)
@@ -461,7 +474,7 @@ def _make_summary(
         if isinstance(logged, Unavailable):
             sigma = logged
         else:
-            variance_s = logged.index[inside_spans(logged.index, judged)].to_numpy()
+            variance_s = logged.index[inside_spans(logged.index, evaluated_s)].to_numpy()
             known_variance = logged if variance is None else variance
             stated = np.interp(variance_s, known_variance.index, known_variance[f"{axis}_m2"])
             sigma = float(np.sqrt(np.median(stated)))
@@ -469,9 +482,9 @@ def _make_summary(
             *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
         )
     heights = {
-        name: _summarise_aid(evaluated, judged)
+        name: _summarise_aid(evaluated, evaluated_s)
         for name, each in other_aid_updates.items()
-        if len(evaluated := each[inside_spans(each.index, judged)])
+        if len(evaluated := each[inside_spans(each.index, evaluated_s)])
     }
     if vision := heights.pop(EV_POS.name, None):
         more["others"] = {EV_POS.name: vision}
@@ -479,8 +492,8 @@ def _make_summary(
         more["heights"], more["height_rmse_to_truth_m"] = heights, error_m(np.eye(3)[2])
     return Summary(
         samples=len(evaluated_updates),
-        rejected_share=float(evaluated_updates["rejected"].mean()),
-        heading_error_mean_deg=_heading_error(flight, replay, heading, judged),
+        rejected_fraction=float(evaluated_updates["rejected"].mean()),
+        heading_error_mean_deg=_heading_error(flight, replay, heading, evaluated_s),
         **more,
     )
 
@@ -494,10 +507,10 @@ def _innovation_statistics(
     return float(np.mean(nu**2 / s)), nis_band(len(nu)), float(np.std(nu))
 
 
-def _summarise_aid(evaluated_updates: pd.DataFrame, judged: Spans) -> HeightSummary:
+def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> HeightSummary:
     rejected = evaluated_updates["rejected"].to_numpy()
     fused_s = evaluated_updates.index.to_numpy()[rejected == 0.0]
-    fusions_by_span = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged)
+    fusions_by_span = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in evaluated_s)
     longest_s = max(_longest_between_fusions(*part) for part in fusions_by_span)
     return HeightSummary(
         *_innovation_statistics(evaluated_updates, *axes_of(evaluated_updates)),
@@ -507,7 +520,7 @@ def _summarise_aid(evaluated_updates: pd.DataFrame, judged: Spans) -> HeightSumm
 
 
 def _heading_error(
-    flight: Flight, replay: Ekf2Replay, heading: pd.Series, judged: Spans
+    flight: Flight, replay: Ekf2Replay, heading: pd.Series, evaluated_s: Spans
 ) -> float | Unavailable:
     """Return the mean of a heading (rad) minus the true heading, in degrees."""
     if GNSS_POS.noise not in replay.settings:
@@ -515,7 +528,7 @@ def _heading_error(
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
-    evaluated_heading = heading[inside_spans(heading.index, judged)]
+    evaluated_heading = heading[inside_spans(heading.index, evaluated_s)]
     true_at_samples = np.interp(
         evaluated_heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
@@ -523,18 +536,20 @@ def _heading_error(
     return float(np.degrees(np.nanmean(error)))
 
 
-def _longest_between_fusions(fused_s: Array, judged: Spans) -> float:
+def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
     """Return the longest time (s) between two fusions or the ends of the evaluated time."""
-    ends = [judged[0][0], judged[-1][1]]
+    ends = [evaluated_s[0][0], evaluated_s[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
 
 def _deviation_note(
-    model: Model, replay: Ekf2Replay, without: Mapping[str, float], judged: Spans
+    model: Model, replay: Ekf2Replay, without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
     """Describe the difference to the replay as flown without some aids."""
     flown, changed_position = (
-        replay_run.published.loc[inside_spans(replay_run.published.index, judged), Columns.POSITION]
+        replay_run.published.loc[
+            inside_spans(replay_run.published.index, evaluated_s), Columns.POSITION
+        ]
         for replay_run in (model.flown, replay)
     )
     *horizontal, down = np.abs((changed_position - flown).to_numpy()).T
@@ -564,9 +579,14 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
         )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
-        change = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
+        # of two samples in one step EKF2 fuses the newer one, so updates may be fewer than samples
+        samples = max(len(replay.updates), replay.late) + replay.lost
         yield (
-            f"{change or 'As flown'}: {replay.late + replay.lost} of "
-            f"{len(replay.updates) + replay.lost} samples would arrive after the fusion horizon "
-            f"({replay.lost} would never be fused){remedy}"
+            f"{_change_text(replay)}: {replay.late + replay.lost} of {samples} samples would "
+            f"arrive after the fusion horizon ({replay.lost} would never be fused){remedy}"
         )
+
+
+def _change_text(replay: Ekf2Replay) -> str:
+    """Return the changed parameters, or "As flown"."""
+    return ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "As flown"

@@ -27,7 +27,7 @@ def detect(analysis: Analysis) -> Found:
         if 0 < horizontal < len(inside):
             often += f" ({horizontal} horizontally)"
         yield finding(
-            "warning" if horizontal else "info",
+            "warning" if horizontal else "note",
             "ekf2_resets",
             f"EKF2 reset its {'position' if horizontal else 'height'} {often}, by up to "
             f"{max(sizes):.2f} m at {at_s:.1f} s. In the comparison: {treatment}.",

@@ -123,7 +123,7 @@ def deviating_settings(analysis: Analysis) -> Found:
     if axis_tuning is None:
         return
     chosen = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
-    ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.filter_sigma_a}
+    ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
     if hardly_moved(analysis):  # without motion SIGMA_A cannot be estimated
         del ml_noises[SIGMA_A]
     found = {
@@ -137,7 +137,7 @@ def deviating_settings(analysis: Analysis) -> Found:
         off = {
             name: each
             for name, each in off.items()
-            if chosen[name] < each.value and not (drifts and each.severity == "info")
+            if chosen[name] < each.value and not (drifts and each.severity == "note")
         }
     if not off:
         return
@@ -146,7 +146,9 @@ def deviating_settings(analysis: Analysis) -> Found:
     if SIGMA_Z in values and axis_tuning.sigma_z.value is None:
         values[SIGMA_Z] = max(values[SIGMA_Z], SMALLEST_SIGMA_Z_M)
     held_out_gain = (
-        None if isinstance(axis_tuning.held_out, Unavailable) else axis_tuning.held_out.gain_nats
+        None
+        if isinstance(axis_tuning.held_out, Unavailable)
+        else axis_tuning.held_out.log_likelihood_gain_per_measurement
     )
     remedy_text, first = remedy.format_kf_remedy(analysis, values, unseen_nats=held_out_gain), None
     for name in worst_first:
@@ -157,7 +159,7 @@ def deviating_settings(analysis: Analysis) -> Found:
         interval = f"; 95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit}" if noise.high else ""
         setting_finding = finding(
             severity,
-            f"{name[:7]}_{side}",
+            f"{name[:7]}_too_{side}",
             f"{name[:7].upper()} {chosen[name]:g} {unit} is {'at least ' if is_bound else ''}"
             f"{format_factor(size)} times too {side}. The maximum-likelihood estimate is "
             f"{'at most ' if is_bound else ''}{value:.3g} {unit} ({axis_tuning.name}"
@@ -202,7 +204,7 @@ def process_noise_near_zero(analysis: Analysis) -> Found:
     """
     for name, result in analysis.axes.items():
         updates, statement = result.replay.updates, result.filters["kf"]
-        if isinstance(statement, Unavailable) or statement.verdict != "variance understated":
+        if isinstance(statement, Unavailable) or statement.verdict != "overconfident":
             continue
         if statement.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION:
             continue
@@ -214,7 +216,7 @@ def process_noise_near_zero(analysis: Analysis) -> Found:
         before = updates["prior_position_variance_m2"].to_numpy()
         growth = float(np.median((before[1:] / after[:-1] - 1.0)[len(after) // 2 :]))
         tuned = tuning_of_axis(analysis.tuning, name)
-        ml_sigma_a = None if tuned is None else tuned.filter_sigma_a.value
+        ml_sigma_a = None if tuned is None else tuned.sigma_a_two_state.value
         remedy_text = (
             ""
             if ml_sigma_a is None
@@ -222,7 +224,7 @@ def process_noise_near_zero(analysis: Analysis) -> Found:
         )
         sigma_a = analysis.settings.sigma_a_m_s2
         yield error(
-            "process_noise_forgotten",
+            "process_noise_near_zero",
             f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero. The position variance grows by only "
             f"{format_percent(growth, 1)} between updates, and the gain falls to {gain:.3f}. KF "
             f"needs {response_s:.0f} s to follow a change (along {result.axis.called}).",
@@ -241,7 +243,7 @@ def variances(analysis: Analysis) -> Found:
                 results = [analysis.axes[name] for name in axes if name in analysis.axes]
                 pairs = [(result, result.filters[owner]) for result in results]
                 off = [(result, each) for result, each in pairs if is_inconsistent(each)]
-                members = [pair for pair in off if (pair[1].sigma_factor > 1.0) == over]
+                members = [pair for pair in off if (pair[1].sigma_ratio < 1.0) == over]
                 if members:
                     found = _variance_finding(analysis, owner, group, members)
                     yield structs.replace(found, caused_by=first)
@@ -253,14 +255,14 @@ def _variance_finding(
 ) -> Finding:
     """Make one finding for a group of axes, with the axis whose mean NIS is furthest from 1."""
     result, statement = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
-    over, factor = statement.sigma_factor > 1.0, statement.sigma_error_factor
+    over, factor = statement.sigma_ratio < 1.0, statement.sigma_error_factor
     severity: Severity = "error" if factor >= SIGMA_RATIO_ERROR else "warning"
     if _is_default(analysis, owner, result):
         severity = one_level_lower(severity)
     tuned = tuning_of_axis(analysis.tuning, result.axis.name)
-    stated = "overstated" if over else "understated"
+    confidence = "underconfident" if over else "overconfident"
     if over and analysis.source.origin.may_drift:
-        severity, remedy_text, cause = "info", KEEP_NOISES_DRIFT, ELSEWHERE
+        severity, remedy_text, cause = "note", KEEP_NOISES_DRIFT, ELSEWHERE
     elif over and analysis.source.origin.is_gnss:
         is_barometer = analysis.source.aid(result.axis.name) == BAROMETER
         remedy_text = (
@@ -268,7 +270,7 @@ def _variance_finding(
         )
         cause = NOISE if remedy_text else ELSEWHERE
         keep = KEEP_NOISES_CORRELATED.format("a barometer" if is_barometer else "GNSS")
-        severity, remedy_text = severity if remedy_text else "info", remedy_text or keep
+        severity, remedy_text = severity if remedy_text else "note", remedy_text or keep
     elif over and any(each == owner for each, *_ in hidden_errors(analysis)):
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
@@ -277,12 +279,12 @@ def _variance_finding(
             kind_of(analysis, cause_found),
             _remedy(analysis, owner, result, tuned, cause_found),
         )
-        severity = "info" if remedy_text == KEEP_NOISES_TRUTH else severity
+        severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
-        "sigma_factor": statement.sigma_factor,
+        "sigma_ratio": statement.sigma_ratio,
         "nis_mean": statement.nis_mean,
-        "outside_gate": statement.outside_gate,
+        "fraction_outside_gate": statement.fraction_outside_gate,
         CAUSE: cause,
     }
     if tuned is not None and (ml_sigma_z := _value_or_bound(tuned.sigma_z)) is not None:
@@ -295,8 +297,8 @@ def _variance_finding(
         gate_effect = f" The gate of EKF2 may then {accepted}."
     return finding(
         severity,
-        f"{owner}_variance_{stated}",
-        f"{name} is {'under' if over else 'over'}confident along {result.axis.called}: σ is "
+        f"{owner}_{confidence}",
+        f"{name} is {confidence} along {result.axis.called}: σ is "
         f"{format_factor(factor)} times too {'large' if over else 'small'}. The mean NIS is "
         f"{format_number(statement.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} axes)."
         f"{gate_effect}",
@@ -370,10 +372,10 @@ def _remedy_without_cause(
 ) -> str:
     """Action if no re-run explains the deviation, with the closest re-run."""
     tried = interventions_on(analysis.causes, owner, result.axis.name)
-    if any(each.denied_by_truth for each in tried):
+    if any(each.contradicts_truth for each in tried):
         return KEEP_NOISES_TRUTH
     if tried:
-        nearest = min(tried, key=lambda each: abs(each.explains - 1.0))
+        nearest = min(tried, key=lambda each: abs(each.explained_fraction - 1.0))
         return f"{NOT_EXPLAINED} Closest: {format_rerun(analysis, nearest)}."
     if owner == "ekf2":
         return _remedy_without_replay(analysis, result, tuned)
@@ -400,7 +402,7 @@ def _remedy_without_replay(
     ratio = noise_m / used_m
     if not (
         ratio < 1.0 / NOISE_RATIO_TOLERANCE
-        if statement.sigma_factor > 1.0
+        if statement.sigma_ratio < 1.0
         else ratio > NOISE_RATIO_TOLERANCE
     ):
         return (

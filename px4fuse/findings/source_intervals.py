@@ -11,7 +11,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.flight_events import longest_s, source_gaps
 from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
-from px4fuse.findings.model import Found, finding, format_percent, info, warning
+from px4fuse.findings.model import Found, finding, format_percent, note, warning
 from px4fuse.position_source import ALIGNED
 
 MIN_LOST_SHARE = 0.02  # of the source's samples; seen: 0 to 0.3 %, and 8 to 9 % in v1.13
@@ -67,12 +67,12 @@ def losses(analysis: Analysis) -> Found:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.has_ulog:
             action += " The ULog contains the samples that PX4 received (SDLOG_PROFILE 129)."
-        yield info(
+        yield note(
             "source_samples_lost",
             f"About {format_percent(lost / sent)} of {source.name} is missing from the recording "
             f"({lost} of {sent} samples, one per {typical:.2f} s). EKF2 may have received them.",
             action,
-            {"lost": lost, "lost_share": lost / sent},
+            {"lost": lost, "lost_fraction": lost / sent},
         )
 
 
@@ -107,11 +107,11 @@ def downsampling(analysis: Analysis) -> Found:
         )
     yield finding(
         "error" if slow else "warning",
-        "source_thinned",
+        "source_downsampled",
         message,
         "Increase the rate of the stream at the sender (MAVROS, bridge, link) and remove any rate "
         "limit.",
-        {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base, "lost_share": lost},
+        {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base, "lost_fraction": lost},
     )
 
 

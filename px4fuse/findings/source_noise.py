@@ -15,7 +15,7 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.findings.cause_grouping import WHITE_RATIO
-from px4fuse.findings.model import Found, error, format_percent, info, warning
+from px4fuse.findings.model import Found, error, format_percent, note, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight import Columns, Unavailable
@@ -63,9 +63,9 @@ def time_correlated_noise(analysis: Analysis) -> Found:
             "Check multipath, anchor geometry and filters in the sender, or use positions at "
             "intervals longer than the correlation time."
         )
-    make_finding = info if is_gnss else warning
+    make_finding = note if is_gnss else warning
     yield make_finding(
-        "source_coloured",
+        "source_noise_time_correlated",
         f"The errors of {analysis.source.name} are correlated over {over}. A time-correlated part "
         f"of {found.slow_m:.2g} m (1 σ) adds to white noise of {found.white_m:.2g} m. KF and EKF2 "
         "assume independent errors: they follow the correlated part and report a σ that is too "
@@ -86,7 +86,7 @@ def repeats(analysis: Analysis) -> Found:
         return
     make_finding = error if share >= MIN_REPEAT_SHARE_ERROR else warning
     yield make_finding(
-        "source_repeats",
+        "source_samples_repeated",
         f"{count} of {len(again)} positions of {analysis.source.name} ({format_percent(share)}) "
         "repeat the previous one. The filters count each repetition as a new, independent "
         "measurement, at a time at which nothing was measured.",
@@ -118,7 +118,7 @@ def unequal_noise(analysis: Analysis) -> Found:
     if large < MIN_AXIS_RATIO * small or large_low <= small_high:
         return
     yield warning(
-        "source_axes_unequal",
+        "source_noise_unequal_axes",
         f"The noise of {analysis.source.name} is {large:.2g} m along {more} and {small:.2g} m "
         f"along {less}. One SIGMA_Z, or one EKF2 measurement noise, does not fit both axes.",
         f"Analyse each axis separately (--axis {more} --sigma-z {large:.2g}). For EKF2 use the "
@@ -137,7 +137,7 @@ def noise_variation(analysis: Analysis) -> Found:
     sigma_z: float | None = chosen.sigma_z_m
     outlier_time_s = np.zeros(0)
     if isinstance(tuned, AxisTuning):
-        sigma_a, sigma_z = tuned.filter_sigma_a.value, tuned.sigma_z.value
+        sigma_a, sigma_z = tuned.sigma_a_two_state.value, tuned.sigma_z.value
         outlier_time_s = tuned.outlier_time_s
     lines = [analysis.axes[name].axis for name in ("north", "east") if name in analysis.axes]
     if sigma_a is None or sigma_z is None or len(lines) < 2:
@@ -177,7 +177,7 @@ def noise_variation(analysis: Analysis) -> Found:
     if analysis.source.origin.is_gnss:
         check = "satellites in view, walls, trees and radio interference"
     yield (error if ratio >= MIN_PART_RATIO_ERROR else warning)(
-        "source_noise_changes",
+        "source_noise_varies",
         f"The noise of {analysis.source.name} is {ratio:.1f} times larger from {start:.0f} s to "
         f"{end:.0f} s than in the rest of the flight. Most samples are affected, not single "
         "outliers. No single SIGMA_Z fits the whole flight.",

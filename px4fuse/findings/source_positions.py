@@ -95,7 +95,7 @@ def smoothing(analysis: Analysis) -> Found:
     if found is not None:
         make_finding = error if found.lag_s >= MIN_LAG_ERROR_S else warning
         yield make_finding(
-            "source_smoothed",
+            "source_low_pass_filtered",
             f"{analysis.source.name} is low-pass filtered before it is sent. Successive errors "
             f"correlate by {found.correlation:.1f}, and positions lag the motion by "
             f"{found.lag_s:.2f} s. The noise before filtering is {found.sigma_z_m:.2g} m. KF and "
@@ -128,7 +128,7 @@ def jumps(analysis: Analysis) -> Found:
             action = "Wait for a steady fix (RTK) before take-off and keep the antenna uncovered."
         yield finding(
             "error" if size >= MIN_JUMP_ERROR_M else "warning",
-            "source_jumps",
+            "source_position_jump",
             f"{analysis.source.name} jumps {format_count(len(large))} and stays there, by "
             f"{size:.2f} m (± {1.96 * sigma:.2f} m) at {at_s:.1f} s. The IMU measures no such "
             f"motion. Possible causes: {causes}. After the jump KF and EKF2 are wrong by its size, "
@@ -156,7 +156,7 @@ def scale(analysis: Analysis) -> Found:
     if abs(excess) >= max(MIN_SCALE, MIN_SCALE_SIGMAS * sigma):
         yield finding(
             "error" if abs(excess) >= MIN_SCALE_ERROR else "warning",
-            "source_scale_wrong",
+            "source_scale_error",
             f"Distances of {analysis.source.name} are {format_percent(abs(excess))} too "
             f"{'long' if excess > 0 else 'short'} (± {format_percent(1.96 * sigma)}) compared with "
             "the IMU. Innovations do not show a scale factor error.",
@@ -226,7 +226,7 @@ def stated_variance(analysis: Analysis) -> Found:
                 side += ", unless it covers time-correlated errors"
         yield finding(
             "error" if size >= MIN_VARIANCE_RATIO_ERROR else "warning",
-            "source_variance_wrong",
+            "source_reported_variance_wrong",
             f"{source.name} reports σ {sigma:.3g} m, but its noise is {noise:.3g} m (95 % "
             f"{low:.3g} to {high:.3g} m). The reported variance is {format_factor(size)} times too "
             f"{side}. EKF2 takes R from it (EKF2_EV_NOISE_MD 0), but not less than EKF2_EVP_NOISE.",

@@ -44,7 +44,7 @@ def detect(analysis: Analysis) -> Found:
 def constant(name: str, clock: ClockMap, distinct: int) -> Found:
     """Make the findings of constant timestamps and of the jitter of the receive times."""
     yield error(
-        "source_stamps_constant",
+        "source_timestamps_constant",
         f"The {clock.pairs} timestamps of {name} have only {distinct} distinct "
         f"value{'s' if distinct > 1 else ''}. The time of measurement is unknown; px4fuse uses the "
         "receive time instead.",
@@ -54,7 +54,7 @@ def constant(name: str, clock: ClockMap, distinct: int) -> Found:
     )
     if (jitter_s := clock.jitter_s) > MAX_RECEIPT_JITTER_S:
         yield warning(
-            "source_receipt_jitter",
+            "source_timestamp_jitter",
             f"The receive times of {name}, used instead of its timestamps, jitter by "
             f"{jitter_s * 1e3:.0f} ms (1 σ). At 1 m/s this is a position error of "
             f"{jitter_s:.3f} m.",
@@ -77,7 +77,7 @@ def arrivals(analysis: Analysis) -> Found:
         until, latency = synchronised
         make_finding = error if latency >= MIN_LATENCY_ERROR_S else warning
         yield make_finding(
-            "source_stamps_of_arrival",
+            "source_timestamps_are_arrival_times",
             f"The timestamps of {name} are arrival times until {until:.1f} s. From then on they "
             f"are times of measurement, {latency:.3f} s before arrival: TIMESYNC had not converged "
             "before (PX4 needs 500 answers). One time offset cannot correct both parts.",
@@ -88,7 +88,7 @@ def arrivals(analysis: Analysis) -> Found:
         )
     elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_PURE_SHARE:
         yield warning(
-            "source_stamps_of_arrival",
+            "source_timestamps_are_arrival_times",
             f"The timestamps of {name} are arrival times. The sender was never synchronised with "
             "the autopilot (TIMESYNC), so every position is late by its latency.",
             ANSWER_TIMESYNC,

@@ -11,9 +11,9 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import causal_replays
-from px4fuse.comparison.causal_replays import Intervention, Of, cause_of, interventions_on
+from px4fuse.comparison.causal_replays import Intervention, Statistic, cause_of, interventions_on
 from px4fuse.comparison.model import FILTERS, AgainstTruth, Difference, FilterName
-from px4fuse.ekf2.steps import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.cause_grouping import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
@@ -27,28 +27,28 @@ from px4fuse.text import capitalise_first, format_factor
 
 MAX_PARAGRAPHS = 3  # paragraphs of the summary
 # Findings whose content is in the first paragraph
-IN_FIRST_PARAGRAPH = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
+IN_FIRST_PARAGRAPH = VARIANCES | {"error_exceeds_reported_sigma", "ekf2_not_logged"}
 # Faults of the source that no noise setting and no outlier removal corrects
 NOISE_SHAPE_FINDINGS = frozenset(
     (
-        "source_axes_unequal",
-        "source_clock_changes",
-        "source_coloured",
-        "source_jumps",
-        "source_noise_changes",
-        "source_repeats",
-        "source_scale_wrong",
-        "source_smoothed",
+        "source_noise_unequal_axes",
+        "source_time_offset_changes",
+        "source_noise_time_correlated",
+        "source_position_jump",
+        "source_noise_varies",
+        "source_samples_repeated",
+        "source_scale_error",
+        "source_low_pass_filtered",
     )
 )
 # Faults that rotate the acceleration, which looks like process noise
-MISALIGNMENT_FINDINGS = frozenset(("ekf2_heading_wrong", "source_frame_turned"))
+MISALIGNMENT_FINDINGS = frozenset(("ekf2_heading_error", "source_frame_misaligned"))
 # Findings listed after the explanation of the difference KF - EKF2
-EFFECT_FINDINGS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
+EFFECT_FINDINGS = frozenset({"ekf2_resets", "ekf2_rejects_positions", "ekf2_fusion_interrupted"})
 NAMES: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
 
 
-def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
+def summarise(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     """Summarise a flight, the most important first.
 
     Parameters
@@ -68,12 +68,12 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
         for owner in FILTERS
     }
     shapes = {
-        one.id for one in findings if one.id in NOISE_SHAPE_FINDINGS and one.severity != "info"
+        one.id for one in findings if one.id in NOISE_SHAPE_FINDINGS and one.severity != "note"
     }
     # a low pass also delays the positions, so a time offset is then not the cause
-    allowed_kinds = (FRAME,) if "source_smoothed" in shapes else (CLOCK, FRAME)
+    allowed_kinds = (FRAME,) if "source_low_pass_filtered" in shapes else (CLOCK, FRAME)
     is_misaligned = any(
-        one.id in MISALIGNMENT_FINDINGS and one.severity != "info" for one in findings
+        one.id in MISALIGNMENT_FINDINGS and one.severity != "note" for one in findings
     )
     for owner, cause in cause_by_filter.items():
         kind = kind_of(analysis, cause)
@@ -89,10 +89,10 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     causes = [
         one
         for one in findings
-        if one.caused_by is None and one.severity != "info" and one.id not in known
+        if one.caused_by is None and one.severity != "note" and one.id not in known
     ]
     has_explanation = bool(shapes) or any(
-        one.id == "errors_larger_than_claimed" and one.caused_by for one in findings
+        one.id == "error_exceeds_reported_sigma" and one.caused_by for one in findings
     )
     sentences = [
         _verdict_paragraph(analysis, cause_by_filter, has_explanation),
@@ -104,7 +104,7 @@ def story(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     return tuple(sentences[:MAX_PARAGRAPHS])
 
 
-def _failed_statistic(analysis: Analysis, owner: FilterName) -> Of:
+def _failed_statistic(analysis: Analysis, owner: FilterName) -> Statistic:
     """Statistic that a cause has to explain: mean NEES if the error exceeds σ, else mean NIS."""
     return (
         "nees"
@@ -135,7 +135,7 @@ def _verdict_paragraph(
     elif not all(isinstance(result.filters[owner].truth, AgainstTruth) for owner in filters):
         difference_text = f"{along} KF and EKF2 are compared"
         if isinstance(result.difference, Difference):
-            difference_m = format_metres(result.difference.position_rmse_m)
+            difference_m = format_metres(result.difference.position_rms_m)
             difference_text = f"{along} KF and EKF2 differ by {difference_m} RMS"
         sentences.append(f"{difference_text}. The log contains no ground truth.")
         if source.origin.may_drift:
@@ -164,13 +164,9 @@ def _filter_sentence(analysis: Analysis, owner: FilterName) -> str:
     elif statement.verdict == "consistent":
         verdict = "is consistent"
     else:
-        confidence, size = (
-            ("underconfident", "large")
-            if statement.sigma_factor > 1.0
-            else ("overconfident", "small")
-        )
+        size = "large" if statement.verdict == "underconfident" else "small"
         factor = format_factor(statement.sigma_error_factor)
-        verdict = f"is {confidence}: σ is {factor} times too {size}"
+        verdict = f"is {statement.verdict}: σ is {factor} times too {size}"
     if not isinstance(statement.truth, AgainstTruth):
         return f"By its innovations along {along} {name} {verdict}."
     rmse = format_metres(statement.truth.position_rmse_m)
@@ -191,7 +187,7 @@ def _explanation(
     if cause is not None:
         return f"{capitalise_first(format_rerun(analysis, cause))}."
     tested = interventions_on(analysis.causes, owner, axis, _failed_statistic(analysis, owner))
-    if any(each.denied_by_truth for each in tested):
+    if any(each.contradicts_truth for each in tested):
         return "The errors against ground truth need this σ."
     # drift and faults of the source are listed as findings
     is_explained_elsewhere = has_explanation or analysis.source.origin.may_drift
@@ -203,7 +199,7 @@ def _finding_sentence(analysis: Analysis, finding: Finding) -> str:
     if finding.id == "source_gap":
         return _gap_sentence(analysis, finding)
     when = finding.when if finding.when and not finding.has_time_in_message else ""
-    return f"{finding.headline}{f' ({when})' if when else ''}."
+    return f"{finding.title}{f' ({when})' if when else ''}."
 
 
 def _gap_sentence(analysis: Analysis, finding: Finding) -> str:
@@ -254,12 +250,13 @@ def _difference_after_change(
         intervention
         for owner, cause in causes.items()
         for intervention in interventions_on(
-            analysis.causes, owner, analysis.main.axis.name, "apart"
+            analysis.causes, owner, analysis.main.axis.name, "difference"
         )
-        if cause is not None and intervention.explains >= causal_replays.MIN_EXPLAINED_SHARE
+        if cause is not None
+        and intervention.explained_fraction >= causal_replays.MIN_EXPLAINED_SHARE
     ]
     if reductions:
-        most = max(reductions, key=lambda intervention: intervention.explains)
+        most = max(reductions, key=lambda intervention: intervention.explained_fraction)
         yield (
             f"Re-run of {NAMES[most.filter]} with this correction: difference KF - EKF2 "
             f"{most.before:.2f} → {most.after:.2f} m RMS."
@@ -268,12 +265,12 @@ def _difference_after_change(
 
 def _differences(analysis: Analysis, *, has_difference_text: bool) -> Iterator[str]:
     """Loop closure error, and the explanation of the difference KF - EKF2."""
-    loop, why = analysis.loop, analysis.why.get(analysis.main.axis.name)
+    loop, why = analysis.loop, analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(loop, Loop) and (gap := loop.closure_error_m) is not None:
         length = loop.path_length_m
         yield (
             f"The odometry has a loop closure error of {format_metres(gap)} after {length:.0f} m "
             f"({format_percent(gap / length, 1)})."
         )
-    if isinstance(why, Why) and not has_difference_text:
+    if isinstance(why, DifferenceExplanation) and not has_difference_text:
         yield why.cause

@@ -20,7 +20,7 @@ MEASURES = read_rows("measures.csv")
 # Numbers whose difference is within either tolerance are not listed. The absolute tolerance is in
 # the unit of the number
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.01, 0.001
-_REJECTED_PATTERN = "axes.*.rejected_share"
+_REJECTED_PATTERN = "axes.*.rejected_fraction"
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
             parent, _, field = path.rpartition(".")
             record, first_name = value_at(results, parent), names[0] if names else ""
             value = getattr(record, field, None)
-            is_undetermined = isinstance(record, Clock) and not record.determinable
+            is_undetermined = isinstance(record, Clock) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
             is_duplicate = pattern == _REJECTED_PATTERN and first_name not in (
                 horizontal_axis,

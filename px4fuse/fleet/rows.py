@@ -50,14 +50,13 @@ def value_at(results: object, path: str) -> Any:
 def axis_rows(results: ComparisonResults) -> list[Row]:
     """Return the rows of one log, one per axis; columns without a value are absent.
 
-    ``kf_factor`` and ``ekf2_factor`` are reported σ over actual σ, as ``sigma_factor`` in the
-    results: above 1 the filter is underconfident. SIGMA_Z and SIGMA_A are maximum-likelihood
-    estimates; north and east have a common estimate. A time offset that the flight does not
-    determine is absent.
+    ``kf_sigma_ratio`` and ``ekf2_sigma_ratio`` are actual σ over reported σ: above 1 the filter is
+    overconfident. SIGMA_Z and SIGMA_A are maximum-likelihood estimates; north and east have a
+    common estimate. A time offset that the flight does not determine is absent.
     """
     common = log_columns(results.log) | finding_columns(results.findings, results.aids)
-    common["story"] = "\n".join(results.story)
-    has_time_offset = bool(value_at(results, "clock.determinable"))
+    common["summary"] = "\n".join(results.summary)
+    has_time_offset = bool(value_at(results, "clock.is_determinable"))
     rows = []
     for name, axis in results.axes.items():
         unavailable = next((f for f in axis.filters.values() if isinstance(f, Unavailable)), None)
@@ -78,7 +77,7 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
     """Return ids and severities of findings that no other finding causes, and verdicts on aids."""
     causes = [finding for finding in findings if finding.caused_by is None]
-    fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "idle"]
+    fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"]
     return {
         "aids": FINDING_SEPARATOR.join(fused),
         "findings": FINDING_SEPARATOR.join(finding.id for finding in causes),

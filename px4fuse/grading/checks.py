@@ -321,7 +321,7 @@ class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):
 
 
 # findings about timestamps whose time offset is not constant
-CHANGING_CLOCK_FINDINGS = ("source_clock_changes", "source_stamps_of_arrival")
+CHANGING_CLOCK_FINDINGS = ("source_time_offset_changes", "source_timestamps_are_arrival_times")
 Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
 # name in messages, unit and option of each noise
 NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
@@ -429,7 +429,7 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
         if evidence.comparison is None:
             return NO_COMPARISON
         clock = evidence.comparison.clock
-        if not isinstance(clock, Clock) or not clock.determinable:
+        if not isinstance(clock, Clock) or not clock.is_determinable:
             share = self.undeterminable if isinstance(clock, Clock) else 0.0
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
@@ -486,10 +486,10 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
                 "no loop closure was accepted."
             )
         if not isinstance(loop, LoopResult) or loop.closure_error_m is None:
-            unavailable = loop.known_end if isinstance(loop, LoopResult) else loop
+            unavailable = loop.true_end if isinstance(loop, LoopResult) else loop
             reason_text = format_reason(getattr(unavailable, "reason", ""))
             return 0.0, f"Your report contains no loop closure error{reason_text}."
-        if loop.absolute:
+        if loop.is_absolute_track:
             return (
                 0.0,
                 "The track in your report does not drift. Use odometry, for example LOG:vio.",

@@ -137,7 +137,7 @@ class Course:
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
-def make_entries(
+def build_entries(
     reports: Sequence[GradedReport],
     submissions: Sequence[Submission],
     course: Course,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from px4fuse.answer_form import MISTAKES, Answers, ClaimedMistake, QuantityAnswer
+from px4fuse.answer_form import MISTAKES, Answers, QuantityAnswer, StudentMistake
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING
 from px4fuse.record import table
@@ -119,11 +119,11 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
 
 
 # mistake of the flight, mistake of the form that matches it best, and share of the points
-Match = tuple[TrueMistake, ClaimedMistake | None, float]
+Match = tuple[TrueMistake, StudentMistake | None, float]
 
 
 def _mistake_feedback(
-    matches: list[Match], false_claims: list[ClaimedMistake], is_clean_named: bool
+    matches: list[Match], false_claims: list[StudentMistake], is_clean_named: bool
 ) -> Iterator[str]:
     """Yield a phrase for each right or missed mistake, and one for all false claims."""
     if not matches:
@@ -140,14 +140,14 @@ def _mistake_feedback(
         yield f"your flight does not have {', '.join(claim.kind for claim in false_claims)}"
 
 
-def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[ClaimedMistake]]:
+def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
     """Match each mistake of the flight with one of the form; also return the false claims.
 
     Pairs with the largest share are matched first: equal mistakes, then related mistakes, then
     consequences.
     """
     unmatched = [claim for claim in answers.mistakes if claim.kind != "none"]
-    claim_by_kind: dict[str, tuple[ClaimedMistake, float]] = {}
+    claim_by_kind: dict[str, tuple[StudentMistake, float]] = {}
     candidates = [
         (kind_share(mistake.kind, claim.kind), mistake.kind, claim)
         for mistake in truth.mistakes
@@ -191,7 +191,7 @@ def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
     return shares
 
 
-def size_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
+def size_share(mistake: TrueMistake, claim: StudentMistake) -> float:
     """Return the share for a size: 1 (right), 1/2 (close), or 1/3.
 
     1/3 is for a size with the wrong sign, and for the right size of a related mistake.
@@ -208,7 +208,7 @@ def size_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
     return _value_share(size, mistake.low, mistake.high, 0.5 if is_close else 0.0)
 
 
-def when_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
+def when_share(mistake: TrueMistake, claim: StudentMistake) -> float:
     """Return the share for time and panel: one half for each."""
     if mistake.from_s is None and mistake.until_s is None:
         is_time_right = claim.when == "whole flight"
@@ -230,7 +230,7 @@ def panels(kind: str) -> list[str]:
     return [*(panel for panel, kinds in TABLE["shows"].items() if kind in kinds), "cover"]
 
 
-def cure_share(mistake: TrueMistake, claim: ClaimedMistake, truth: FormTruth) -> float:
+def cure_share(mistake: TrueMistake, claim: StudentMistake, truth: FormTruth) -> float:
     """Return the share for a correction and its value."""
     value = claim.value_in_first_unit()
     shares = [
@@ -285,7 +285,7 @@ def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
 def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
     """Return the mean share for the verdicts on KF and EKF2, and for the behaviour of EKF2."""
     shares = [_ekf2_behaviour_share(answers, truth)]
-    for answer, verdict in ((answers.verdict_ours, truth.ours), (answers.verdict_ekf2, truth.ekf2)):
+    for answer, verdict in ((answers.verdict_kf, truth.kf), (answers.verdict_ekf2, truth.ekf2)):
         is_right = answer and answer == verdict.verdict
         # "consistent" gets half of the points if σ is wrong by a small factor only
         is_nearly_right = (

@@ -10,7 +10,7 @@ from pathlib import Path
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.errors import ResultsError
 from px4fuse.grading import submissions
-from px4fuse.grading.entries import OVERRIDES_NAME, Course, make_entries, read_overrides
+from px4fuse.grading.entries import OVERRIDES_NAME, Course, build_entries, read_overrides
 from px4fuse.grading.model import Entry, GradedReport, Submission
 from px4fuse.grading.outputs import find_grade_column, write_class
 from px4fuse.grading.records import RECORDS_FOLDER, load_or_verify
@@ -120,7 +120,7 @@ def grade(
             reused_count += is_loaded
             progress(len(graded_by_index), len(found_submissions))
     graded = [graded_by_index[index] for index in range(len(found_submissions))]
-    entries, override_notes = make_entries(graded, found_submissions, course, overrides)
+    entries, override_notes = build_entries(graded, found_submissions, course, overrides)
     written_paths, class_notes = write_class(entries, course, output)
     return GradeOutcome(
         entries, (*notes, *unread_notes, *override_notes, *class_notes), reused_count, written_paths

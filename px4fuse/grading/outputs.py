@@ -403,8 +403,8 @@ def fill_grades(
         max_points = _max_points(sheet, row, grade_index)
         if max_points is not None and total > max_points:
             notes.append(
-                f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the maximum "
-                f"of {max_points:.10g} on the platform. Increase the maximum there."
+                f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the "
+                f"maximum of {max_points:.10g} on the platform. Increase the maximum there."
             )
         row[grade_index] = format_cell_number(total).replace(".", "," if has_decimal_comma else ".")
         if feedback_index is not None and feedback_index != grade_index:
