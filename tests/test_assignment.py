@@ -66,7 +66,7 @@ def cached_flights():
         return made[repr(given)]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assignment, "fly", from_memory)
+        patch.setattr(assignment, "simulate_assigned", from_memory)
         yield
 
 
@@ -80,7 +80,7 @@ def files(folder):
 class TestDraw:
     def test_same_secret_and_id_give_same_bytes(self):
         given = SECRET, CLASS[0], "aisle", 2, True
-        assert simulate_assigned(*given) == assignment.fly(*given)
+        assert simulate_assigned(*given) == assignment.simulate_assigned(*given)
         # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
@@ -172,7 +172,7 @@ class TestDraw:
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
 def test_fly_log_has_finding_of_each_mistake_in_key(tmp_path, kind, number, count):
-    log, answer = assignment.fly(SECRET, CLASS[number], kind, count, True)
+    log, answer = assignment.simulate_assigned(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
     flight = px4fuse.read_log(path)
@@ -248,14 +248,14 @@ class TestAssign:
 
     def test_assign_interrupted_run_is_continued(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
-        flown = assignment.fly
+        flown = assignment.simulate_assigned
 
         def stop_at_last(*given):
             if given[1] == CLASS[-1]:
                 raise KeyboardInterrupt
             return flown(*given)
 
-        monkeypatch.setattr(assignment, "fly", stop_at_last)
+        monkeypatch.setattr(assignment, "simulate_assigned", stop_at_last)
         with pytest.raises(KeyboardInterrupt):
             assign(CLASS, folder, key_file, None, "aisle", 2)
         monkeypatch.undo()
@@ -296,7 +296,9 @@ class TestAssign:
 
 class TestKey:
     def key(self):
-        answers = (assignment.fly(SECRET, one, "aisle", 2, True)[1] for one in CLASS[:2])
+        answers = (
+            assignment.simulate_assigned(SECRET, one, "aisle", 2, True)[1] for one in CLASS[:2]
+        )
         return AnswerKey("aisle", tuple(answers), "s")
 
     def test_key_text_is_read_back_equal(self, tmp_path):

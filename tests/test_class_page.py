@@ -46,7 +46,7 @@ def graded(name: str, points: float | None, **more: Any) -> GradedReport:
 
 
 OF_ENTRY = ("submitted_at", "late_s", "deduction", "overrides", "comment", "total",
-            "others")  # fmt: skip
+            "other_reports")  # fmt: skip
 
 
 def row(name: str, points: float | None, **more: Any) -> Entry:

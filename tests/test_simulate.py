@@ -204,7 +204,7 @@ class TestMistakes:
 
     def test_nlos_has_exact_fraction_in_bursts(self):
         simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse(["nlos=5%,3m"]))
-        outlier, motion = simulation.positions.outlier, simulation.motion
+        outlier, motion = simulation.positions.is_outlier, simulation.motion
         time = simulation.positions.measured_s
         flying = (time > motion.take_off_s) & (time < motion.touch_down_s)
         assert np.count_nonzero(outlier) == round(0.05 * np.count_nonzero(flying))

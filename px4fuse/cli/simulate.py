@@ -57,7 +57,7 @@ def _scenario_options(command: Command) -> Command:
         default_text = f"{default:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
         help_text = f"{quantity.meaning}  [default: {default_text}]"
         kind = TypedQuantity(quantity.unit, default)
-        command = click.option(quantity.typed, field, type=kind, help=help_text)(command)
+        command = click.option(quantity.cli_name, field, type=kind, help=help_text)(command)
     return command
 
 
