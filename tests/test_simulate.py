@@ -315,7 +315,7 @@ def test_scenario_invalid_values_raise_error(changes):
     (AISLE, ["open-end"], "requires --kind loop"), (UNFILTERED, ["ekf2-noise"], "--no-ekf2"),
     (LOOP, ["open-end=7"], "Use at most 6 m"),
     (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
-    (AISLE, ["dropout=600s,0s"], "no data in vehicle_visual_odometry"),
+    (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no data"),
 ])  # fmt: skip
 def test_simulate_unsuitable_mistake_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):
