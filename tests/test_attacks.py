@@ -206,7 +206,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
     ),
     "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
     "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
-    "log of another student": (set_value("b" * 64, "log", "sha256"), "other log", "given to s02"),
+    "log of another student": (set_value("b" * 64, "log", "sha256"), "other log", "given to student s02"),
     "better NIS": (
         set_value(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", "",
     ),
@@ -223,7 +223,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
         set_value("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
     ),
     "the id of another student": (
-        set_value("s02", "student", "id"), "page differs", "given to s01",
+        set_value("s02", "student", "id"), "page differs", "given to student s01",
     ),
 }  # fmt: skip
 

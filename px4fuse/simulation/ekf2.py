@@ -72,9 +72,8 @@ GNSS_RULES = FusionRules(
 NO_AID_TIMEOUT_S = 5.0
 # σ from EKF2_ANGERR_INIT, _GPS_V_NOISE, _GPS_P_NOISE, _GBIAS_INIT and _ABIAS_INIT (covariance.cpp)
 INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
-# Time (s) at rest before the log begins, and σ of the specific force, angular rate and velocity that
-# are measured at rest. They reproduce σ of v1.16 on the ground: 0.0005 rad/s, 0.06 m/s and
-# 0.17 m/s² (horizontal)
+# Time (s) at rest before the log, and σ of specific force, angular rate and velocity at rest. They
+# reproduce σ of v1.16 on the ground: 0.0005 rad/s, 0.06 m/s and 0.17 m/s² (horizontal)
 REST_S = 10.0
 REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 # rad and m; σ of heading and height as logged by v1.16 in flight
