@@ -206,7 +206,9 @@ FILES: dict[str, tuple[Change, str, str]] = {
     ),
     "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
     "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
-    "log of another student": (set_value("b" * 64, "log", "sha256"), "other log", "given to student s02"),
+    "log of another student": (
+        set_value("b" * 64, "log", "sha256"), "other log", "given to student s02",
+    ),
     "better NIS": (
         set_value(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", "",
     ),
