@@ -72,7 +72,7 @@ def format_differences(results: ChangeResults) -> Page:
             else f"{diff_input.kind} of {diff_input.log}"
         )
         versions = f"SHA-256 {diff_input.log_sha256[:12]}, px4fuse {diff_input.px4fuse}"
-        page.labelled(name, f"{diff_input.given} ({log}), {versions}")
+        page.write_labelled(name, f"{diff_input.given} ({log}), {versions}")
     if results.settings:
         settings = [
             (setting.name, _format_setting(setting.a), _format_setting(setting.b))
@@ -98,9 +98,9 @@ def format_differences(results: ChangeResults) -> Page:
         styled = styled_text(
             f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
         )
-        page.labelled(f"Only {finding.only_in}", styled)
+        page.write_labelled(f"Only {finding.only_in}", styled)
     for text in results.worse:
-        page.labelled("Worse", styled_text(text, 8.0, RED))
+        page.write_labelled("Worse", styled_text(text, 8.0, RED))
     if not results.worse:
         page.write("No verdict is worse in B.")
     return page

@@ -19,11 +19,11 @@ from msgspec import Meta
 from px4fuse.answer_form import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.comparison.model import AgainstTruth
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, HorizontalNis
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, HorizontalNis
 from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
-from px4fuse.loop.model import Correction, LoopResult, Way
+from px4fuse.loop.model import Correction, CorrectionName, LoopResult
 from px4fuse.record import OrUnavailable, Share
 from px4fuse.results.contract import (
     TUNED_FIELDS,
@@ -387,7 +387,7 @@ class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
     From a σ that is too small or too large by ``factor`` on, there are no points.
     """
 
-    factor: Factor = SIGMA_FACTOR_FINDING
+    factor: Factor = MIN_FINDING_SIGMA_FACTOR
 
     def score(self, evidence: Evidence) -> ShareAndReason:
         """Score the verdict on the joint NIS of north and east."""
@@ -505,9 +505,11 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
         return (2.0 + quarter_count) / 4.0, f"{statement}. The closure was accepted. {comment}"
 
 
-def _score_corrections(corrections: Mapping[Way, OrUnavailable[Correction]]) -> ShareAndReason:
+def _score_corrections(
+    corrections: Mapping[CorrectionName, OrUnavailable[Correction]],
+) -> ShareAndReason:
     """Return 1 for a corrected path, plus 1 if the correction reduces the ATE."""
-    ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
+    ways: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
     corrected_paths = [
         correction
         for correction in map(corrections.get, ways)

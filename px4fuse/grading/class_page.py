@@ -17,8 +17,8 @@ from px4fuse.assignment.sheet import format_cell_number
 from px4fuse.grading.model import TOTAL_TITLE, Entry, GradedReport, Item, Override, list_titles
 from px4fuse.text import format_number
 from px4fuse.webpage import frame
-from px4fuse.webpage.frame import Cell, Column, Part, Row
-from px4fuse.webpage.safe import local_link, template
+from px4fuse.webpage.frame import Cell, Column, Row, Section
+from px4fuse.webpage.safe import load_template, local_link
 
 BIN_COUNT = 10
 MISSING = "no submission"
@@ -58,7 +58,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        above=_above_html(entries, counts),
+        html_above=_above_html(entries, counts),
         noun=("student", "students"),
         columns=(
             Column("Student"),
@@ -83,7 +83,7 @@ def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
     totals = [entry.total for entry in entries if entry.total is not None]
     max_points = max((entry.max_points for entry in entries if entry.max_points > 0.0), default=1.0)
     reports = [report for entry in entries if (report := entry.counted_report)]
-    return template("grading/above.html").render(
+    return load_template("grading/above.html").render(
         students=len(entries),
         counts=counts,
         averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
@@ -173,15 +173,15 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     redrawn_links = (
         [("Redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
     )
-    report_parts = (frame.links_part("Report", redrawn_links),)
+    report_parts = (frame.links_section("Report", redrawn_links),)
     return Row(cells, tuple(_tags(entry)), (*_details(entry), *box_parts), report_parts)
 
 
-def _details(entry: Entry) -> Iterator[Part]:
+def _details(entry: Entry) -> Iterator[Section]:
     """Yield the details that the page shows if a row is opened."""
-    report, comment = entry.counted_report, frame.prose_part("Your comment", entry.comment)
+    report, comment = entry.counted_report, frame.prose_section("Your comment", entry.comment)
     if report is None:
-        yield frame.list_part("Missing", ["No submission."])
+        yield frame.list_section("Missing", ["No submission."])
         yield comment
         return
     verdict = report.verdict
@@ -202,24 +202,24 @@ def _details(entry: Entry) -> Iterator[Part]:
         f"{name}: {'' if is_named else 'not '}named" for name, is_named in report.mistakes.items()
     ]
     attempts = [f"{other.submission}: {other.status}" for other in entry.other_reports]
-    yield frame.list_part("Flags", entry.flags, warn=True)
-    yield frame.list_part(
+    yield frame.list_section("Flags", entry.flags, is_warning=True)
+    yield frame.list_section(
         "Pending: action required",
         [report.pending_action] if report.pending_action else [],
-        warn=True,
+        is_warning=True,
     )
-    yield frame.list_part("Verification", verdict.reasons)
+    yield frame.list_section("Verification", verdict.reasons)
     titles = ("Value", "Report", "New run") if differences else ()
-    yield frame.table_part("Numbers that differ", titles, differences)
+    yield frame.table_section("Numbers that differ", titles, differences)
     title = "Points (proposed)" if report.pending_action else "Points"
-    yield frame.table_part(
+    yield frame.table_section(
         title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2)
     )
     yield comment
-    yield frame.list_part("Mistakes of this flight", named_texts)
-    yield frame.pairs_part("Answer form", [*form_rows(report.form)] if report.form else [])
-    yield frame.prose_part("Text of the student", report.notes)
-    yield frame.list_part("Other attempts", attempts)
+    yield frame.list_section("Mistakes of this flight", named_texts)
+    yield frame.pairs_section("Answer form", [*form_rows(report.form)] if report.form else [])
+    yield frame.prose_section("Text of the student", report.notes)
+    yield frame.list_section("Other attempts", attempts)
 
 
 def _points_cell(entry: Entry) -> Cell:
@@ -240,7 +240,7 @@ def _points_cell(entry: Entry) -> Cell:
     return Cell(text, entry.total, ", ".join(notes), "", share)
 
 
-def _point_boxes(entry: Entry) -> Part:
+def _point_boxes(entry: Entry) -> Section:
     """Make input boxes for the items that the instructor scores, and for the total.
 
     Other rows of overrides.csv are included, because the downloaded file replaces overrides.csv.
@@ -263,4 +263,4 @@ def _point_boxes(entry: Entry) -> Part:
         if title not in max_by_title
     ]
     identity = entry.student_id or (report.submission if report else "")
-    return frame.boxes_part("Your points and comments", identity, rows, other_rows)
+    return frame.boxes_section("Your points and comments", identity, rows, other_rows)

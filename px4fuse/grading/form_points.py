@@ -13,7 +13,7 @@ import msgspec
 
 from px4fuse.answer_form import MISTAKES, Answers, QuantityAnswer, StudentMistake
 from px4fuse.assignment.truth import FormTruth, TrueMistake
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR
 from px4fuse.record import table
 
 # points that each false claim costs, and number of false claims from which no mistake has points
@@ -290,7 +290,7 @@ def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
         # "consistent" gets half of the points if σ is wrong by a small factor only
         is_nearly_right = (
             verdict.factor is not None
-            and verdict.factor < SIGMA_FACTOR_FINDING
+            and verdict.factor < MIN_FINDING_SIGMA_FACTOR
             and answer == "consistent"
         )
         shares.append(1.0 if is_right else 0.5 if is_nearly_right else 0.0)

@@ -51,9 +51,9 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
 from px4fuse.trajectory.rotation import (
     conjugate,
+    cumulative_product,
     from_vector,
     multiply,
-    running_product,
     skew,
     to_vector,
 )
@@ -184,7 +184,7 @@ def _stretch(
     time_s = step_us * 1e-6
     rotation = attitude(motion.at(time_s)).body_to_ned
     true_quaternions = sensors.quaternions(rotation)
-    integrated_attitude = running_product(
+    integrated_attitude = cumulative_product(
         np.concatenate([true_quaternions[:1], from_vector(rotation_rad)])
     )
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
