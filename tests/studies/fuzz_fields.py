@@ -44,7 +44,7 @@ import one_thread  # noqa: E402, F401 - before NumPy
 import mavlink_tools  # noqa: E402
 import numpy as np  # noqa: E402
 from click.testing import CliRunner  # noqa: E402
-from conftest import page_of  # noqa: E402
+from conftest import blank_page  # noqa: E402
 from exchange import replace  # noqa: E402
 from mavlink_tools import Aisle, Recorder, frame, message, raw_frame, stamp  # noqa: E402
 from pypdf import PdfReader  # noqa: E402
@@ -529,7 +529,7 @@ def run_command(
             stack.enter_context(warnings.catch_warnings())
             warnings.simplefilter("error")
             if not draw:
-                stack.enter_context(mock.patch.object(pdf, "render", page_of))
+                stack.enter_context(mock.patch.object(pdf, "render", blank_page))
             done = CliRunner().invoke(cli, words)
     except TookTooLongError as error:
         outcome.add_fault("limits", f"{where}: more than {SLOW_S:.0f} s ({place_of(error)})")

@@ -31,7 +31,7 @@ import one_thread  # noqa: E402, F401 - before NumPy
 import click  # noqa: E402
 from class_tools import run_in_turn  # noqa: E402
 from click.testing import CliRunner  # noqa: E402
-from conftest import REPOSITORY, SAMPLES, page_of  # noqa: E402
+from conftest import REPOSITORY, SAMPLES, blank_page  # noqa: E402
 from fuzz_fields import (  # noqa: E402
     DRAWN_SHARE,
     bases,
@@ -240,7 +240,7 @@ def run_once(name: str, rng: random.Random, out: Path) -> tuple[str, str]:
         for module in (grading, workers):
             stack.enter_context(mock.patch.object(module, "run_bounded", run_in_turn))
         if rng.random() > DRAWN_SHARE:
-            stack.enter_context(mock.patch.object(pdf, "render", page_of))
+            stack.enter_context(mock.patch.object(pdf, "render", blank_page))
         done = CliRunner().invoke(cli, words)
     failure = done.exception
     if isinstance(failure, Px4FuseError):
