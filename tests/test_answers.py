@@ -43,9 +43,8 @@ def test_an_empty_form_says_nothing_and_explains_every_mistake(tmp_path: Path) -
 def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
     text = EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = -0.367")
     text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
-    found = read(
-        tmp_path, text.replace('verdict_kf = ""', 'verdict_kf = "overstated"')
-    )  # former name
+    former = 'verdict_ours = "overstated"'  # former name
+    found = read(tmp_path, text.replace('verdict_kf = ""', former))
     (claim,) = found.mistakes
     assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)
