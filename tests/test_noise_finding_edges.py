@@ -96,7 +96,7 @@ def test_setting_deviation_severity_at_limits(
 
 
 def test_deviating_settings_lists_larger_deviation_first() -> None:
-    held = made(HeldOutCheck, gain_nats=0.25)
+    held = made(HeldOutCheck, log_likelihood_gain_per_measurement=0.25)
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11), held_out=held)
     worse, other = noises.deviating_settings(analysis(source=MOVING, tuning=fitted))
     assert (worse.id, worse.caused_by) == ("sigma_a_too_large", None)
