@@ -1,4 +1,4 @@
-"""Results to change in tests: of the shipped report, and of a small loop."""
+"""Results for tests: those of the example report, and of a small loop."""
 
 import copy
 import json
@@ -25,7 +25,7 @@ NONE = Unavailable("it", "nobody asked", "Ask.")
 
 
 def correction(rmse: float, moved_m: float) -> Correction:
-    """A correction with one score."""
+    """Return a correction with one score."""
     statistics = Statistics(9, rmse, rmse, rmse, 0.0, rmse, rmse)
     score = Score(
         alignment="se3",
@@ -100,8 +100,8 @@ LOOP = to_plain(
 )
 
 
-def changed(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
-    """Results with the values at some paths, "__" for dots, replaced; ``...`` removes."""
+def changed_results(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
+    """Return results with changed values by path ("__" instead of dots); ``...`` removes one."""
     changed_ = copy.deepcopy(results)
     for path, value in values.items():
         *parents, last = path.split("__")
@@ -115,11 +115,11 @@ def changed(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
     return changed_
 
 
-def decoded(results: dict[str, Any]) -> Results:
-    """Results as they are read from a report."""
+def decode_results(results: dict[str, Any]) -> Results:
+    """Decode results as from a report."""
     return read_results(json.dumps(results).encode())
 
 
 def finding(name: str, severity: str = "warning") -> dict[str, Any]:
-    """A finding as results hold it."""
+    """Return a finding as in results."""
     return {"id": name, "severity": severity, "message": "", "evidence": {}, "remedy": ""}

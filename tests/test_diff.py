@@ -159,7 +159,7 @@ def test_changes_with_new_error_are_worse(clean):
 # -- the list of measures --------------------------------------------------------------------------
 
 
-def test_measures_have_no_path_twice_and_intervals_that_exist(clean):
+def test_measures_have_unique_paths_and_valid_intervals(clean):
     paths = [one["path"] for one in MEASURES]
     assert len(set(paths)) == len(paths)
     found = numbers(clean.results)

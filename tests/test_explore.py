@@ -15,14 +15,14 @@ import click
 import numpy as np
 import pytest
 from browser import Browser, Elements
-from cli_tools import done, refused
+from cli_tools import error_line, run_checked
 from exchange import replace
 from explore_tools import ask, box, mouse, open_view, settle, show
 from flights import Imu, aisle_flight, unexplained
 
 from px4fuse.analysis import Analysis, run_comparison
 from px4fuse.cli.compare import compare as compare_command
-from px4fuse.cli.inputs import comparison_request, read_student
+from px4fuse.cli.options import comparison_request, read_student
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.explore import page as pages
@@ -30,7 +30,7 @@ from px4fuse.explore.page import html_text
 from px4fuse.flight import Flight
 from px4fuse.request import ComparisonRequest
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 MARKUP = '<img src=x onerror="window.alive=1"></script><script>window.alive=2</script>\u202e'
 TABLE = """Object.fromEntries([...document.querySelectorAll('#table tbody tr')].map((row) =>
@@ -341,12 +341,12 @@ def test_explore_without_log_uses_sample_flight(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
-    assert "no log was given" in refused("explore").lower()
+    assert "no log was given" in error_line("explore").lower()
     assert list(tmp_path.iterdir()) == []
     here = tmp_path / "sample_logs"
     here.mkdir()
     (here / sample_log.name).write_bytes(sample_log.read_bytes())
-    output = done("explore", "--start", "20", "--end", "40").stderr
+    output = run_checked("explore", "--start", "20", "--end", "40").stderr
     assert "No log was given: the sample log aisle_uwb.ulg is used." in output
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
 
@@ -365,6 +365,6 @@ def test_open_option_opens_written_file(
         (["evaluate", f"{log}:ekf2", f"{log}:truth", "-o", "a.pdf", "--open"], "a.pdf"),
         (["compare", log, *part, "--json", "only.json", "-o", "other.pdf"], None),
     ):
-        done(*words)
+        run_checked(*words)
         assert opened == ([] if name is None else [str(tmp_path / name)])
         opened.clear()

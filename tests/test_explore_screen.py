@@ -21,7 +21,7 @@ from px4fuse.findings import find
 from px4fuse.request import ComparisonRequest
 from px4fuse.text import format_number
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 IN_VIEW = """(...names) => names.filter((name) => {
   const node = document.querySelector(name), box = node.getBoundingClientRect();

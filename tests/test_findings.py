@@ -13,7 +13,7 @@ import pytest
 from cli_tools import run_main
 from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplained, with_noises
-from golden_tools import agrees, rounded, value
+from golden_tools import assert_matches_golden, rounded, value
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
@@ -316,7 +316,7 @@ def test_find_fault_reports_evidence_and_no_other_error(at: int, fault: Fault) -
     assert first.severity == fault.severity
     assert {name: first.evidence.get(name) for name in fault.evidence} == fault.evidence
     lines = [f"{first.id} {first.severity} {value(first.evidence)}", first.message, first.remedy]
-    agrees("findings", [rounded(line) for line in lines], paragraph=at)
+    assert_matches_golden("findings", [rounded(line) for line in lines], paragraph=at)
     errors = {f.id for f in findings if f.severity == "error" and f.caused_by is None}
     assert errors <= {fault.id, ALSO_ERROR.get(fault.id)}
 

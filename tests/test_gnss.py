@@ -675,7 +675,7 @@ def test_read_gnss_damaged_fix_is_dropped_with_velocity(tmp_path):
     "recorded", [False, pytest.param(True, marks=pytest.mark.reallogs)], ids=["model", "real EKF2"]
 )
 def test_reconstruct_fixes_recovers_missing_fixes(recorded, request):
-    """Of a flight with all fixes every fourth to sixth is kept, and two innovations per second."""
+    """Keep every fourth to sixth fix of a complete flight, and two innovations per second."""
     if recorded:
         folder = request.getfixturevalue("shared_logs")
         flight = read_log(folder / "gps" / "v1.16.1_gps_fullrate.ulg")

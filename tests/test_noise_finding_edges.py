@@ -157,7 +157,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
     updates.iloc[:19] = [0.9, 9.0]
     updates["gain_position"] *= [1.0] * 20 + [0.5] * 9 + [1.0] * 2 + [2.0] * 9
     after = pd.Series(1.0 / (1.0 + growth), index=index)
-    after.iloc[20] = 1e-9  # one of them is an outlier
+    after.iloc[20] = 1e-9  # one measurement is an outlier
     both = pd.concat([after, pd.Series(7.0, index=index[:-1] + 0.1)]).sort_index()
     replay = SimpleNamespace(updates=updates, steps=both.to_frame("position_variance_m2"))
     slow = {"verdict": "overconfident", "lag1_autocorrelation": 0.31, **parts}

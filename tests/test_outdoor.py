@@ -1,4 +1,4 @@
-"""Outdoor flights: simulated GNSS against the truth, its EKF2, and the findings."""
+"""Outdoor flights: simulated GNSS against ground truth, EKF2, and the findings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli_tools import done, refused
+from cli_tools import error_line, run_checked
 from ekf2_tools import opened
 from hypothesis import given
 from hypothesis import strategies as st
@@ -33,7 +33,7 @@ from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
 from px4fuse.simulation.mistakes import Mistakes, parse
 from px4fuse.simulation.scenario import Scenario, make_scenario
-from px4fuse.trajectory.rotation import interpolate, matrix
+from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 OUTDOOR = make_scenario("outdoor", seed=5)
 pytestmark = pytest.mark.usefixtures("quick_filter")
@@ -101,7 +101,7 @@ def test_simulated_field_and_height_have_stated_noise(tmp_path: Path) -> None:
         measured.index.to_numpy(), flight.truth.attitude.index.to_numpy(),
         flight.truth.attitude[Columns.QUATERNION].to_numpy(),
     )  # fmt: skip
-    expected = np.einsum("nji,j->ni", matrix(true), sensors.EARTH_FIELD_GAUSS)
+    expected = np.einsum("nji,j->ni", to_matrix(true), sensors.EARTH_FIELD_GAUSS)
     off = measured.drop(columns="fused_3d").to_numpy() - expected
     before = measured.index < 60.0
     np.testing.assert_allclose(off[before].mean(axis=0), 0.0, atol=0.008)
@@ -250,11 +250,11 @@ def test_attitude_error_heading_mistake_follows_with_lag() -> None:
 
 def test_simulate_outdoor_command_uses_kind_defaults(tmp_path: Path) -> None:
     arguments = "simulate", "--kind", "outdoor", "-o", tmp_path / "o.ulg"
-    output = done(*arguments, "--speed", "3").output
+    output = run_checked(*arguments, "--speed", "3").output
     assert "outdoor, 3 laps of a square of 30 m at 3 m/s" in output
     assert "GNSS, 0.4 m at 5 Hz" in output
     for more, expected in (
         (["--assignment", "r.csv"], "--kind outdoor"),
         (["--mistake", "yaw=10"], "--mistake yaw requires --kind aisle or loop"),
     ):
-        assert expected in refused(*arguments, *more)
+        assert expected in error_line(*arguments, *more)

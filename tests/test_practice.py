@@ -16,7 +16,7 @@ import click
 import numpy as np
 import pytest
 from browser import Browser
-from cli_tools import done
+from cli_tools import run_checked
 from explore_tools import ask, axe, serious, settle, show
 from hypothesis import given
 from hypothesis import strategies as st
@@ -197,7 +197,7 @@ def test_page_source_does_not_show_answers(quiz: Path) -> None:
         flight = json.loads(content)["flight"]
         assert flight["findings"] == flight["summary"] == []
         assert "mistake" not in content
-        assert "px4fuse compare 'flight" in flight["command"]["bare"]
+        assert "px4fuse compare 'flight" in flight["command"]["base"]
     for one in answers:
         assert one["summary"]
         for mistake in one["mistakes"]:
@@ -313,10 +313,10 @@ def test_practice_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(click, "launch", opened.append)
     # the content of the page is tested above
     monkeypatch.setattr("px4fuse.practice.practice_text", lambda *given: repr(given[:3]))
-    done("practice", "--seed", "3", "--flights", "1")
+    run_checked("practice", "--seed", "3", "--flights", "1")
     page = tmp_path / "reports" / "practice_3.html"
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [page]
     assert page.read_text(encoding="utf-8") == "(3, 1, 1)"
     assert opened == []  # without --open and without a terminal
-    done("practice", "--seed", "3", "--flights", "1", "--open", "-o", "a.html")
+    run_checked("practice", "--seed", "3", "--flights", "1", "--open", "-o", "a.html")
     assert opened == [str(tmp_path / "a.html")]

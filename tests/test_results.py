@@ -7,7 +7,7 @@ import jsonschema
 import pytest
 from exchange import replace
 from flights import unexplained
-from results_tools import EXAMPLE, LOOP, changed, decoded
+from results_tools import EXAMPLE, LOOP, changed_results, decode_results
 
 import px4fuse
 from px4fuse.analysis import explain
@@ -52,7 +52,7 @@ def test_schema_accepts_results_only(one):
         {"extra": 1}, {"provenance": ...}, {"schema__name": "px4fuse-tuning"}, {"loop": {}},
         {"schema__version": "1.0"}, {"loop": {"what": "loop"}}, {"student__name": 7},
     ):  # fmt: skip
-        assert not validator.is_valid(json.loads(json.dumps(changed(one, **wrong)))), wrong
+        assert not validator.is_valid(json.loads(json.dumps(changed_results(one, **wrong)))), wrong
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_results_too_few_updates_have_reason_not_zero(sample_flight):
 
 
 def test_to_json_rejects_nan_and_infinity():
-    made = decoded(EXAMPLE)
+    made = decode_results(EXAMPLE)
     for number in (math.nan, math.inf):
         broken = replace(made, settings=replace(made.settings, dt_s=number))
         with pytest.raises(ValueError, match="not JSON compliant"):
@@ -147,20 +147,20 @@ def test_read_results_invalid_file_is_refused(given, said):
 )
 def test_read_results_schema_violation_is_refused(values, said):
     with pytest.raises(ResultsError, match=f"does not follow the schema.*{said}|{said}"):
-        decoded(changed(**values))
+        decode_results(changed_results(**values))
 
 
 def test_read_results_fields_of_a_newer_minor_version_are_ignored():
-    known = decoded(changed(schema__version="4.9999"))
-    more = changed(
+    known = decode_results(changed_results(schema__version="4.9999"))
+    more = changed_results(
         schema__version="4.9999", new=1, log__new={}, axes__aisle__filters__kf__new=[0.0],
         tuning__horizontal__held_out__new=None, source__available=[
             {**one, "new": "x"} for one in EXAMPLE["source"]["available"]],
     )  # fmt: skip
-    assert decoded(more) == known
-    assert replace(known, schema=decoded(EXAMPLE).schema) == decoded(EXAMPLE)
+    assert decode_results(more) == known
+    assert replace(known, schema=decode_results(EXAMPLE).schema) == decode_results(EXAMPLE)
     with pytest.raises(ResultsError, match="unknown field `new`"):
-        decoded({**more, "schema": EXAMPLE["schema"]})
+        decode_results({**more, "schema": EXAMPLE["schema"]})
 
 
 @pytest.mark.parametrize(
@@ -169,13 +169,13 @@ def test_read_results_fields_of_a_newer_minor_version_are_ignored():
 )
 def test_read_results_of_schema_3_names_the_version_to_use(provenance, said):
     with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:
-        decoded(changed(schema__version="3.0", provenance=provenance))
+        decode_results(changed_results(schema__version="3.0", provenance=provenance))
     assert str(raised.value).endswith(f"Create the report again, or read it with {said}")
 
 
 def test_read_results_cleans_keys_like_texts():
     nothing = {"what": "noises", "reason": "too short", "remedy": ""}
-    assert list(decoded(changed(tuning={"a\u202eb": nothing})).tuning) == ["ab"]
+    assert list(decode_results(changed_results(tuning={"a\u202eb": nothing})).tuning) == ["ab"]
 
 
 def test_to_json_numbers_have_ten_significant_digits():

@@ -1,4 +1,4 @@
-"""Rotations as quaternions, against closed forms and SciPy."""
+"""Quaternion rotations against closed forms and SciPy."""
 
 import math
 
@@ -7,32 +7,32 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from px4fuse.trajectory.rotation import (
+    cumulative_product,
     from_vector,
     interpolate,
-    matrix,
     multiply,
-    running_product,
     skew,
+    to_matrix,
     to_vector,
 )
 
 
-def test_a_rotation_that_hardly_turns_keeps_its_size() -> None:
+def test_to_vector_tiny_rotation_keeps_angle() -> None:
     tiny = np.array([1.0, 2e-14, -4e-14, 6e-14])
     for sign in (1.0, -1.0):
         np.testing.assert_allclose(to_vector(sign * tiny), [4e-14, -8e-14, 12e-14])
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 10, 50])
-def test_a_running_product_is_the_product(count: int) -> None:
+def test_running_product_equals_repeated_multiplication(count: int) -> None:
     turns = from_vector(np.random.default_rng(count).normal(0.0, 1.0, (count, 3)))
-    product, one = running_product(turns), np.array([1.0, 0.0, 0.0, 0.0])
+    product, one = cumulative_product(turns), np.array([1.0, 0.0, 0.0, 0.0])
     for row, turn in zip(product, turns, strict=True):
         one = multiply(one, turn)
         np.testing.assert_allclose(row, one, atol=1e-12)
 
 
-def test_between_two_quaternions_lies_their_middle() -> None:
+def test_interpolate_quaternions_gives_midpoint() -> None:
     known = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -1.0], [-1.0, 0.0, 0.0, 0.0]])
     middle = interpolate(np.array([0.5, 1.5]), np.arange(3.0), known)
     half = math.sqrt(0.5)
@@ -40,16 +40,16 @@ def test_between_two_quaternions_lies_their_middle() -> None:
     assert np.linalg.norm(middle, axis=1) == pytest.approx(1.0)
 
 
-def test_rotations_are_scipys() -> None:
+def test_rotation_functions_equal_scipy() -> None:
     rng = np.random.default_rng(1)
     turns = rng.normal(0.0, 0.7, (50, 3))
     q = from_vector(turns)
     theirs = Rotation.from_rotvec(turns)
-    assert matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
+    assert to_matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
     assert to_vector(q) == pytest.approx(turns, abs=1e-12)
     assert to_vector(-q) == pytest.approx(turns, abs=1e-12)
     assert to_vector(from_vector(np.zeros((1, 3)))) == pytest.approx(np.zeros((1, 3)))
     both = multiply(q[:25], q[25:])
-    assert matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
+    assert to_matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
     v, u = rng.normal(size=(2, 3))
     assert skew(v) @ u == pytest.approx(np.cross(v, u))

@@ -1,4 +1,4 @@
-"""EKF2 of simulated flights: against the truth, against its replay, and in the findings."""
+"""EKF2 of simulated flights against ground truth and its replay, and in the findings."""
 
 import numpy as np
 import pandas as pd

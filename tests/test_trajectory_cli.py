@@ -8,13 +8,13 @@ from typing import Any
 import jsonschema
 import pypdf
 import pytest
-from cli_tools import contents, refused, run
+from cli_tools import contents, error_line, run
 from click.testing import Result
 from conftest import REPOSITORY
 
 from px4fuse.results.contract import schema
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
@@ -23,7 +23,7 @@ ROWS = [line for line in SLAM.read_text().splitlines() if not line.startswith("#
 
 
 def results(*arguments: str | Path) -> dict[str, Any]:
-    """What a command prints with ``--json -``."""
+    """Return the JSON that a command prints with ``--json -``."""
     result = run(*arguments, "--json", "-")
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
@@ -179,7 +179,7 @@ def test_evaluate_other_settings_or_files_keep_old_report(desk, tmp_path, monkey
         written = {Path(name).stem for name in contents(tmp_path / "reports")}
         assert written == set(list(commands)[:count])
     before = contents(tmp_path / "reports")
-    assert "-o" in refused("evaluate", tmp_path / "other" / "s.tum", desk / "s.tum")
+    assert "-o" in error_line("evaluate", tmp_path / "other" / "s.tum", desk / "s.tum")
     assert contents(tmp_path / "reports") == before
 
 

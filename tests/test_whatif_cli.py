@@ -9,19 +9,19 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-from cli_tools import done
+from cli_tools import run_checked
 
 from px4fuse.analysis import WhatIfAnalysis, run_what_if
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight
-from px4fuse.report.whatif import NOT_PREDICTABLE, column_heads, reading, rows, sweep_table
+from px4fuse.report.whatif import NOT_PREDICTABLE, column_heads, rows, sweep_notes, sweep_table
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
 from px4fuse.results.reading import read_results
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def swept(sample_log: Path) -> WhatIfAnalysis:
 
 def test_whatif_results_have_logged_replayed_and_changed(sample_log: Path) -> None:
     options = "--set", "EKF2_EVP_NOISE=0.3", "--json", "-"
-    text = done("whatif", sample_log, *options).stdout
+    text = run_checked("whatif", sample_log, *options).stdout
     said = json.loads(text)
     jsonschema.validate(said, schema())
     assert isinstance(read_results(text.encode()), WhatIfResults)
@@ -52,7 +52,7 @@ def test_whatif_results_have_logged_replayed_and_changed(sample_log: Path) -> No
 
 def test_whatif_without_gnss_from_time_drifts_afterwards(sample_log: Path) -> None:
     options = "--without", "ev_pos", "--from", "100", "--json", "-"
-    said = json.loads(done("whatif", sample_log, *options).stdout)
+    said = json.loads(run_checked("whatif", sample_log, *options).stdout)
     jsonschema.validate(said, schema())
     assert said["whatif"]["without"] == {"ev_pos": 100.0}
     assert said["evaluated_s"][0][0] == 100.0
@@ -100,7 +100,7 @@ def test_whatif_sweep_keeps_set_parameters(swept: WhatIfAnalysis) -> None:
     assert nis == sorted(nis, reverse=True)
     assert sweep_table(swept)[0][0] == "EKF2_EVP_NOISE (m)"
     assert [row[0] for row in sweep_table(swept)[1]] == ["0.05", "0.1", "0.2"]
-    best, error, *_ = reading(swept)
+    best, error, *_ = sweep_notes(swept)
     assert "closest to 1 at EKF2_EVP_NOISE 0.1" in best
     least = min(values, key=lambda value: value.position_rmse_to_truth_m)
     assert f"smallest at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
@@ -182,7 +182,7 @@ def test_unpredictable_change_has_no_numbers(sample_flight: Flight) -> None:
     assert {line[3] for line in table} == {NOT_PREDICTABLE}
     assert all(NOT_PREDICTABLE not in line[:3] for line in table)
     assert [line[1] for line in sweep_table(told)[1]] == [NOT_PREDICTABLE] * 2
-    said = " ".join(reading(told))
+    said = " ".join(sweep_notes(told))
     assert "Not predictable: more than 35% of the samples would be rejected" in said
     assert "2 mm of position noise would change the result" in said
     assert "closest to 1" not in said

@@ -51,7 +51,7 @@ from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
-from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
+from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
 # Note in simulated logs, whose EKF2 is this model
@@ -478,7 +478,7 @@ def read_vision(
             interpolate(stamp, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
             for frame in (attitude, track.orientation)
         )
-        turn = matrix(multiply(published, conjugate(sent)))
+        turn = to_matrix(multiply(published, conjugate(sent)))
         position = np.einsum("nij,nj->ni", turn, position)
         variance = np.einsum("nij,nj->ni", turn**2, variance)
     age = record.vision_age_s

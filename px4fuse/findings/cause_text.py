@@ -8,9 +8,10 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.frame_rotation import HeadingError
+from px4fuse.filter.settings import UNITS
 from px4fuse.findings import cause_grouping as kinds
 from px4fuse.flight import Unavailable
-from px4fuse.request import OPTIONS
+from px4fuse.request import COMPARISON_OPTIONS
 from px4fuse.text import capitalise_first, format_number
 
 # Findings that state the same fault as a re-run in the summary, by kind of cause
@@ -91,7 +92,9 @@ def format_remedy(analysis: Analysis, cause: Intervention) -> str:
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
     settings = (changed.SIGMA_Z, changed.SIGMA_A, changed.CLOCK)
-    options = [f"{OPTIONS[name].name} {change.pop(name):g}" for name in settings if name in change]
+    options = [
+        f"{COMPARISON_OPTIONS[name]} {change.pop(name):g}" for name in settings if name in change
+    ]
     if change:
         actions.append(f"Set {remedy.format_settings(change)}.")
     if options:
@@ -142,7 +145,7 @@ def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> st
                 else f"positions rotated by {value:+.0f}°{mean}"
             )
         case changed.SIGMA_A | changed.SIGMA_Z:
-            label, unit = name[:7].upper(), OPTIONS[name].unit
+            label, unit = name[:7].upper(), UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
     flown, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit

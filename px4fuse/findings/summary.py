@@ -22,7 +22,7 @@ from px4fuse.findings.model import Finding, format_percent
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.readers.px4_ekf2 import OTHER_AIDING
+from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 from px4fuse.text import capitalise_first, format_factor
 
 MAX_PARAGRAPHS = 3  # paragraphs of the summary
@@ -232,7 +232,7 @@ def _gap_sentence(analysis: Analysis, finding: Finding) -> str:
 def _fused(ekf2: Ekf2 | Unavailable, start_s: float, end_s: float) -> list[str]:
     """Labels of aids that measure motion and that EKF2 fused without a break of half the span."""
     found = []
-    for name in (EV_POS.name, *OTHER_AIDING):
+    for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
         log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
         if log is not None and "fused" in log.samples:
             fused = log.samples["fused"].loc[start_s:end_s]

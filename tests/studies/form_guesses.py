@@ -1,9 +1,9 @@
-"""What forms earn that nobody thought about, on assigned flights.
+"""Points of guessed answer forms on assigned flights.
 
-``python tests/studies/form_guesses.py`` draws assignments as ``simulate --assignment`` does, takes
-the right answers of each, and prints the mean share of the points of: forms filled in at random,
-"none" everywhere, the constant form that earns most (the commonest mistake with the commonest
-answers), and forms filled in with the truth. ``--students`` gives another number of flights.
+``python tests/studies/form_guesses.py`` draws assignments like ``simulate --assignment`` and prints
+the mean share of the points of random forms, of "none" everywhere, of the best constant form (the
+most frequent mistake with the most frequent answers), and of correct forms. ``--students`` sets the
+number of flights.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GUESSES = 20
 
 
 def truth(number: int) -> FormTruth:
-    """The right answers to the flight of one student of a mixed class."""
+    """Return the correct answers for the flight of one student of a mixed class."""
     student = Person(f"s{number}")
     _, answer = fly(SECRET, student, "mixed")
     assert answer.form is not None
@@ -37,7 +37,7 @@ def truth(number: int) -> FormTruth:
 
 
 def at_random(rng: np.random.Generator) -> Answers:
-    """A form that knows what can be said and nothing else."""
+    """Return a form with random valid answers."""
     named = [name for name in MISTAKES if name != "none"]
     kinds = rng.choice(named, int(rng.integers(1, 4)), replace=False)
     claims = tuple(
@@ -59,7 +59,7 @@ def at_random(rng: np.random.Generator) -> Answers:
 
 
 def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
-    """The same for everybody: a mistake of the likeliest sizes, and the commonest of all else."""
+    """Yield constant forms: one mistake of several sizes, and the most frequent other answers."""
 
     def common(values: list[str]) -> str:
         return Counter(values).most_common(1)[0][0]
@@ -88,7 +88,7 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
 
 
 def right(one: FormTruth) -> Answers:
-    """The truth, as a student would write it."""
+    """Return the correct form."""
     claims = []
     for wrong in one.mistakes:
         parameter, (low, high), _ = cures(wrong, one)[0]

@@ -1,9 +1,9 @@
-"""How often the 95 % intervals of SIGMA_Z, SIGMA_A and the clock offset cover the truth.
+"""Coverage of the 95 % intervals of SIGMA_Z, SIGMA_A and the clock offset.
 
-``python tests/studies/intervals.py [FLIGHTS]`` flies every scenario of the detectors'
-rates, and the usual one with outliers, with as many seeds (by default 50), and prints a line for
-each: coverage, bias of SIGMA_Z and of the offset with the standard error of its mean, how much the
-offset scatters against its stated sigma, and false clock findings. Nothing is asserted.
+``python tests/studies/intervals.py [FLIGHTS]`` simulates each scenario of detector_rates.py, and
+the default one with outliers, with this number of seeds (default 50). It prints for each: coverage,
+bias of SIGMA_Z and of the offset with the standard error of its mean, scatter of the offset divided
+by its σ, and false clock findings. Nothing is asserted.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ Job = tuple[int, str, str]
 
 
 def covers(noise: Noise, true: float) -> bool:
-    """Whether an interval, open ends included, holds a value."""
+    """Return True if an interval, which may have open ends, contains a value."""
     return (noise.low or 0.0) <= true <= (noise.high or np.inf)
 
 
 def measured(job: Job) -> tuple[float, ...] | None:
-    """What one flight gives; None where there is no estimate."""
+    """Return the estimates of one flight; None without an estimate."""
     seed, scenario, mistake = job
     flown = replace(clean(scenario).flight(seed), ekf2=False, truth=False)
     flight = simulate_flight(flown, parse((mistake,) if mistake else ()))
@@ -57,7 +57,7 @@ def measured(job: Job) -> tuple[float, ...] | None:
 
 
 def lines(flights: int) -> Iterator[str]:
-    """One line for each scenario."""
+    """Yield one line for each scenario."""
     conditions = [(name, "") for name in SCENARIOS] + [(DEFAULT, each) for each in OUTLIERS]
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         for name, mistake in conditions:
