@@ -323,13 +323,13 @@ def tune_axes(
         kf_sigma_a.value or kf_sigma_a.high or kf_fit.noises.sigma_a_m_s2,
         final_sigma_z_m,
     )
-    log_likelihood_gain_per_measurement = kf_fit.score(chosen_noises) - kf_fit.score(final_noises)
+    gain_nats = kf_fit.score(chosen_noises) - kf_fit.score(final_noises)
     return AxisTuning(
         name=name,
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
-        log_likelihood_gain_per_measurement=log_likelihood_gain_per_measurement / count,
+        log_likelihood_gain_per_measurement=gain_nats / count,
         before=_assess_innovations(intervals[0], chosen_noises, is_outlier),
         after=_assess_innovations(intervals[0], final_noises, is_outlier),
         outlier_time_s=axes[0].measurement_time_s[-count:][is_outlier],
