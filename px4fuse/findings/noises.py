@@ -30,7 +30,7 @@ from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
 from px4fuse.filter.settings import UNITS, Settings
-from px4fuse.filter.signals import within
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.cause_text import format_remedy, format_remedy_of_ekf2, format_rerun, kind_of
@@ -310,7 +310,7 @@ def _noise_above_reported(analysis: Analysis) -> str:
     """Action if EKF2's parameter keeps R above the accuracy that the receiver reports, else ""."""
     name = aid_of(analysis).noise
     parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
-    stated = within(analysis.source.samples, analysis.segment)[Columns.POSITION_VARIANCE[0]]
+    stated = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION_VARIANCE[0]]
     stated_m = float(np.sqrt(stated.median()))
     if not parameter_m > NOISE_RATIO_TOLERANCE * stated_m:  # false for NaN too
         return ""

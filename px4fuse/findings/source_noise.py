@@ -12,7 +12,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
-from px4fuse.filter.signals import within
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.findings.cause_grouping import WHITE_RATIO
 from px4fuse.findings.model import Found, error, format_percent, note, warning
@@ -79,7 +79,11 @@ def repeats(analysis: Analysis) -> Found:
     """Detect positions that repeat the previous one while the vehicle moves."""
     if hardly_moved(analysis):
         return
-    sent = within(analysis.source.samples, analysis.segment)[Columns.POSITION].dropna().to_numpy()
+    sent = (
+        cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
+        .dropna()
+        .to_numpy()
+    )
     again = np.all(np.diff(sent, axis=0) == 0.0, axis=1)
     count, share = int(again.sum()), float(again.mean()) if len(again) else 0.0
     if count < MIN_REPEATS or share < MIN_REPEAT_SHARE:

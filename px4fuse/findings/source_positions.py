@@ -14,7 +14,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
-from px4fuse.filter.signals import within
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, too_slow
@@ -207,7 +207,9 @@ def stated_variance(analysis: Analysis) -> Found:
     smooths = isinstance(analysis.smoothing, Unavailable) or low_pass(analysis) is not None
     if smooths or not isinstance(tuned, AxisTuning) or not source.origin.is_vision:
         return
-    reported = within(source.samples, analysis.segment)[Columns.POSITION_VARIANCE[:2]].dropna()
+    reported = cut_to_segment(source.samples, analysis.segment)[
+        Columns.POSITION_VARIANCE[:2]
+    ].dropna()
     noise, low, high = tuned.sigma_z.value, tuned.sigma_z.low, tuned.sigma_z.high
     if reported.empty or noise is None or low is None or high is None:
         return
@@ -250,7 +252,7 @@ def _error_m(analysis: Analysis) -> float | None:
 
 def motion_range_m(comparison: Comparison) -> float:
     """Larger horizontal extent (m) of the source in the segment, 5 to 95 % of the positions."""
-    inside = within(comparison.source.samples, comparison.segment)
+    inside = cut_to_segment(comparison.source.samples, comparison.segment)
     low, high = inside[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))
 
@@ -260,7 +262,9 @@ def hardly_moved(comparison: Comparison) -> bool:
 
     The noise is estimated from second differences, which a steady motion does not affect.
     """
-    inside = within(comparison.source.samples, comparison.segment)[Columns.POSITION[:2]].dropna()
+    inside = cut_to_segment(comparison.source.samples, comparison.segment)[
+        Columns.POSITION[:2]
+    ].dropna()
     second_difference_m = np.median(np.abs(np.diff(inside.to_numpy(), 2, axis=0)), axis=0)
     noise_m = float(second_difference_m.max()) / SECOND_DIFFERENCE_FACTOR
     return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, NOISE_RANGE_FACTOR * noise_m)

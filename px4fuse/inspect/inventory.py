@@ -14,7 +14,13 @@ from px4fuse.comparison.preparation import flight_for_source
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
-from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_acceleration, within
+from px4fuse.filter.signals import (
+    IMU_GAP_INTERVALS,
+    IMU_GAP_S,
+    Segment,
+    cut_to_segment,
+    ned_acceleration,
+)
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
 from px4fuse.inspect.tables import NO_POSITION, unavailable_parts
@@ -297,7 +303,7 @@ def _abilities(
         yield AnalysisOption("compare", False, reason)
     else:
         source, segment = compared.source, compared.segment
-        count, span = len(within(source.samples, segment)), (segment.start_s, segment.end_s)
+        count, span = len(cut_to_segment(source.samples, segment)), (segment.start_s, segment.end_s)
         description = "KF with {}, {} samples, {:.1f} s to {:.1f} s"
         yield AnalysisOption("compare", True, description.format(source.name, count, *span))
         acceleration, rows_by_name = compared.lines[0].acceleration, _ekf2_and_truth_rows(compared)

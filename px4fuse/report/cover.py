@@ -11,7 +11,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.signals import AISLE, Axis, within
+from px4fuse.filter.signals import AISLE, Axis, cut_to_segment
 from px4fuse.findings import Finding, by_root, finding_title
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.log import LogInfo
@@ -227,7 +227,7 @@ def _tracks(comparison: Comparison) -> dict[str, Coordinates]:
     segment, flight = comparison.segment, comparison.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
-        inside = within(frame, segment)
+        inside = cut_to_segment(frame, segment)
         return inside["north_m"].to_numpy(), inside["east_m"].to_numpy()
 
     tracks = {"measurement": cut(comparison.source.samples)}

@@ -155,10 +155,10 @@ def _link_file(
 
 def split_part(source: str) -> tuple[str, str]:
     """Split ``LOG:vio`` into file and track, without access to files."""
-    from px4fuse.loop.tracks import FLIGHT_PARTS  # noqa: PLC0415
+    from px4fuse.loop.tracks import TRACK_NAMES  # noqa: PLC0415
 
     name, colon, tail = source.rpartition(":")
-    return (name, f":{tail}") if colon and tail in FLIGHT_PARTS else (source, "")
+    return (name, f":{tail}") if colon and tail in TRACK_NAMES else (source, "")
 
 
 def _repeat_comparison(
