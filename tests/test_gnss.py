@@ -487,7 +487,7 @@ def test_what_if_gnss_delay_changes_heading(models):
         return logged, after
 
     for model in models.values():
-        assert {stretch.field is None for stretch in model.inputs.stretches} == {False}
+        assert {segment.field is None for segment in model.inputs.segments} == {False}
         assert model.agreement.heading_rms_difference_deg < 0.5
         # height follows the logged EKF2 height
         state, replayed = model.flight.ekf2.state["down_m"], model.flown.published["down_m"]
@@ -508,7 +508,7 @@ def test_what_if_without_aid_predicts_error(models):
 
     def without(*names: str) -> tuple[Summary, float]:
         found = what_if(models["nominal"], [{}], dict.fromkeys(names, 60.0))
-        assert found.judged[0][0] == 60.0
+        assert found.evaluated_s[0][0] == 60.0
         (after,) = found.whatif
         error = after.position_rmse_to_truth_m
         return after, error
@@ -530,7 +530,7 @@ def test_what_if_without_aid_predicts_error(models):
 def test_what_if_unused_parameter_raises_settings_error(models):
     with pytest.raises(SettingsError, match="EKF2 fused GNSS position in this log"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
-    own = replace(models["nominal"].inputs.received, own_times=True)
+    own = replace(models["nominal"].inputs.received, has_measurement_times=True)
     model = replace(models["nominal"], inputs=replace(models["nominal"].inputs, received=own))
     with pytest.raises(SettingsError, match="EKF2_GPS_DELAY has no effect in this log"):
         what_if(model, [{"EKF2_GPS_DELAY": 50.0}])
@@ -604,7 +604,7 @@ def test_read_gnss_noise_is_limited_as_in_ekf2(parameters, fused, tmp_path):
     np.testing.assert_allclose(found.stamp_s, samples.index + 0.11)
     np.testing.assert_allclose(found.arrival_s, found.stamp_s)
     np.testing.assert_allclose(found.variance_m2[:, :2], 100.0)
-    assert not found.own_times
+    assert not found.has_measurement_times
     assert (found.velocity_m_s is not None) is fused
     if found.velocity_m_s is not None and found.velocity_variance_m2_s2 is not None:
         np.testing.assert_allclose(found.velocity_m_s[0], [1.0, 2.0, 3.0])
@@ -628,7 +628,7 @@ def test_read_gnss_driver_time_replaces_delay(tmp_path):
     record = made(FusionRecord, parameters={"EKF2_GPS_DELAY": 110.0, "EKF2_GPS_MODE": 0.0})
     flight = flight_of(outdoors(own_s=0.09, EKF2_GPS_MODE=0.0), tmp_path)
     found = read_gnss(flight, flight.ekf2, record)
-    assert found.own_times
+    assert found.has_measurement_times
     assert found.velocity_m_s is None
     # the timestamp is chosen so that the delay leads to the driver's time
     np.testing.assert_allclose(found.stamp_s - 0.11, track_of(flight).samples.index)
@@ -640,7 +640,7 @@ def test_read_gnss_driver_time_replaces_delay(tmp_path):
 def test_rules_gnss_reset_depends_on_release(north_m, parameters, scale, with_velocity):
     delayed = pd.DataFrame({"north_m": [north_m]})
     record = made(FusionRecord, parameters=parameters, per_step_biases=False, delayed=delayed)
-    rules = _rules(record, 0.01, gnss=True)
+    rules = _rules(record, 0.01, is_gnss=True)
     assert (rules.reset_scale, rules.with_velocity) == (scale, with_velocity)
     assert (rules.reset_s, rules.stop_s) == (7.0, np.inf)
 

@@ -20,7 +20,7 @@ from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.causal_replays import TURN, cause_of
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.ekf2.whatif import HEADING_STAYS, what_if
+from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
@@ -193,7 +193,7 @@ def test_what_if_without_magnetometer_keeps_heading(tmp_path: Path) -> None:
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
     model = opened(read_log(log))
     result = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
-    assert result.notes[0] == HEADING_STAYS
+    assert result.notes[0] == HEADING_LOGGED_NOTE
     errors = [one.heading_error_mean_deg for one in (result.logged, *result.whatif)]
     assert errors[1] == pytest.approx(errors[0], abs=0.1)
     with pytest.raises(SettingsError, match="does not contain all fused magnetometer samples"):

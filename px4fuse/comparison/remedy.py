@@ -147,7 +147,7 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
     """
     delay = inputs.aid.delay
     parameter = PARAMETERS[delay]
-    if delay_ms > parameter.maximum or inputs.received.own_times:
+    if delay_ms > parameter.maximum or inputs.received.has_measurement_times:
         return {}
     changes = {delay: max(float(round(delay_ms)), parameter.minimum)}
     needed, flown = changes[delay] + ARRIVAL_MS, inputs.settings

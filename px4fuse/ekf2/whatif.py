@@ -1,4 +1,4 @@
-"""EKF2 with other parameters: logged, replayed and changed results over the same times."""
+"""EKF2 with other parameters: results as logged, as replayed and with changes, at equal times."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share
 
 ANALYSIS_NAME = "EKF2 what-if"
-# fraction of the replayed samples that the log must contain to measure gaps between fusions
+# fraction of the replayed samples that the log must contain to measure the time between fusions
 MIN_COMPLETE_SHARE = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -40,16 +40,16 @@ NO_TRUTH = Unavailable(
     "Record motion capture (ATT_POS_MOCAP) besides the position source, or fly in simulation.",
 )
 # Notes for flights on GNSS
-HEADING_FOLLOWS = (
+HEADING_REPLAYED_NOTE = (
     "Heading is replayed with the magnetometer (as flown it differs from the log by {:.1f}° RMS)"
 )
-HEADING_STAYS = (
+HEADING_LOGGED_NOTE = (
     "The logged EKF2 heading is used in all columns: the log does not contain all fused "
     "magnetometer samples"
 )
-HEIGHT_FOLLOWS = "Height is replayed with the logged height sensors"
-HEIGHT_STAYS = "The logged EKF2 height is used in all columns"
-OWN_HEADING, OWN_HEIGHT = (
+HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
+HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
+HEADING_NOT_REPLAYED, HEIGHT_NOT_REPLAYED = (
     Unavailable(
         "heading error",
         "with external vision the replay uses the logged EKF2 heading",
@@ -63,10 +63,10 @@ OWN_HEADING, OWN_HEIGHT = (
 MIN_EVALUATED_S = 5.0
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
-# Position noise (m) and number of repeated runs. A result is predictable if this noise hardly
-# changes it
-DISTURBED_M, DISTURBED_RUNS = 0.002, 4
-# Rejected share below which no repeated runs are needed, and above which nothing is predictable
+# Additional position noise (m) and number of repeated runs with this noise. A result is predictable
+# if the noise hardly changes the result
+DISTURBANCE_M, DISTURBANCE_RUNS = 0.002, 4
+# Rejected share up to which no repeated runs are needed, and above which no result is predictable
 MIN_REJECTED_SHARE, MAX_REJECTED_SHARE = 0.02, 0.35
 # s; time without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
 # common.h)
@@ -82,7 +82,7 @@ class AxisSummary(Record, frozen=True):
     Attributes
     ----------
     nis_mean : float
-        Over all evaluated samples, including rejected ones.
+        Mean NIS over all evaluated samples, including rejected ones.
     nis_band : (float, float)
         95 % band of the mean NIS of a consistent filter.
     innovation_std_m : float
@@ -119,7 +119,10 @@ class HeightSummary(Record, frozen=True):
 
     @property
     def steady(self) -> bool:
-        """Return True if predictable: no height reset (not modelled), and few rejections."""
+        """Return True if the result is predictable: no height reset and few rejections.
+
+        The replay does not model a height reset.
+        """
         is_without_reset = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
         return is_without_reset and self.rejected_share <= MAX_REJECTED_SHARE
 
@@ -159,10 +162,10 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     rejected_share: Share
     longest_without_fusion_s: NotNegative | Unavailable
     resets: Count
-    heading_error_mean_deg: float | Unavailable = OWN_HEADING
+    heading_error_mean_deg: float | Unavailable = HEADING_NOT_REPLAYED
     heights: Mapping[str, HeightSummary] = {}
     others: Mapping[str, HeightSummary] = {}
-    height_rmse_to_truth_m: NotNegative | Unavailable = OWN_HEIGHT
+    height_rmse_to_truth_m: NotNegative | Unavailable = HEIGHT_NOT_REPLAYED
     late: Count = 0
     lost: Count = 0
     steady: bool = True
@@ -196,22 +199,22 @@ class WhatIf:
     Attributes
     ----------
     agreement : Agreement
-        Agreement of replay and log, the precondition for the rest.
+        Agreement of the replay with the log, which all other results require.
     logged, replayed : Summary
         As flown, from the log and from the model.
     whatif : tuple of Summary
         One per change of parameters.
-    judged : tuple of (float, float)
+    evaluated_s : tuple of (float, float)
         Evaluated times (s), equal for all columns.
     notes : tuple of str
-        One sentence each.
+        Limitations of the replay, one sentence each.
     """
 
     agreement: Agreement
     logged: Summary
     replayed: Summary
     whatif: tuple[Summary, ...]
-    judged: Spans
+    evaluated_s: Spans
     notes: tuple[str, ...]
 
     __repr__ = one_line_repr
@@ -246,41 +249,54 @@ def what_if(
         return model.agreement.as_unavailable(ANALYSIS_NAME)
     without = without or {}
     replays = replay_settings(model, settings, without=without)
-    flight, judged = model.flight, model.flown.judged_s
+    flight, evaluated_s = model.flight, model.flown.judged_s
     if without:
-        since = min(without.values())
-        # a further stretch would start from the log, in which the aid was fused
+        disabled_s = min(without.values())
+        # a later segment would start from a logged state into which the aid was fused
         remaining_spans = [
-            (max(start, since), end) for start, end in judged if end - since > MIN_EVALUATED_S
+            (max(start, disabled_s), end)
+            for start, end in evaluated_s
+            if end - disabled_s > MIN_EVALUATED_S
         ]
-        judged = tuple(remaining_spans[:1])
-        if not judged:
+        evaluated_s = tuple(remaining_spans[:1])
+        if not evaluated_s:
             raise SettingsError(
-                f"--from {since:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
+                f"--from {disabled_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
                 f"flight, which ends at {model.flown.judged_s[-1][1]:.0f} s. Choose an "
                 "earlier time."
             )
     gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
-        logged=_summarise_log(flight, model.flown, judged),
-        replayed=_summarise_replay(flight, model.flown, judged),
+        logged=_summarise_log(flight, model.flown, evaluated_s),
+        replayed=_summarise_replay(flight, model.flown, evaluated_s),
         whatif=_mark_unpredictable(
-            model, [_summarise_replay(flight, r, judged) for r in replays], judged, without
+            model,
+            [_summarise_replay(flight, r, evaluated_s) for r in replays],
+            evaluated_s,
+            without,
         ),
-        judged=judged,
+        evaluated_s=evaluated_s,
         notes=(
             *(_heading_and_height_notes(model) if replays and gnss else ()),
             *(note for replay in replays for note in _notes(model, replay)),
-            *(_deviation_note(model, replay, without, judged) for replay in replays if without),
+            *(
+                _deviation_note(model, replay, without, evaluated_s)
+                for replay in replays
+                if without
+            ),
         ),
     )
 
 
 def _heading_and_height_notes(model: Model) -> tuple[str, str]:
-    off_deg = model.agreement.heading_rms_difference_deg
-    heading = HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
-    return heading, HEIGHT_STAYS if model.inputs.height_reason else HEIGHT_FOLLOWS
+    difference_deg = model.agreement.heading_rms_difference_deg
+    heading = (
+        HEADING_LOGGED_NOTE
+        if difference_deg is None
+        else HEADING_REPLAYED_NOTE.format(difference_deg)
+    )
+    return heading, HEIGHT_LOGGED_NOTE if model.inputs.height_reason else HEIGHT_REPLAYED_NOTE
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
@@ -310,9 +326,9 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
 
 
 def _mark_unpredictable(
-    model: Model, summaries: Sequence[Summary], judged: Spans, without: Mapping[str, float]
+    model: Model, summaries: Sequence[Summary], evaluated_s: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
-    """Mark the results that change when noise is added to the positions."""
+    """Mark results as not predictable that change when noise is added to the positions."""
     runs = [[summary] for summary in summaries]
     uncertain_runs = [
         repeated_runs
@@ -320,22 +336,22 @@ def _mark_unpredictable(
         if repeated_runs[0].changed
         and MIN_REJECTED_SHARE < repeated_runs[0].rejected_share <= MAX_REJECTED_SHARE
     ]
-    for seed in range(DISTURBED_RUNS if uncertain_runs else 0):
-        disturbed_model = with_position_noise(model, DISTURBED_M, seed)
+    for seed in range(DISTURBANCE_RUNS if uncertain_runs else 0):
+        noisy_model = with_position_noise(model, DISTURBANCE_M, seed)
         repeated_replays = replay_settings(
-            disturbed_model,
+            noisy_model,
             [repeated_runs[0].changed for repeated_runs in uncertain_runs],
             without=without,
         )
         for repeated_runs, replay in zip(uncertain_runs, repeated_replays, strict=True):
-            repeated_runs.append(_summarise_replay(model.flight, replay, judged))
+            repeated_runs.append(_summarise_replay(model.flight, replay, evaluated_s))
     return tuple(
         replace(
             summary,
             steady=all(height.steady for height in summary.heights.values())
             and all(
-                disturbed_model.rejected_share <= MAX_REJECTED_SHARE
-                for disturbed_model in summary.others.values()
+                noisy_model.rejected_share <= MAX_REJECTED_SHARE
+                for noisy_model in summary.others.values()
             )
             and (
                 not summary.changed
@@ -359,50 +375,52 @@ def _agree(runs: Sequence[Summary]) -> bool:
     )
 
 
-def _summarise_replay(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
+def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     updates = replay.updates
     evaluated_updates, fused_at_s = (
-        updates[inside_spans(updates.index, judged)],
+        updates[inside_spans(updates.index, evaluated_s)],
         updates["fused_at_s"].to_numpy(),
     )
     # the variance grows between two samples; both ends define the interpolation
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
-        s, r = (updates[f"{of}_variance_{axis}_m2"] for of in ("innovation", "observation"))
-        after = updates[f"position_variance_{axis}_m2"]
-        variance[f"{axis}_m2"] = np.column_stack([s - r, after]).ravel()
+        s, r = (
+            updates[f"{quantity}_variance_{axis}_m2"] for quantity in ("innovation", "observation")
+        )
+        variance_after = updates[f"position_variance_{axis}_m2"]
+        variance[f"{axis}_m2"] = np.column_stack([s - r, variance_after]).ravel()
     fused = evaluated_updates["fused_at_s"][
         (evaluated_updates["fused"] > 0) | (evaluated_updates["reset"] > 0)
     ]
     resets = evaluated_updates["reset"].sum()
     if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
-        resets += vision["reset"][inside_spans(vision["fused_at_s"], judged)].sum()
+        resets += vision["reset"][inside_spans(vision["fused_at_s"], evaluated_s)].sum()
     return _make_summary(
         flight,
         replay,
-        judged,
+        evaluated_s,
         evaluated_updates,
         replay.published,
         variance,
         replay.other_aid_updates,
         replay.delayed["heading_rad"],
         changed=replay.changed,
-        longest_without_fusion_s=_longest_between_fusions(fused.to_numpy(), judged),
+        longest_without_fusion_s=_longest_between_fusions(fused.to_numpy(), evaluated_s),
         resets=int(resets),
         late=replay.late,
         lost=replay.lost,
     )
 
 
-def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary:
+def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = logged_innovations(ekf2)
-    evaluated_updates = logged[inside_spans(logged.index, judged)]
+    evaluated_updates = logged[inside_spans(logged.index, evaluated_s)]
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
     resets = horizontal_resets_s(ekf2) - horizon_s
-    resets = resets[inside_spans(resets, judged)]
-    replayed = int(inside_spans(replay.updates.index, judged).sum())
+    resets = resets[inside_spans(resets, evaluated_s)]
+    replayed = int(inside_spans(replay.updates.index, evaluated_s).sum())
     longest: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log contains only {len(evaluated_updates)} of about {replayed} innovations",
@@ -410,7 +428,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
     )
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
         fused = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
-        longest = _longest_between_fusions(np.concatenate([fused, resets]), judged)
+        longest = _longest_between_fusions(np.concatenate([fused, resets]), evaluated_s)
     assert isinstance(flight.attitude, pd.DataFrame)  # a replay requires the attitude
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
@@ -419,7 +437,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
     return _make_summary(
         flight,
         replay,
-        judged,
+        evaluated_s,
         evaluated_updates,
         ekf2.state,
         None,
@@ -434,7 +452,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, judged: Spans) -> Summary
 def _make_summary(
     flight: Flight,
     replay: Ekf2Replay,
-    judged: Spans,
+    evaluated_s: Spans,
     evaluated_updates: pd.DataFrame,
     published: pd.DataFrame,
     variance: pd.DataFrame | None,
@@ -442,14 +460,15 @@ def _make_summary(
     heading: pd.Series,
     **more: Any,
 ) -> Summary:
-    """Compute a column from innovations, published position, variance and ``more``.
+    """Compute a column of the what-if table.
 
-    ``variance`` None stands for the logged variance; others are interpolated at its times.
+    ``variance`` is interpolated at the times of the logged variance; None: the logged variance.
+    ``more`` contains further fields of :class:`Summary`.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged = ekf2.variance
-    times = ekf2.state.index[inside_spans(ekf2.state.index, judged)].to_numpy()
+    times = ekf2.state.index[inside_spans(ekf2.state.index, evaluated_s)].to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
         position = along(published, Columns.POSITION, direction, times)
@@ -461,17 +480,19 @@ def _make_summary(
         if isinstance(logged, Unavailable):
             sigma = logged
         else:
-            variance_s = logged.index[inside_spans(logged.index, judged)].to_numpy()
+            variance_s = logged.index[inside_spans(logged.index, evaluated_s)].to_numpy()
             known_variance = logged if variance is None else variance
-            stated = np.interp(variance_s, known_variance.index, known_variance[f"{axis}_m2"])
-            sigma = float(np.sqrt(np.median(stated)))
+            sigma_variance = np.interp(
+                variance_s, known_variance.index, known_variance[f"{axis}_m2"]
+            )
+            sigma = float(np.sqrt(np.median(sigma_variance)))
         more[axis] = AxisSummary(
             *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
         )
     heights = {
-        name: _summarise_aid(evaluated, judged)
+        name: _summarise_aid(evaluated, evaluated_s)
         for name, each in other_aid_updates.items()
-        if len(evaluated := each[inside_spans(each.index, judged)])
+        if len(evaluated := each[inside_spans(each.index, evaluated_s)])
     }
     if vision := heights.pop(EV_POS.name, None):
         more["others"] = {EV_POS.name: vision}
@@ -480,7 +501,7 @@ def _make_summary(
     return Summary(
         samples=len(evaluated_updates),
         rejected_share=float(evaluated_updates["rejected"].mean()),
-        heading_error_mean_deg=_heading_error(flight, replay, heading, judged),
+        heading_error_mean_deg=_heading_error(flight, replay, heading, evaluated_s),
         **more,
     )
 
@@ -494,10 +515,10 @@ def _innovation_statistics(
     return float(np.mean(nu**2 / s)), nis_band(len(nu)), float(np.std(nu))
 
 
-def _summarise_aid(evaluated_updates: pd.DataFrame, judged: Spans) -> HeightSummary:
+def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> HeightSummary:
     rejected = evaluated_updates["rejected"].to_numpy()
     fused_s = evaluated_updates.index.to_numpy()[rejected == 0.0]
-    fusions_by_span = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in judged)
+    fusions_by_span = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in evaluated_s)
     longest_s = max(_longest_between_fusions(*part) for part in fusions_by_span)
     return HeightSummary(
         *_innovation_statistics(evaluated_updates, *axes_of(evaluated_updates)),
@@ -507,15 +528,15 @@ def _summarise_aid(evaluated_updates: pd.DataFrame, judged: Spans) -> HeightSumm
 
 
 def _heading_error(
-    flight: Flight, replay: Ekf2Replay, heading: pd.Series, judged: Spans
+    flight: Flight, replay: Ekf2Replay, heading: pd.Series, evaluated_s: Spans
 ) -> float | Unavailable:
     """Return the mean of a heading (rad) minus the true heading, in degrees."""
     if GNSS_POS.noise not in replay.settings:
-        return OWN_HEADING
+        return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
-    evaluated_heading = heading[inside_spans(heading.index, judged)]
+    evaluated_heading = heading[inside_spans(heading.index, evaluated_s)]
     true_at_samples = np.interp(
         evaluated_heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
@@ -523,25 +544,27 @@ def _heading_error(
     return float(np.degrees(np.nanmean(error)))
 
 
-def _longest_between_fusions(fused_s: Array, judged: Spans) -> float:
+def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
     """Return the longest time (s) between two fusions or the ends of the evaluated time."""
-    ends = [judged[0][0], judged[-1][1]]
+    ends = [evaluated_s[0][0], evaluated_s[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
 
 def _deviation_note(
-    model: Model, replay: Ekf2Replay, without: Mapping[str, float], judged: Spans
+    model: Model, replay: Ekf2Replay, without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
-    """Describe the difference to the replay as flown without some aids."""
+    """Describe the position difference between the replays without some aids and as flown."""
     flown, changed_position = (
-        replay_run.published.loc[inside_spans(replay_run.published.index, judged), Columns.POSITION]
+        replay_run.published.loc[
+            inside_spans(replay_run.published.index, evaluated_s), Columns.POSITION
+        ]
         for replay_run in (model.flown, replay)
     )
     *horizontal, down = np.abs((changed_position - flown).to_numpy()).T
     distance = np.hypot(*horizontal)
     lost_text = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
     heights = {*model.flown.other_aid_updates} - {EV_POS.name}
-    position = {*modelled_aids(model.inputs)} - {MAG.name} - heights
+    horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - heights
     height = f"; the height by at most {down.max():.3g} m" if heights & {*without} else ""
     give_up_note = (
         "; without a horizontal aid EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s), "
@@ -551,7 +574,7 @@ def _deviation_note(
     return (
         f"Without {lost_text} the published position differs from the replay as flown by at most "
         f"{distance.max():.3g} m (at {at_s:.1f} s), {distance[-1]:.3g} m at the end{height}"
-        + (give_up_note if position <= without.keys() else "")
+        + (give_up_note if horizontal_aids <= without.keys() else "")
     )
 
 

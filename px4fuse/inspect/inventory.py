@@ -320,7 +320,7 @@ def _abilities(
     yield _ability("aids", aids, description)
     inputs = prepare_inputs(flight)
     if not isinstance(inputs, Unavailable):
-        replayed_s = sum(float(np.ptp(stretch.time_s)) for stretch in inputs.stretches)
+        replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
         description = f"EKF2 replay with {inputs.aid.label}, {replayed_s:.0f} s"
     yield _ability("what-if", inputs, description)
 

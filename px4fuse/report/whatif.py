@@ -6,7 +6,7 @@ from typing import Any
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.whatif import DISTURBED_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHARE, Summary
+from px4fuse.ekf2.whatif import DISTURBANCE_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHARE, Summary
 from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
@@ -149,7 +149,7 @@ def reading(counterfactual: WhatIfAnalysis) -> list[str]:
     if not all(one.steady for one in counterfactual.whatif.whatif):
         lines.append(
             f"Not predictable: more than {MAX_REJECTED_SHARE:.0%} of the samples would "
-            f"be rejected, {1000.0 * DISTURBED_M:.0f} mm of position noise would change "
+            f"be rejected, {1000.0 * DISTURBANCE_M:.0f} mm of position noise would change "
             f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s. Each "
             "rejection then decides the next."
         )
@@ -167,7 +167,7 @@ def summary(counterfactual: WhatIfAnalysis) -> Page:
         write_explanation(page, counterfactual.why[AISLE])
     log, whatif_result = counterfactual.flight.log, counterfactual.whatif
     page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.judged)
+    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)
     page.labelled("Used", f"{spans} of the flight, in all columns")
     page.labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(counterfactual)]

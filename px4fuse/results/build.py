@@ -106,7 +106,7 @@ def whatif_results(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF, request, counterfactual.flight),
             agreement=whatif_result.agreement,
-            judged_s=whatif_result.judged,
+            judged_s=whatif_result.evaluated_s,
             asked=counterfactual.asked,
             logged=whatif_result.logged,
             replayed=whatif_result.replayed,

@@ -20,7 +20,7 @@ from px4fuse.ekf2.filter_recursion import (
     HEADING,
     NORTH,
     POSITION_COLUMNS,
-    StretchRun,
+    SegmentRun,
     Variant,
 )
 from px4fuse.ekf2.heights import barometer_samples_inside
@@ -35,9 +35,9 @@ from px4fuse.ekf2.replay_segments import (
     THETA,
     VELOCITY,
     HeightSamples,
-    Stretch,
+    ReplaySegment,
     add_field_states,
-    down_sampled,
+    downsample_imu,
     step_ends,
 )
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
@@ -129,20 +129,20 @@ def simulate_ekf2(
         Parameters of the log.
     """
     aid, aids = scenario.aid, _fused_aids(scenario)
-    stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu)
+    segment, time_us, nominal = _make_segment(scenario, mistakes, motion, imu)
     known = {name: float(np.float32(v)) for name, v in log_parameters.items()}
     if others:
         magnetometer, barometer = others
-        stretch = replace(stretch, heights=_barometer_heights(stretch, barometer))
+        segment = replace(segment, heights=_barometer_heights(segment, barometer))
         if not known[MAG.switch]:
-            stretch = _with_field(stretch, magnetometer)
+            segment = _with_field(segment, magnetometer)
     settings = settings_in_force(known, *aids)
     rules = GNSS_RULES if aid == GNSS_POS else RULES
-    step_s = float(np.median(stretch.step_s))
+    step_s = float(np.median(segment.step_s))
     length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICT_US))
     inputs = Inputs(
         settings=settings,
-        stretches=(stretch,),
+        segments=(segment,),
         received=_arrived_samples(source),
         # ev_pos_control.cpp: without bit 0 samples are evaluated but not fused
         rules=rules
@@ -162,9 +162,9 @@ def simulate_ekf2(
     return ekf2_topics(inputs, model_run, track, scenario.attitude_rate_hz, aid_source_hz)
 
 
-def _stretch(
+def _make_segment(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
-) -> tuple[Stretch, IntArray, Array]:
+) -> tuple[ReplaySegment, IntArray, Array]:
     """Return the flight in prediction steps about the true attitude, step times (µs), attitude."""
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
     interval = np.diff(time_us) * 1e-6
@@ -173,12 +173,12 @@ def _stretch(
         imu.fields[name][1:].astype(np.float64) * interval[:, None]
         for name in ("gyro_rad", "accelerometer_m_s2")
     )
-    turn, gain = down_sampled(rate, force, ends)
+    rotation_vectors, velocity_increments = downsample_imu(rate, force, ends)
     step_us = time_us[np.concatenate([[0], ends])]
     time = step_us * 1e-6
     rotation = attitude(motion.at(time)).body_to_ned
     nominal = sensors.quaternions(rotation)
-    gyro = running_product(np.concatenate([nominal[:1], from_vector(turn)]))
+    gyro = running_product(np.concatenate([nominal[:1], from_vector(rotation_vectors)]))
     attitude_difference = multiply(nominal, conjugate(gyro))
     error = np.zeros((len(time), 3))
     error[:, HEADING] = sensors.attitude_error(scenario, mistakes, time).as_rotvec()[:, HEADING]
@@ -189,14 +189,14 @@ def _stretch(
     variance = np.diagonal(covariance).copy()
     deviation = np.sqrt(variance)
     return (
-        Stretch(
+        ReplaySegment(
             time_s=time,
             step_s=np.diff(time),
             rotation=rotation,
             correction_rad=to_vector(
                 multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
             ),
-            force_m_s2=gain / np.diff(time)[:, None],
+            force_m_s2=velocity_increments / np.diff(time)[:, None],
             accelerometer_bias_m_s2=np.zeros(3),
             state=state,
             variance=variance,
@@ -213,19 +213,21 @@ def _stretch(
     )
 
 
-def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
+def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
     """Add the magnetic fields to the states, aligned on the ground."""
-    taken_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(stretch.step_s))
+    measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
     fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
-    return add_field_states(stretch, taken_s, gauss, 1.0, fields, np.full(6, FIELD_SD_GAUSS**2))
+    return add_field_states(
+        segment, measured_at_s, gauss, 1.0, fields, np.full(6, FIELD_SD_GAUSS**2)
+    )
 
 
-def _barometer_heights(stretch: Stretch, barometer: Topic) -> HeightSamples:
+def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSamples:
     """Return the barometer heights; the barometer is EKF2's only height sensor here."""
-    taken_s = sensors.time_s(barometer) - 0.5 * float(np.median(stretch.step_s))
+    measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    samples = barometer_samples_inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
+    samples = barometer_samples_inside(segment, measured_at_s, down_m, np.zeros(len(down_m)))
     return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
 
 
@@ -285,9 +287,9 @@ def _arrived_samples(source: sensors.SensedPositions) -> ReceivedPositions:
 
 
 def _topic_track(
-    inputs: Inputs, model_run: StretchRun, time_us: IntArray, nominal: Array
+    inputs: Inputs, model_run: SegmentRun, time_us: IntArray, nominal: Array
 ) -> TopicTrack:
-    stretch = model_run.stretch
+    segment = model_run.segment
     lag = round(inputs.horizon_s / inputs.step_s)
     state, _ = delayed_states(model_run, 0)
     resets, aided = _hold_without_aiding(model_run, state)
@@ -295,15 +297,15 @@ def _topic_track(
     for step, jump in resets:
         reset_sum_m[step:, :2] += jump
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
-    gyro = np.einsum("nij,nj->ni", stretch.rotation[1:], delay_by(state[:, GYRO_BIAS], lag)[1:])
-    attitude_steps = -stretch.correction_rad - gyro * stretch.step_s[:, None]
+    gyro = np.einsum("nij,nj->ni", segment.rotation[1:], delay_by(state[:, GYRO_BIAS], lag)[1:])
+    attitude_steps = -segment.correction_rad - gyro * segment.step_s[:, None]
     gyro_attitude_error = state[0, THETA] + np.concatenate(
         [np.zeros((1, 3)), np.cumsum(attitude_steps, axis=0)]
     )
     attitude_error = gyro_attitude_error + follow_attitude(
         state[:, THETA] - gyro_attitude_error, lag, inputs.step_s, inputs.horizon_s
     )
-    velocity, position = publish(stretch, state, reset_sum_m, attitude_error, lag, inputs.settings)
+    velocity, position = publish(segment, state, reset_sum_m, attitude_error, lag, inputs.settings)
     return TopicTrack(
         time_us=time_us,
         lag=lag,
@@ -318,17 +320,17 @@ def _topic_track(
 
 
 def _hold_without_aiding(
-    model_run: StretchRun, state: Array
+    model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
     """Return resets by step and times with an aid; without one hold the position of ``state``.
 
     EKF2 then fuses a fake position, which the model does not contain.
     """
-    events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
+    events, run, time = model_run.events[0], model_run, model_run.segment.time_s
     horizontal = slice(NORTH, EAST + 1)
     used = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
     last = np.zeros(len(time))
-    last[events.end[used]] = time[events.end[used]]
+    last[events.end_step[used]] = time[events.end_step[used]]
     aided = time - np.maximum.accumulate(last) <= NO_AIDING_S
     aiding_ends = np.flatnonzero(np.diff(aided.astype(int)) == -1) + 1
     aiding_starts = np.flatnonzero(np.diff(aided.astype(int)) == 1) + 1
@@ -339,7 +341,7 @@ def _hold_without_aiding(
         state[start:end, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
     for event in np.flatnonzero(run.reset[:, 0]):
-        step = int(events.end[event])
+        step = int(events.end_step[event])
         jump = run.innovation[event, 0, POSITION_COLUMNS]
         if not aided[step - 1]:
             jump = state[step, horizontal] - state[step - 1, horizontal]

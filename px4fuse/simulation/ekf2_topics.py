@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.filter_recursion import EAST, NORTH, POSITION_COLUMNS, StretchRun
+from px4fuse.ekf2.filter_recursion import EAST, NORTH, POSITION_COLUMNS, SegmentRun
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.replay_segments import POSITION
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
@@ -55,17 +55,17 @@ class TopicTrack:
     resets: tuple[tuple[int, Array], ...]
     aided: BoolArray
 
-    def timestamps(self, rows: IntArray, taken_s: Array | None = None) -> dict[str, Any]:
-        """Return the timestamps of messages about some steps; ``taken_s``: measurement times."""
+    def timestamps(self, rows: IntArray, measured_at_s: Array | None = None) -> dict[str, Any]:
+        """Return the timestamps of messages about some steps, with their measurement times (s)."""
         sampled_us = self.time_us[rows]
-        if taken_s is not None:
-            sampled_us = np.rint(taken_s * 1e6).astype(np.int64)
+        if measured_at_s is not None:
+            sampled_us = np.rint(measured_at_s * 1e6).astype(np.int64)
         return sensors.timestamps(sampled_us, self.time_us[rows + self.lag] - sampled_us)
 
 
 def ekf2_topics(
     inputs: Inputs,
-    model_run: StretchRun,
+    model_run: SegmentRun,
     track: TopicTrack,
     attitude_hz: float,
     aid_source_hz: float,
@@ -74,8 +74,8 @@ def ekf2_topics(
 
     Parameters
     ----------
-    model_run : StretchRun
-        Run of one variant in one stretch.
+    model_run : SegmentRun
+        Run of one variant in one segment.
     attitude_hz : float
         Rate of vehicle_attitude, which EKF2 estimates if it fuses a magnetometer.
     aid_source_hz : float
@@ -88,7 +88,7 @@ def ekf2_topics(
         *_barometer_topics(inputs, model_run, track),
         *(
             []
-            if model_run.stretch.field is None
+            if model_run.segment.field is None
             else _magnetometer_topics(inputs, model_run, track, attitude_hz)
         ),
         _flags_topic(inputs, model_run, track),
@@ -111,9 +111,9 @@ def _local_position_topic(track: TopicTrack, *, gnss: bool) -> Topic:
     return topic("vehicle_local_position", fields)
 
 
-def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> Topic:
+def _states_topic(model_run: SegmentRun, track: TopicTrack, *, gnss: bool) -> Topic:
     """Return estimator_states of v1.16: 25 states and 24 variances, horizontal positions as 0."""
-    end = model_run.events[0].end
+    end = model_run.events[0].end_step
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
     events = events[end[events] < len(track.time_us) - track.lag]
     events = events[sensors.keep_at_rate(sensors.seconds(track.time_us[end[events]]), STATES_HZ)]
@@ -132,15 +132,15 @@ def _states_topic(model_run: StretchRun, track: TopicTrack, *, gnss: bool) -> To
 
 
 def _aid_sources(
-    inputs: Inputs, model_run: StretchRun, track: TopicTrack, rate_hz: float
+    inputs: Inputs, model_run: SegmentRun, track: TopicTrack, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Return estimator_aid_src_*: one message per sample that arrived in time."""
     events, run, aid = model_run.events[0], model_run, inputs.aid
-    event_rows = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag))
+    event_rows = np.flatnonzero(events.usable & (events.end_step < len(track.time_us) - track.lag))
     event_rows = event_rows[
-        sensors.keep_at_rate(sensors.seconds(track.time_us[events.end[event_rows]]), rate_hz)
+        sensors.keep_at_rate(sensors.seconds(track.time_us[events.end_step[event_rows]]), rate_hz)
     ]
-    rows, sample, received = events.end[event_rows], events.sample[event_rows], inputs.received
+    rows, sample, received = events.end_step[event_rows], events.sample[event_rows], inputs.received
     aid_stamps = track.timestamps(rows, events.time_s[event_rows])
     measured = received.position_m[sample, :2]
     north, east = measured.T
@@ -179,23 +179,25 @@ def _aid_sources(
     )
 
 
-def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> list[Topic]:
+def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> list[Topic]:
     """Return estimator_aid_src_baro_hgt, or nothing without a barometer."""
-    heights, end = model_run.stretch.heights, model_run.events[0].end
+    heights, end = model_run.segment.heights, model_run.events[0].end_step
     if heights is None or model_run.heights is None:
         return []
     update_rows = model_run.heights.updates(BAROMETER.name, 0, end.astype(float))
     update_rows = update_rows[update_rows["fused_at_s"] < len(track.time_us) - track.lag].iloc[1:]
     update_rows = update_rows[sensors.keep_at_rate(update_rows.index.to_numpy(), OTHER_AIDS_HZ)]
     innovation, variance, rejected, fused, rows = update_rows.to_numpy().T
-    taken_s, step = update_rows.index.to_numpy(), rows.astype(np.intp)
-    measured = heights.down_m[np.searchsorted(heights.taken_s, taken_s)] - sensors.HOME[2]
+    measured_at_s, step = update_rows.index.to_numpy(), rows.astype(np.intp)
+    measured = (
+        heights.down_m[np.searchsorted(heights.measured_at_s, measured_at_s)] - sensors.HOME[2]
+    )
     noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
     return [
         _aid_source(
             BAROMETER,
             inputs.settings,
-            track.timestamps(step, taken_s),
+            track.timestamps(step, measured_at_s),
             measured,
             (innovation, variance, noise),
             (rejected > 0, fused > 0),
@@ -204,10 +206,10 @@ def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) 
 
 
 def _magnetometer_topics(
-    inputs: Inputs, model_run: StretchRun, track: TopicTrack, attitude_hz: float
+    inputs: Inputs, model_run: SegmentRun, track: TopicTrack, attitude_hz: float
 ) -> list[Topic]:
     """Return the topics that exist with a magnetometer: attitude, innovations and status."""
-    field, settings, end = model_run.stretch.field, inputs.settings, model_run.events[0].end
+    field, settings, end = model_run.segment.field, inputs.settings, model_run.events[0].end_step
     assert field is not None
     event_rows = np.flatnonzero(
         np.isfinite(model_run.field[:, 2, 0, 0]) & (end < len(track.time_us) - track.lag)
@@ -276,13 +278,13 @@ def _aid_source(
     return topic(name, fields, name if aid == GNSS_POS else "estimator_aid_src")
 
 
-def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> Topic:
+def _flags_topic(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> Topic:
     """Return estimator_status_flags: once a second and at each start or stop of fusion."""
-    events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
+    events, run, time = model_run.events[0], model_run, model_run.segment.time_s
     attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
     is_fusing = np.zeros(len(time), np.bool_)
-    stops = np.append(time[events.end[attempts]], np.inf)[1:]
-    for step, stop in zip(events.end[attempts].tolist(), stops.tolist(), strict=True):
+    stops = np.append(time[events.end_step[attempts]], np.inf)[1:]
+    for step, stop in zip(events.end_step[attempts].tolist(), stops.tolist(), strict=True):
         until = time[step] + inputs.rules.stop_s
         is_fusing[step : int(np.searchsorted(time, min(stop, until)))] = True
     changed = np.diff(is_fusing.astype(int), prepend=0) != 0
@@ -293,7 +295,7 @@ def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> To
         "control_status_changes": np.cumsum(changed)[rows],
         "cs_gnss_pos": is_fusing[rows] & gnss,
         "cs_ev_pos": is_fusing[rows] & (not gnss),
-        "cs_mag_hdg" if model_run.stretch.field is None else "cs_mag_3d": True,
+        "cs_mag_hdg" if model_run.segment.field is None else "cs_mag_3d": True,
     }
     return topic(
         "estimator_status_flags", fields | ({"cs_gnss_vel": is_fusing[rows]} if gnss else {})
