@@ -17,7 +17,7 @@ from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
 from px4fuse.findings import Finding, find
-from px4fuse.findings.summary import story
+from px4fuse.findings.summary import summarise_flight
 from px4fuse.record import Record, table
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
@@ -211,7 +211,7 @@ def _flight_data(one: PracticeFlight, number: int) -> tuple[dict[str, Any], str]
             _describe_mistake(mistake, size, findings)
             for mistake, size in zip(one.mistakes, one.sizes, strict=True)
         ],
-        "story": list(story(analysis, findings)),
+        "story": list(summarise_flight(analysis, findings)),
         "findings": data["findings"],
     }
     data |= {"story": [], "findings": []}

@@ -320,7 +320,7 @@ def test_noise_remedy_needs_parameter_above_accuracy(
     prepared = prepare(flight_of(log, tmp_path))
     monkeypatch.setattr(findings_tools, "SEGMENT", prepared.segment)
     no_model = Unavailable("replay", "no IMU", "Log it.")
-    words = noises._noise_above_reported(
+    words = noises._format_excessive_noise(
         stand_in(source=prepared.source, log=prepared.flight.log, ekf2_model=no_model)
     )
     assert bool(words) is expected

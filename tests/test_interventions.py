@@ -29,7 +29,7 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.summary import story
+from px4fuse.findings.summary import summarise_flight
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -84,7 +84,7 @@ def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of
         assert found.change[name] == pytest.approx(value, abs=within)
     assert found.is_enough
     # the summary names the re-run of this filter
-    told = story(analysis, find(analysis))[0]
+    told = summarise_flight(analysis, find(analysis))[0]
     ekf2, kf_case = told.split("Along the aisle KF ")
     assert "Re-run with " in (kf_case if owner == "kf" else ekf2)
 
@@ -104,7 +104,7 @@ def test_ekf2_changes_vibration_raises_noise_to_px4_limit() -> None:
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
     assert found.explains > 0.5
     told = "Re-run with EKF2_ACC_NOISE 1 m/s² instead of 0.35 m/s²: mean NIS "
-    assert told in story(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
+    assert told in summarise_flight(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
 
 
@@ -117,7 +117,7 @@ def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
     assert again.change == pytest.approx(before.change, abs=0.01)
     assert again.after == pytest.approx(before.after, rel=0.05)
     told = f"EKF2 has .* Re-run with timestamps corrected \\({offset_s:.2g} s early\\)"
-    ekf2 = story(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
+    ekf2 = summarise_flight(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
     assert re.search(told, ekf2)
 
 
@@ -170,7 +170,7 @@ def test_cause_has_difference_before_and_after() -> None:
     assert row.explains == pytest.approx(1.0 - (row.after / row.before) ** 2)
     assert row.explains > 0.8
     reduction = "Re-run of KF with this correction: difference KF - EKF2 0.24 → "
-    assert reduction in story(kf_case, find(kf_case))[1]
+    assert reduction in summarise_flight(kf_case, find(kf_case))[1]
     # corrected EKF2 differs from KF as much as EKF2 in the same flight without the mistake
     ekf2_case = flown("ekf2-gate=1", passes=6)
     right = compare(simulate_flight(Scenario(seed=5)), RIGHT)
@@ -179,7 +179,7 @@ def test_cause_has_difference_before_and_after() -> None:
         (rms_difference(ekf2_case), rms_difference(right)), rel=0.1
     )
     reduction = "Re-run of EKF2 with this correction: difference KF - EKF2 "
-    assert reduction in story(ekf2_case, find(ekf2_case))[1]
+    assert reduction in summarise_flight(ekf2_case, find(ekf2_case))[1]
 
 
 def test_outliers_are_excluded_at_shifted_timestamps() -> None:

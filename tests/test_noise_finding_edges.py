@@ -37,8 +37,8 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOutCheck, Noise
 from px4fuse.findings import Finding, cause_text, hidden_errors, loops, noises
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.noises import _is_default
-from px4fuse.findings.summary import story
+from px4fuse.findings.noises import _has_default_noises
+from px4fuse.findings.summary import summarise_flight
 from px4fuse.loop.model import Closure, Loop
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
@@ -98,7 +98,7 @@ def test_setting_deviation_severity_at_limits(
 def test_deviating_settings_lists_larger_deviation_first() -> None:
     held = made(HeldOutCheck, gain_nats=0.25)
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11), held_out=held)
-    worse, other = noises.deviating_settings(analysis(source=MOVING, tuning=fitted))
+    worse, other = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert (worse.id, worse.caused_by) == ("sigma_a_large", None)
     assert (other.id, other.caused_by) == ("sigma_z_large", "sigma_a_large")
     assert worse.severity == "error"
@@ -109,22 +109,22 @@ def test_deviating_settings_lists_larger_deviation_first() -> None:
         in worse.message
     )
     small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None), held_out=held)
-    worse, _ = noises.deviating_settings(analysis(source=MOVING, tuning=small))
+    worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
     assert (
         "times too small. The maximum-likelihood estimate is 9 m/s² (horizontal). P"
         in worse.message
     )
-    assert named(noises.deviating_settings, analysis(source=MOVING)) == {}
+    assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
 
 def test_deviating_settings_bound_is_typed_as_at_least_5_mm() -> None:
     bounded = tuned(Noise(None, None, 0.0021))
-    finding = only(noises.deviating_settings, analysis(source=MOVING, tuning=bounded))
+    finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == "[--sigma-z 0.005|0.005|1|None]."
     assert "is at least 480 times too large" in finding.message
     assert "estimate is at most 0.0021 m (horizontal). The" in finding.message
     known = analysis(source=MOVING, tuning=tuned(Noise(0.00211, 0.002, 0.0022)))
-    assert only(noises.deviating_settings, known).remedy == "[--sigma-z 0.00211|0.00211|1|None]."
+    assert only(noises.detect_wrong_settings, known).remedy == "[--sigma-z 0.00211|0.00211|1|None]."
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_deviating_settings_drift_or_hidden_error_keep_noise(
 ) -> None:
     estimate = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
     fitted = tuned(Noise(estimate, 0.9 * estimate, 1.1 * estimate), Noise(0.1, 0.09, 0.11))
-    assert list(named(noises.deviating_settings, analysis(tuning=fitted, **parts))) == expected
+    assert list(named(noises.detect_wrong_settings, analysis(tuning=fitted, **parts))) == expected
 
 
 def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
@@ -176,13 +176,13 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
 def test_near_zero_process_noise_needs_slow_correlated_filter(
     one: Any, expected: str | None
 ) -> None:
-    assert severity(noises.process_noise_near_zero, analysis(axes=(one,))) == expected
+    assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
 def test_near_zero_process_noise_reports_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
-    finding = only(noises.process_noise_near_zero, analysis(axes=(following(0.05), slower)))
+    finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
     assert finding.remedy == "Increase SIGMA_A."
     assert "5.0 % between updates, and the gain falls to 0.050. KF needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
@@ -190,7 +190,7 @@ def test_near_zero_process_noise_reports_response_time() -> None:
         (Noise(2.3456, 2.0, 3.0), " [--sigma-a 2.35|1|2.35|None]."), (Noise(None, None, 3.0), ""),
     ):  # fmt: skip
         one = analysis(axes=(following(0.05),), tuning=tuned(None, estimate))
-        assert only(noises.process_noise_near_zero, one).remedy == f"Increase SIGMA_A.{more}"
+        assert only(noises.detect_process_noise_near_zero, one).remedy == f"Increase SIGMA_A.{more}"
 
 
 # ---------------------------------------------------------------- variances
@@ -206,13 +206,20 @@ def test_variances_severity_at_limits() -> None:
         (1.563, "warning"), (1.56, None), (3.99, "warning"), (4.0, "error"), (0.25, "error"),
         (0.251, "warning"), (0.641, None), (0.639, "warning"),
     ):  # fmt: skip
-        assert severity(noises.variances, analysis(axes=(kf(nis),))) == expected, nis
-    assert severity(noises.variances, analysis(axes=(kf(9.0, verdict="consistent"),))) is None
+        assert (
+            severity(noises.detect_inconsistent_variances, analysis(axes=(kf(nis),))) == expected
+        ), nis
+    assert (
+        severity(
+            noises.detect_inconsistent_variances, analysis(axes=(kf(9.0, verdict="consistent"),))
+        )
+        is None
+    )
 
 
 def test_variances_group_axes_with_vertical_as_consequence() -> None:
     axes = (kf(2.0), kf(3.0, "east"), kf(9.0, "down"), kf(0.1, "aisle"))
-    found = tuple(noises.variances(analysis(axes=axes)))
+    found = tuple(noises.detect_inconsistent_variances(analysis(axes=axes)))
     assert [(one.id, one.caused_by, one.evidence["axis"]) for one in found] == [
         ("kf_variance_overstated", None, "aisle"), ("kf_variance_understated", None, "east"),
         ("kf_variance_understated", "kf_variance_understated", "down"),
@@ -224,12 +231,16 @@ def test_variances_group_axes_with_vertical_as_consequence() -> None:
 
 def test_variances_underconfident_drift_or_error_keep_noise() -> None:
     for nis, is_kept, level in ((0.2, True, "info"), (5.0, False, "error")):
-        finding = only(noises.variances, analysis(axes=(kf(nis),), source=ODOMETRY))
+        finding = only(
+            noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
+        )
         assert (finding.remedy == noises.KEEP_NOISES_DRIFT) is is_kept
         assert finding.severity == level
     for owner, there in (("kf", True), ("ekf2", False)):
         worse = {owner: statement(), f"{owner}_truth": against_truth(9.0)}
-        finding = only(noises.variances, analysis(axes=(kf(0.2), axis("east", **worse))))
+        finding = only(
+            noises.detect_inconsistent_variances, analysis(axes=(kf(0.2), axis("east", **worse)))
+        )
         assert (finding.remedy == noises.KEEP_NOISES_TRUTH) is there
         assert finding.evidence["cause"] == "elsewhere"
 
@@ -239,7 +250,7 @@ def test_variances_default_settings_lower_severity() -> None:
         ({}, "warning"), ({"sigma_z_m": 0.11}, "error"), ({"sigma_a_m_s2": 0.51}, "error"),
     ):  # fmt: skip
         one = analysis(axes=(kf(5.0),), settings=Settings(**chosen))
-        assert severity(noises.variances, one) == level
+        assert severity(noises.detect_inconsistent_variances, one) == level
 
 
 def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -> Any:
@@ -256,7 +267,9 @@ def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -
      ({}, 0.124, True), ({}, 0.126, False), ({}, 0.081, True), ({}, 0.079, False)],
 )  # fmt: skip
 def test_is_default_ekf2_noise_unless_sender_reports_another(flown, used_m, default):
-    assert _is_default(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
+    assert (
+        _has_default_noises(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
+    )
 
 
 @pytest.mark.parametrize(
@@ -317,7 +330,9 @@ def test_variances_cause_determines_action(owner, change, kind, action, monkeypa
     causes = (tried(owner, {"sigma_z_m": 7.0}, explains=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explains=1.6))  # fmt: skip
     one = axis("north", **{owner: statement(9.0, "variance understated")})
-    finding = only(noises.variances, analysis(axes=(one,), causes=causes, ekf2_model=model))
+    finding = only(
+        noises.detect_inconsistent_variances, analysis(axes=(one,), causes=causes, ekf2_model=model)
+    )
     assert action in finding.remedy
     assert finding.evidence["cause"] == kind
 
@@ -326,15 +341,18 @@ def test_variances_without_cause_report_closest_rerun() -> None:
     little = tried("kf", {"sigma_z_m": 7.0}, explains=0.4)
     causes = (little, tried("kf", {"sigma_z_m": 2.0}, "east"),
               tried("kf", {"clock_offset_s": 0.2}, explains=0.1))  # fmt: skip
-    finding = only(noises.variances, analysis(axes=(kf(9.0),), causes=causes))
+    finding = only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),), causes=causes))
     assert finding.evidence["cause"] == "elsewhere"
     assert finding.remedy == (
         f"{noises.NOT_EXPLAINED} Closest: re-run with SIGMA_Z 7 m instead of 1 m: mean NIS 9 → 3.7 "
         "(expected 1)."
     )
-    assert only(noises.variances, analysis(axes=(kf(9.0),))).remedy == noises.UNKNOWN_NOISE
+    assert (
+        only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),))).remedy
+        == noises.UNKNOWN_NOISE
+    )
     known = analysis(axes=(kf(9.0),), tuning=tuned())
-    assert only(noises.variances, known).remedy == noises.NOT_EXPLAINED
+    assert only(noises.detect_inconsistent_variances, known).remedy == noises.NOT_EXPLAINED
 
 
 def test_variances_noise_too_small_to_estimate_is_a_bound() -> None:
@@ -343,7 +361,7 @@ def test_variances_noise_too_small_to_estimate_is_a_bound() -> None:
             axes=(kf(0.2),), tuning=tuned(Noise(None, None, high)),
             causes=(tried("kf", {"sigma_z_m": typed}, before=0.2),),
         )  # fmt: skip
-        finding = only(noises.variances, one)
+        finding = only(noises.detect_inconsistent_variances, one)
         assert f"at this rate. [--sigma-z {typed}, and a smaller SIGMA_A|{typed}|" in finding.remedy
         assert finding.evidence["sigma_z_asked_m"] == high
         assert finding.evidence["sigma_z_asked_is_upper_bound"] == 1.0
@@ -382,7 +400,7 @@ def test_variances_noise_too_small_to_estimate_is_a_bound() -> None:
 def test_variances_ekf2_without_replay_compare_noises(one, estimate, parameters, text) -> None:
     tuning = {**tuned(estimate), "down": tuned(estimate)["horizontal"]}
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuning)
-    assert text in only(noises.variances, flown).remedy
+    assert text in only(noises.detect_inconsistent_variances, flown).remedy
 
 
 # ---------------------------------------------------------------- the loop and the drift
@@ -416,7 +434,7 @@ def loop(*closures: Closure, **parts: Any) -> Loop:
 def test_loop_closures_gnc_weight_determines_findings(
     closures: tuple[Closure, ...], expected: list[str]
 ) -> None:
-    found = list(loops.closures(loop(*closures, is_end_assumed=False)))
+    found = list(loops.detect_inconsistent_closures(loop(*closures, is_end_assumed=False)))
     assert [finding.id for finding in found] == expected
     if expected == ["loop_drift_understated"]:
         dropped = sum((each.weight_gnc or 0.0) < 0.5 for each in closures)
@@ -477,21 +495,21 @@ KF_OVERCONFIDENT = (
 
 def test_summary_without_truth_compares_innovations() -> None:
     difference = made(Difference, position_rmse_m=0.05)
-    (text,) = story(flight_of(along(1.0, 1.0, difference=difference)), ())
+    (text,) = summarise_flight(flight_of(along(1.0, 1.0, difference=difference)), ())
     assert text == (
         "Along the aisle KF and EKF2 differ by 0.050 m RMS. The log contains no ground truth. By "
         "its innovations along the aisle EKF2 is consistent. By its innovations along the aisle KF "
         "is consistent."
     )
-    (text,) = story(flight_of(along(0.25, 4.0, difference=difference)), ())
+    (text,) = summarise_flight(flight_of(along(0.25, 4.0, difference=difference)), ())
     assert "EKF2 is underconfident: σ is 2 times too large." in text
     assert text.endswith("KF is overconfident: σ is 2 times too small.")
     mute = axis(
         "aisle", ekf2=NONE, kf=statement(1.0), ekf2_state=made(pd.DataFrame), difference=difference
     )
-    (text,) = story(flight_of(mute), ())
+    (text,) = summarise_flight(flight_of(mute), ())
     assert "EKF2 is not tested for consistency: the log has no innovations or too few." in text
-    (text,) = story(flight_of(along(0.25, 4.0), source=ODOMETRY), ())
+    (text,) = summarise_flight(flight_of(along(0.25, 4.0), source=ODOMETRY), ())
     assert text.endswith("Both filters follow uwb, which may drift.")
 
 
@@ -499,14 +517,14 @@ def test_summary_names_cause_only_after_rerun() -> None:
     change = {"sigma_z_m": 3.0}
     for explains, is_cause in ((1.0, True), (0.5, True), (1.5, True), (0.49, False), (1.51, False)):
         causes = (tried("kf", change, "aisle", explains=explains),)
-        text = story(flight_of(with_truth(9.0), causes=causes), ())[0]
+        text = summarise_flight(flight_of(with_truth(9.0), causes=causes), ())[0]
         rerun = "too small. Re-run with SIGMA_Z 3 m instead of 1 m: mean NIS 9 → "
         assert (rerun in text) is is_cause
         assert text.endswith("too small. No tested change explains this.") is not is_cause
     # re-runs of another axis, another filter, or for another statistic
     for other in (tried("kf", change), tried("ekf2", change, "aisle"),
                   tried("kf", change, "aisle", "nees")):  # fmt: skip
-        text = story(flight_of(with_truth(9.0), causes=(other,)), ())[0]
+        text = summarise_flight(flight_of(with_truth(9.0), causes=(other,)), ())[0]
         assert text.endswith(KF_OVERCONFIDENT)
 
 
@@ -516,7 +534,7 @@ def test_summary_cause_of_both_filters_does_not_repeat_finding() -> None:
     both = along(4.0, 9.0, ekf2_truth=against_truth(1.0), kf_truth=against_truth(1.0))
     one = flight_of(both, causes=causes)
     outliers = Finding("source_outliers", "error", "So.", "Do.", headline="Outliers")
-    first, *more = story(one, (outliers,))
+    first, *more = summarise_flight(one, (outliers,))
     assert (
         "Re-run with 38 outliers removed: mean NIS 4 → 1 (expected 1). Along the aisle KF" in first
     )
@@ -537,7 +555,7 @@ def test_summary_difference_is_explained_by_cause_or_steps() -> None:
         )
         one = flight_of(with_truth(9.0), causes=(tried("kf", change, "aisle"), difference),
                         why={"aisle": why})  # fmt: skip
-        _, second = story(one, ())
+        _, second = summarise_flight(one, ())
         rerun = "Re-run of KF with this correction: difference KF - EKF2 0.50 → 0.20 m RMS."
         assert second == (rerun if is_explained else "The rest is the noise.")
 
@@ -545,7 +563,7 @@ def test_summary_difference_is_explained_by_cause_or_steps() -> None:
 def test_summary_hidden_error_uses_cause_of_nees() -> None:
     hides = along(1.0, 1.0, ekf2_truth=against_truth(1.0), kf_truth=against_truth(16.0))
     causes = (tried("kf", {"clock_offset_s": -0.25}, "aisle", "nees", before=16.0),)
-    text = story(flight_of(hides, causes=causes), ())[0]
+    text = summarise_flight(flight_of(hides, causes=causes), ())[0]
     assert "KF has a position RMSE of 0.40 m, but reports σ 0.10 m." in text
     assert text.endswith(
         "Re-run with timestamps corrected (0.25 s late): RMS of error / reported σ 4 → 1 (expected "
@@ -559,20 +577,22 @@ def test_summary_lists_findings_by_weight() -> None:
 
     why = made(Why, cause="The rest is the noise.")
     one = flight_of(along(1.0, 1.0), why={"aisle": why})
-    texts = story(one, (found("ekf2_resets"), found("no_motion", "info"), found("imu_gap")))
+    texts = summarise_flight(
+        one, (found("ekf2_resets"), found("no_motion", "info"), found("imu_gap"))
+    )
     assert texts[1:] == ("It is imu_gap.", "The rest is the noise.")
     spans = ((20.0, 30.0),)
-    texts = story(one, (found("imu_gap", spans_s=spans),))
+    texts = summarise_flight(one, (found("imu_gap", spans_s=spans),))
     assert texts[1] == "It is imu_gap (20.0 s to 30.0 s)."
     dated = found("imu_gap", spans_s=spans, evidence={"at_s": 20.0})
-    assert story(one, (dated,))[1] == "It is imu_gap."
+    assert summarise_flight(one, (dated,))[1] == "It is imu_gap."
     follows = found("imu_gap", caused_by="logger_dropouts")
-    assert "imu_gap" not in "".join(story(one, (found("logger_dropouts"), follows)))
+    assert "imu_gap" not in "".join(summarise_flight(one, (found("logger_dropouts"), follows)))
     looped = flight_of(along(1.0, 1.0), loop=closing(1.0, 200.0))
-    assert story(looped, ())[1] == (
+    assert summarise_flight(looped, ())[1] == (
         "The odometry has a loop closure error of 1.00 m after 200 m (0.5 %)."
     )
-    assert len(story(flight_of(along(1.0, 1.0), loop=closing(None)), ())) == 1
+    assert len(summarise_flight(flight_of(along(1.0, 1.0), loop=closing(None)), ())) == 1
 
 
 def test_summary_smaller_noise_contradicted_by_truth_is_no_cause() -> None:
@@ -580,8 +600,13 @@ def test_summary_smaller_noise_contradicted_by_truth_is_no_cause() -> None:
         tried("kf", {"sigma_z_m": 0.5}, "aisle", before=0.2), denied_by_truth=True
     )
     one = flight_of(with_truth(0.2), causes=(contradicted,))
-    assert story(one, ())[0].endswith("too large. The errors against ground truth need this σ.")
-    finding = only(noises.variances, analysis(axes=(kf(0.2, "aisle"),), causes=(contradicted,)))
+    assert summarise_flight(one, ())[0].endswith(
+        "too large. A smaller σ would be below the errors against ground truth."
+    )
+    finding = only(
+        noises.detect_inconsistent_variances,
+        analysis(axes=(kf(0.2, "aisle"),), causes=(contradicted,)),
+    )
     assert (finding.remedy, finding.severity) == (noises.KEEP_NOISES_TRUTH, "info")
     assert finding.evidence["cause"] == "elsewhere"
 
@@ -594,16 +619,16 @@ def test_summary_noise_shape_finding_replaces_setting_as_cause() -> None:
         ("source_outliers", "warning", True),
     ):  # fmt: skip
         found = Finding(name, level, "So.", "Do.", headline="It is so")  # type: ignore[arg-type]
-        text = story(one, (found,))[0]
+        text = summarise_flight(one, (found,))[0]
         assert ("Re-run with SIGMA_Z" in text) is is_named
         assert is_named or text.endswith(KF_OVERCONFIDENT)
     # a time offset stays a cause, unless a low pass delays the positions
     clock = (tried("kf", {"clock_offset_s": 0.25}, "aisle"),)
     shaped = Finding("source_coloured", "warning", "So.", "Do.", headline="It is so")
     with_offset = flight_of(with_truth(9.0), causes=clock)
-    assert "Re-run with timestamps" in story(with_offset, (shaped,))[0]
+    assert "Re-run with timestamps" in summarise_flight(with_offset, (shaped,))[0]
     smoothed = Finding("source_smoothed", "warning", "So.", "Do.", headline="It is so")
-    assert "Re-run" not in story(with_offset, (smoothed,))[0]
+    assert "Re-run" not in summarise_flight(with_offset, (smoothed,))[0]
 
 
 @pytest.mark.parametrize(

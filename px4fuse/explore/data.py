@@ -26,9 +26,9 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings import Finding, by_root, find, finding_title
+from px4fuse.findings import Finding, find, finding_title, group_by_root
 from px4fuse.findings.cause_grouping import NOISES
-from px4fuse.findings.summary import story
+from px4fuse.findings.summary import summarise_flight
 from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.text import capitalise_first
@@ -59,7 +59,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
         "source": analysis.source.name,
         # estimates from the innovations of a drifting source are not its noise
         "drifts": analysis.source.origin.may_drift,
-        "story": list(story(analysis, findings)),
+        "story": list(summarise_flight(analysis, findings)),
         "settings": _settings_data(analysis.settings),
         "main": analysis.main.axis.name,
         **signals,
@@ -78,7 +78,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
         },
         "findings": [
             {**_finding_data(first), "more": [_finding_data(one) for one in followers]}
-            for first, *followers in by_root(findings)
+            for first, *followers in group_by_root(findings)
         ],
         "command": _command_data(request, analysis),
         "offset": _offset_data(request, analysis),

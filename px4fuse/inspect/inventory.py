@@ -301,7 +301,7 @@ def _abilities(
         description = "KF with {}, {} samples, {:.1f} s to {:.1f} s"
         yield AnalysisOption("compare", True, description.format(source.name, count, *span))
         acceleration, rows_by_name = compared.lines[0].acceleration, _ekf2_and_truth_rows(compared)
-    slow = " ".join(finding.message for finding in imu.rates(flight))
+    slow = " ".join(finding.message for finding in imu.detect_low_rates(flight))
     if isinstance(acceleration, Unavailable):
         slow = f"{acceleration.reason}; KF assumes constant velocity"
     acceleration_text = "IMU rotated into NED with the attitude, gravity removed"
@@ -374,13 +374,20 @@ def _logging_advice(
     flight: Flight, compared: Comparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
     """Collect the actions of findings about the recording and of missing data, each once."""
-    findings = [*recording.loss(flight), *recording.clocks_set_back(flight)]
+    findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
     needs = [(remedy, "position")] if remedy else []
     if compared is not None:
-        findings += [*missing.source_as_sent(compared), *ekf2_not_fusing.detect(compared)]
-        findings += [*missing.innovations(compared), *recording.dropouts(compared)]
-    findings += imu.rates(flight)
-    needs += [(finding.remedy, finding_title(finding.id)) for finding in findings]
+        findings += [*missing.detect_source_not_logged(compared), *ekf2_not_fusing.detect(compared)]
+        findings += [
+            *missing.detect_missing_innovations(compared),
+            *recording.detect_dropouts(compared),
+        ]
+    findings += imu.detect_low_rates(flight)
+    needs += [
+        (finding.remedy, finding_title(finding.id))
+        for finding in findings
+        if not finding.remedy.startswith(missing.NOTHING_TO_SET)
+    ]
     # advice about the estimator's log is for PX4 only
     main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     needs += [

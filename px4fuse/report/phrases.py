@@ -132,14 +132,15 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "not with the true position. Check the error with ground truth or a loop."
         )
     small_deviations = [
-        f"{filter_name} {axis} ({format_factor(statement.sigma_error_factor)}×)"
+        f"{filter_name} {axis} (σ {format_factor(statement.sigma_error_factor)} times too "
+        f"{'large' if statement.sigma_factor > 1.0 else 'small'})"
         for axis, filter_name, statement in statements
         if statement.verdict != "consistent" and statement.sigma_error_factor < SIGMA_FACTOR_FINDING
     ]
     if small_deviations:
         notes.append(
-            f"Significant, but below the limit of {SIGMA_FACTOR_FINDING:g}× for a finding: "
-            f"{', '.join(small_deviations)}."
+            "Significant deviations below the limit of a finding "
+            f"({SIGMA_FACTOR_FINDING:g} times): {', '.join(small_deviations)}."
         )
     correlated = [
         f"{filter_name} {axis}, lag-1 autocorrelation {statement.lag1_autocorrelation:+.2f}"

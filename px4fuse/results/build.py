@@ -11,7 +11,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find, find_aids, find_loop
-from px4fuse.findings.summary import story
+from px4fuse.findings.summary import summarise_flight
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.record import to_serializable
@@ -55,7 +55,7 @@ def results(
             **_flight_fields(contract.COMPARISON, request, analysis),
             **{name: to_serializable(getattr(analysis, name)) for name in _COPIED_FIELDS},
             aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-            story=story(analysis, findings),
+            story=summarise_flight(analysis, findings),
             findings=findings,
             student=student,
         )
