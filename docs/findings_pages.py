@@ -40,7 +40,7 @@ from px4fuse.comparison.comparison import compare  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
-from px4fuse.findings import NAMES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
+from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
 from px4fuse.flight import Columns, Unavailable  # noqa: E402
@@ -64,21 +64,21 @@ LABEL_WIDTH = 26  # characters per line of an axis label
 SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
-    "ekf2_gate_small": (("ekf2-gate",), {}),
-    "source_clock_offset": (("clock-offset",), {}),
-    "source_clock_changes": (("clock-drift=8000ppm",), {}),
-    "source_stamps_of_arrival": (("clock-jump",), {}),
+    "ekf2_gate_too_small": (("ekf2-gate",), {}),
+    "source_time_offset": (("clock-offset",), {}),
+    "source_time_offset_changes": (("clock-drift=8000ppm",), {}),
+    "source_timestamps_are_arrival_times": (("clock-jump",), {}),
     "source_outliers": (("nlos",), {}),
-    "source_frame_turned": (("yaw",), {}),
-    "source_scale_wrong": (("scale=15%",), {}),
-    "source_jumps": (("jump",), {}),
-    "source_smoothed": (("smoothed",), {}),
-    "source_thinned": (("decimate=3Hz",), {}),
-    "source_variance_wrong": (("r-scale",), {}),
-    "sigma_a_small": ((), {"sigma_a_m_s2": 0.03}),
-    "sigma_a_large": ((), {"sigma_a_m_s2": 5.0}),
-    "sigma_z_small": ((), {"sigma_z_m": 0.02}),
-    "sigma_z_large": ((), {"sigma_z_m": 0.5}),
+    "source_frame_misaligned": (("yaw",), {}),
+    "source_scale_error": (("scale=15%",), {}),
+    "source_position_jump": (("jump",), {}),
+    "source_low_pass_filtered": (("smoothed",), {}),
+    "source_downsampled": (("decimate=3Hz",), {}),
+    "source_reported_variance_wrong": (("r-scale",), {}),
+    "sigma_a_too_small": ((), {"sigma_a_m_s2": 0.03}),
+    "sigma_a_too_large": ((), {"sigma_a_m_s2": 5.0}),
+    "sigma_z_too_small": ((), {"sigma_z_m": 0.02}),
+    "sigma_z_too_large": ((), {"sigma_z_m": 0.5}),
 }
 
 
@@ -160,14 +160,14 @@ def detectors() -> dict[str, str]:
     """File of the detector of each finding, without ``.py``."""
     found: dict[str, str] = {}
     for path in sorted(FINDINGS.glob("*.py")):
-        if path.stem in ("causes", "since", "story", "model", "__init__"):
+        if path.stem in ("causes", "since", "summary", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
-            if isinstance(node, ast.Constant) and node.value in NAMES:
+            if isinstance(node, ast.Constant) and node.value in TITLES:
                 found.setdefault(str(node.value), path.stem)
     # noises.py composes these ids of filter or option and direction
-    composed = (name for name in NAMES if name.startswith(("sigma_", "kf_var", "ekf2_var")))
+    composed = (name for name in TITLES if name.startswith(("sigma_", "kf_var", "ekf2_var")))
     return found | dict.fromkeys(composed, "noises")
 
 
@@ -238,13 +238,13 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
 
 def links(names: list[str]) -> str:
     """Links to the pages of other findings."""
-    return ", ".join(f"[{NAMES[name]}]({name}.md)" for name in dict.fromkeys(names))
+    return ", ".join(f"[{TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
 def packaged_examples(made: Mapping[str, Example]) -> dict[str, Any]:
     """Contents of examples.json for ``px4fuse explain``: message, action and rates by id."""
     table, contents = measured_rates(), {}
-    for name in NAMES:
+    for name in TITLES:
         rows = table[table["finding"] == name]
         clean = rows[rows["condition"] == "none"]
         contents[name] = {
@@ -288,7 +288,7 @@ def index() -> Iterator[str]:
         names = [name for name, entry in CATALOGUE.items() if entry.group == group]
         caption = group[0].upper() + group[1:]
         yield f"## {caption}\n\n| finding | id |\n|---|---|"
-        yield "\n".join(f"| [{NAMES[name]}]({name}.md) | `{name}` |" for name in names)
+        yield "\n".join(f"| [{TITLES[name]}]({name}.md) | `{name}` |" for name in names)
         yield f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n"
         yield "\n".join(names) + "\n```\n"
 
@@ -298,8 +298,8 @@ def write(folder: Path) -> None:
     mpl.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
     made = examples()
-    assert set(made) >= set(NAMES), f"no example: {sorted(set(NAMES) - set(made))}"
-    for name in NAMES:
+    assert set(made) >= set(TITLES), f"no example: {sorted(set(TITLES) - set(made))}"
+    for name in TITLES:
         text = "\n".join(page(name, made.get(name), folder))
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
         pyplot.close("all")

@@ -21,8 +21,8 @@ from px4fuse.comparison.estimates import (
     Progress,
     Tuning,
     estimate_frame_rotation,
-    noises_and_clock,
-    silent,
+    estimate_noises_and_clock,
+    ignore_progress,
     value_or_bound,
 )
 from px4fuse.comparison.flight_events import Events, collect_events
@@ -34,7 +34,7 @@ from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay
-from px4fuse.ekf2.steps import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import WhatIf, sweep_values, what_if
 from px4fuse.ekf2_parameters import check_parameters
 from px4fuse.errors import LogError, MissingDataError, SettingsError
@@ -76,7 +76,7 @@ class Analysis(Comparison):
     clock : ClockOffset or Unavailable
     ekf2_model : Model or Unavailable
         EKF2 prepared for replays; ``agreement`` states how well a replay matches the log.
-    why : mapping from axis name to Why or Unavailable
+    difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
         Steps that explain the difference KF - EKF2.
     loop : Loop or Unavailable
         Loop closure of the flight's odometry.
@@ -89,7 +89,7 @@ class Analysis(Comparison):
     tuning: Tuning
     clock: ClockOffset | Unavailable
     ekf2_model: Model | Unavailable
-    why: Mapping[str, Why | Unavailable]
+    difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
     loop: Loop | Unavailable
     heading: HeadingError | Unavailable
     request: ComparisonRequest | None = None
@@ -133,7 +133,7 @@ class Analysis(Comparison):
             self.flight,
             axes,
             self.settings,
-            sigma_a_m_s2=value_or_bound(axis_tuning.filter_sigma_a, self.settings.sigma_a_m_s2),
+            sigma_a_m_s2=value_or_bound(axis_tuning.sigma_a_two_state, self.settings.sigma_a_m_s2),
             sigma_z_m=value_or_bound(axis_tuning.sigma_z, self.settings.sigma_z_m),
             outlier_time_s=axis_tuning.outlier_time_s,
             clock_offset_s=offset_s,
@@ -194,7 +194,7 @@ class Analysis(Comparison):
     def _horizontal_estimate(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
         """Return the horizontal axes, their tuning and the significant time offset (s)."""
         clock, offset_s = self.clock, 0.0
-        if isinstance(clock, ClockOffset) and clock.determinable:
+        if isinstance(clock, ClockOffset) and clock.is_determinable:
             offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
         for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
             axis_tuning = self.tuning.get(name)
@@ -236,14 +236,14 @@ def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
     if isinstance(analysis, Analysis):
         for name, axis in analysis.axes.items():
             ekf2 = axis.filters["ekf2"]
-            if not isinstance(ekf2, Unavailable) and ekf2.verdict == "variance understated":
+            if not isinstance(ekf2, Unavailable) and ekf2.verdict == "overconfident":
                 failed[f"EKF2, {name}"] = ekf2.verdict
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
-    return failed | {aid.label: aid.verdict for aid in aids.values() if aid.is_bad}
+    return failed | {aid.label: aid.verdict for aid in aids.values() if aid.is_faulty}
 
 
 def run_or_evaluate_aids(
-    request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Analysis | AidsOnlyAnalysis:
     """Run a comparison as :func:`run`; without positions, check EKF2's aids only.
 
@@ -269,7 +269,7 @@ def run_or_evaluate_aids(
 
 
 def run(
-    request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Analysis:
     """Read a flight, compare KF with EKF2 and explain the difference.
 
@@ -289,7 +289,7 @@ def run(
     return replace(explain(run_comparison(request, progress, flight), progress), request=request)
 
 
-def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flight:
+def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
     """Read the recordings of a request and join them into one flight.
 
     Raises
@@ -326,7 +326,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = silent) -> Flig
 
 
 def run_comparison(
-    request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Comparison:
     """Read a flight and compare KF with EKF2, without the explanations.
 
@@ -337,7 +337,7 @@ def run_comparison(
 
 
 def prepare_comparison(
-    request: ComparisonRequest, progress: Progress = silent, flight: Flight | None = None
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Comparison:
     """Read a flight; choose source, segment and axes. Tuning and time offset need no more.
 
@@ -366,8 +366,8 @@ def prepare_comparison(
     prepared = prepare(flight, settings, **choices)
     if clock_offset != AUTO or request.position is not None:
         return prepared
-    _, clock = noises_and_clock(prepared, progress)
-    if isinstance(clock, Unavailable) or not clock.determinable:
+    _, clock = estimate_noises_and_clock(prepared, progress)
+    if isinstance(clock, Unavailable) or not clock.is_determinable:
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
             f"({clock.reason}).",
@@ -390,7 +390,7 @@ def _check_finite(**values: float | str | None) -> None:
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
 
 
-def run_loop(request: LoopRequest, progress: Progress = silent) -> Loop:
+def run_loop(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
     """Read a flight or a trajectory, measure its loop closure error and correct the path.
 
     Raises
@@ -425,7 +425,7 @@ class WhatIfAnalysis:
         True if the changes are the maximum-likelihood estimates.
     without : mapping from PX4's name of an aid to float
         Time (s) from which EKF2 does not fuse the aid.
-    why : mapping from axis name to Why or Unavailable
+    difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
         Difference between KF with default settings and EKF2 as flown; empty if not comparable.
     """
 
@@ -433,7 +433,7 @@ class WhatIfAnalysis:
     whatif: WhatIf
     changes: Mapping[str, float]
     asked: bool
-    why: Mapping[str, Why | Unavailable]
+    difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
     without: Mapping[str, float] = field(default_factory=dict)
 
     __repr__ = one_line_repr
@@ -445,7 +445,7 @@ class WhatIfAnalysis:
 
 
 def run_what_if(
-    request: WhatIfRequest, progress: Progress = silent, flight: Flight | None = None
+    request: WhatIfRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> WhatIfAnalysis:
     """Read a flight and replay its EKF2 with other parameters; arguments as in :func:`run`.
 
@@ -468,7 +468,7 @@ def run_what_if(
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
     is_default_change = not changes and swept is None and not request.without
-    why: Mapping[str, Why | Unavailable] = {}
+    difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
     compared = None
     try:
         if model.agreement.good:
@@ -477,8 +477,8 @@ def run_what_if(
         if is_default_change:
             raise
     if compared is not None:
-        tuning, clock = noises_and_clock(compared, progress)
-        why = explain_ekf2_difference(compared, model, clock)
+        tuning, clock = estimate_noises_and_clock(compared, progress)
+        difference_steps = explain_ekf2_difference(compared, model, clock)
         if is_default_change:
             changes = ml_ekf2_parameters(compared, model, tuning, clock)
             if not changes:
@@ -491,7 +491,9 @@ def run_what_if(
         raise MissingDataError(
             f"{flight.log.name}: {replays.what}: {replays.reason}", replays.remedy
         )
-    return WhatIfAnalysis(flight, replays, changes, is_default_change, why, request.without)
+    return WhatIfAnalysis(
+        flight, replays, changes, is_default_change, difference_steps, request.without
+    )
 
 
 def _explain_missing_change(compared: Comparison, model: Model) -> str:
@@ -507,7 +509,7 @@ def _explain_missing_change(compared: Comparison, model: Model) -> str:
     return f"{name}: {reason}. Give a change, for example `changes` {noise}=0.1."
 
 
-def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
+def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
     """Add tuning, time offset, explanations and loop closure to a comparison.
 
     Parameters
@@ -517,7 +519,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
         Called with the name of each step.
     """
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
-    tuning, clock = noises_and_clock(comparison, progress, names)
+    tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     heading = estimate_frame_rotation(comparison, tuning, clock, progress)
     progress("replaying EKF2")
 
@@ -526,7 +528,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
         return [*explanation_variants(comparison, inputs), *tried]
 
     model = open_model(comparison.flight, requested_variants)
-    why = explain_ekf2_difference(comparison, model, clock)
+    difference_steps = explain_ekf2_difference(comparison, model, clock)
     progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 (tune and sync have none)
 
@@ -536,7 +538,7 @@ def explain(comparison: Comparison, progress: Progress = silent) -> Analysis:
         tuning=tuning,
         clock=clock,
         ekf2_model=model,
-        why=why,
+        difference_steps=difference_steps,
         loop=loop,
         heading=heading,
     )

@@ -64,7 +64,7 @@ VerdictWord = Literal["", "consistent", "overconfident", "underconfident"]
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
-class ClaimedMistake(Record, frozen=True):
+class StudentMistake(Record, frozen=True):
     """Mistake that a student names in the form.
 
     Attributes
@@ -116,15 +116,15 @@ class Answers(Record, frozen=True, kw_only=True):
     ----------
     log_sha256 : str
         SHA-256 of the log of the form.
-    verdict_ours, verdict_ekf2 : str
+    verdict_kf, verdict_ekf2 : str
         Verdict on the reported σ of KF and EKF2, one of :data:`VERDICTS`.
     quantities : tuple of (float, tuple of float, or None)
         In the order of :func:`draw_questions`; a tuple answers a question about several updates.
     """
 
     log_sha256: Sha256
-    mistakes: Annotated[tuple[ClaimedMistake, ...], Meta(max_length=MOST_MISTAKES)] = ()
-    verdict_ours: VerdictWord = ""
+    mistakes: Annotated[tuple[StudentMistake, ...], Meta(max_length=MOST_MISTAKES)] = ()
+    verdict_kf: VerdictWord = ""
     verdict_ekf2: VerdictWord = ""
     ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_DID))] = ()
     quantities: Annotated[tuple[QuantityAnswer, ...], Meta(max_length=10)] = ()
@@ -237,9 +237,9 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
 
 
 def update_values(value: Any) -> Any:
-    """Replace the values of forms and answer keys from before schema 4 by the present ones."""
+    """Replace the names and values of forms and answer keys from before schema 4."""
     if isinstance(value, dict):
-        return {key: update_values(part) for key, part in value.items()}
+        return {_FORM.renamed.get(key, key): update_values(part) for key, part in value.items()}
     if isinstance(value, list):
         return [update_values(part) for part in value]
     return _FORM.renamed.get(value, value) if isinstance(value, str) else value
@@ -329,7 +329,7 @@ def form_text(log_name: str, log_sha256: str) -> str:
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     """Yield names and values of a completed form, for the report and the class page."""
-    yield "Verdict on KF", answers.verdict_ours or BLANK
+    yield "Verdict on KF", answers.verdict_kf or BLANK
     yield "Verdict on EKF2", answers.verdict_ekf2 or BLANK
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or BLANK
     for claim in answers.mistakes:

@@ -33,7 +33,7 @@ COLUMNS = {
     "nis_low": "float64",
     "nis_high": "float64",
     "verdict": "object",
-    "sigma_factor": "float64",
+    "sigma_ratio": "float64",
     "innovation_std_m": "float64",
     "sqrt_s_median_m": "float64",
     "sigma_p_median_m": "float64",
@@ -193,7 +193,7 @@ def close_loop(
     start_s: float | None = None,
     end_s: float | None = None,
     landed_at: tuple[float, float] | tuple[float, float, float] | None = None,
-    came_back: bool = True,
+    closed_loop: bool = True,
     closures: Sequence[request.GivenClosure] = (),
     reference: Pathlike | Trajectory | None = None,
     position_drift_m: float = 1.0,
@@ -213,7 +213,7 @@ def close_loop(
     landed_at : tuple of float, optional
         Place of landing in metres forward and right of the take-off, and degrees of clockwise
         rotation there.
-    came_back : bool
+    closed_loop : bool
         False if the landing closes no loop.
     closures : sequence of px4fuse.request.GivenClosure
         Further pairs of times at the same place.

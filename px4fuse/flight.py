@@ -204,7 +204,7 @@ class PositionTrack:
         names = (
             "name",
             "kind",
-            "passage",
+            "path",
             "description",
             "frame",
             "clock",

@@ -26,7 +26,7 @@ class Sender(Record, frozen=True):
         Type from its heartbeat ("PX4 quadrotor", "companion computer").
     messages : int
         Messages with a valid checksum.
-    lost_share : float or None
+    lost_fraction : float or None
         Fraction of its messages missing in the recording, by the sequence numbers; None if the
         sender does not count its messages.
     chosen : bool
@@ -37,7 +37,7 @@ class Sender(Record, frozen=True):
     component: int
     description: str
     messages: Count
-    lost_share: Share | None
+    lost_fraction: Share | None
     chosen: bool
 
 
@@ -151,7 +151,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
         True if the land detector reports flight at the end of the data.
     restarts : int or None
         Number of restarts of the boot clock; only one part of the recording is used then.
-    receipt_went_back : int or None
+    receive_time_reversals : int or None
         Number of backward steps of the recording computer's clock.
     dropped : mapping
         Number of samples with invalid timestamps, by topic, message or file.
@@ -185,7 +185,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     bytes_read: Count = 0
     ends_in_flight: bool = False
     restarts: Count | None = None
-    receipt_went_back: Count | None = None
+    receive_time_reversals: Count | None = None
     dropped: Mapping[str, Count] = {}
 
     __repr__ = one_line_repr

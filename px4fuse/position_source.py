@@ -8,7 +8,7 @@ from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid
 from px4fuse.record import Record
 
 PositionKind = Literal["uwb", "vio", "mocap", "gnss", "file"]
-Passage = Literal[
+DataPath = Literal[
     "given file", "as it arrived", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
 ]
 
@@ -20,7 +20,7 @@ class Origin(Record, frozen=True):
     ----------
     kind : str
         "uwb" is any positioning system without orientation, "vio" is any odometry.
-    passage : str
+    path : str
         Path from the sender to the log.
     aid : Aid or None
         EKF2 aid of this source, with its EKF2 parameters; None if EKF2 never fuses it.
@@ -29,7 +29,7 @@ class Origin(Record, frozen=True):
     """
 
     kind: PositionKind
-    passage: Passage
+    path: DataPath
     aid: Aid | None
     is_automatic: bool = True
 
@@ -45,12 +45,12 @@ class Origin(Record, frozen=True):
     @property
     def reconstructed(self) -> bool:
         """True if it was derived from EKF2's logged data instead of logged as received."""
-        return self.passage in ("kept by EKF2", "rebuilt from innovations")
+        return self.path in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
         """True if it contains all samples of the sender."""
-        return self.passage in ("given file", "as it arrived")
+        return self.path in ("given file", "as it arrived")
 
     @property
     def is_vision(self) -> bool:
@@ -74,8 +74,8 @@ class Origin(Record, frozen=True):
     @property
     def preference(self) -> int:
         """Index in :data:`ORIGINS`; the smallest is preferred."""
-        places = [(known.aid, known.passage) for known in ORIGINS]
-        return places.index((self.aid, self.passage))
+        places = [(known.aid, known.path) for known in ORIGINS]
+        return places.index((self.aid, self.path))
 
 
 POSITION_FILE = Origin("file", "given file", EV_POS)
@@ -89,12 +89,12 @@ GNSS = Origin("gnss", "as it arrived", GNSS_POS, is_automatic=False)
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 
 
-def find_origin(kind: str, passage: str) -> Origin:
+def find_origin(kind: str, path: str) -> Origin:
     """Return the known origin of this kind and path to the log."""
     return next(
         known_origin
         for known_origin in ORIGINS
-        if (known_origin.kind, known_origin.passage) == (kind, passage)
+        if (known_origin.kind, known_origin.path) == (kind, path)
     )
 
 

@@ -17,7 +17,7 @@ from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
 from px4fuse.findings import Finding, find
-from px4fuse.findings.summary import summarise_flight
+from px4fuse.findings.summary import summarise
 from px4fuse.record import Record, table
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
@@ -43,7 +43,11 @@ SCENARIO_VALUES: dict[str, Any] = {
 }
 LENGTH_M = (8.0, 12.0)  # m; range of the aisle length
 # Finding that contains the time of a mistake
-FINDING_WITH_TIME = {"nlos": "source_outliers", "jump": "source_jumps", "dropout": "source_gap"}
+FINDING_WITH_TIME = {
+    "nlos": "source_outliers",
+    "jump": "source_position_jump",
+    "dropout": "source_gap",
+}
 NOISY_UWB = "noisy-uwb"  # the log is correct, but SIGMA_Z of KF is too small
 
 
@@ -211,10 +215,10 @@ def _flight_data(one: PracticeFlight, number: int) -> tuple[dict[str, Any], str]
             _describe_mistake(mistake, size, findings)
             for mistake, size in zip(one.mistakes, one.sizes, strict=True)
         ],
-        "story": list(summarise_flight(analysis, findings)),
+        "summary": list(summarise(analysis, findings)),
         "findings": data["findings"],
     }
-    data |= {"story": [], "findings": []}
+    data |= {"summary": [], "findings": []}
     packed = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
     scripts = data_scripts(data, analysis, packer, f"-{number}")
     return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{packed}</script>'

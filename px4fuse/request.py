@@ -167,7 +167,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
     start_s, end_s : float or None
         Start and end of the loop; None for take-off and landing.
     landed_at : Landing or None
-    came_back : bool
+    closed_loop : bool
         False if the vehicle did not return to the take-off place.
     closures : tuple of GivenClosure
     position_drift_m, heading_drift_deg : float
@@ -183,7 +183,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
     start_s: float | None = None
     end_s: float | None = None
     landed_at: Landing | None = None
-    came_back: bool = True
+    closed_loop: bool = True
     closures: tuple[GivenClosure, ...] = ()
     position_drift_m: float = 1.0
     heading_drift_deg: float = 3.0

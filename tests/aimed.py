@@ -1,4 +1,4 @@
-"""Commands whose output is one of their inputs: by path, link, folder or other spelling."""
+"""Commands whose output is one of their inputs: by path, link, folder or letter case."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from class_tools import report_of
+from class_tools import make_report
 from conftest import REPORT, SAMPLES
 from ulog_tools import make_log
 
@@ -55,10 +55,10 @@ RUNS = [
 PATHS = ("typed", "relative", "absolute", "link", "link to link", "hard link", "folder", "letters")
 
 
-def made_desk(folder: Path) -> Path:
+def make_desk(folder: Path) -> Path:
     """Write all types of inputs to a folder, each type of table to a subfolder."""
     log = make_log("v1.16", 20.0).encode()
-    report = report_of("Ada", "1")
+    report = make_report("Ada", "1")
     for name, content in {
         "l.ulg": log, "logs/x.ulg": log,
         "m.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes()[:200_000],
@@ -80,8 +80,8 @@ def made_desk(folder: Path) -> Path:
     return folder
 
 
-def hashed(folder: Path) -> dict[str, str]:
-    """Every regular file, without links, with its hash."""
+def file_hashes(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of each regular file by its path; links are excluded."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -96,9 +96,9 @@ class Aim:
     Attributes
     ----------
     option : str
-        With the ending that it requires.
+        Output option with the required file ending.
     name : str or None
-        Name in the folder of -o; None where the output is one file.
+        Name in the folder of -o; None if the output is one file.
     way : str
         One of :data:`PATHS`.
     """
@@ -110,14 +110,14 @@ class Aim:
     way: str
 
     def arguments(self, desk: Path, place: Path) -> list[str] | None:
-        """Make links below ``place``; None if the option or the file system has no such way."""
+        """Make links below ``place`` and return the arguments; None if the way is not possible."""
         typed = self.command.format(desk=desk, place=place).split()
         option, dot, end = self.option.partition(".")
         if self.name:
             found = _linked_into(desk / self.read, self.way, place, self.name)
         elif self.name is not None:
             found = _another_path(Path(self.read).parent, self.way, desk, place)
-        elif self.way == "beside":  # the results beside a report
+        elif self.way == "beside":  # results next to the report
             (place / "r.json").symlink_to(desk / self.read)
             has_results = end == "pdf" and not self.command.startswith("verify")
             found = str(place / "r.pdf") if has_results else None
@@ -127,7 +127,7 @@ class Aim:
 
 
 def _another_path(read: Path, way: str, desk: Path, place: Path, end: str = "") -> str | None:
-    """Another path of an input, or of its folder."""
+    """Return another path of an input, or of its folder."""
     target, link = desk / read, place / f"link{end}"
     if way in ("link", "link to link"):
         (place / "first").symlink_to(os.path.relpath(target, place))
@@ -149,7 +149,7 @@ def _another_path(read: Path, way: str, desk: Path, place: Path, end: str = "") 
 
 
 def _linked_into(target: Path, way: str, place: Path, name: str) -> str | None:
-    """A folder with a link at the place of an output; its subfolder with one, or a link itself."""
+    """Make an output folder that contains a link to an input, or whose subfolder is a link."""
     out, subfolder = place / "out", name.endswith("/")
     out.mkdir()
     if way == "folder" and subfolder:
@@ -167,7 +167,7 @@ def _linked_into(target: Path, way: str, place: Path, name: str) -> str | None:
 
 
 def aims() -> list[Aim]:
-    """Every command, input, output and way."""
+    """Return all combinations of command, input, output and way."""
     found = []
     for command, reads, options, names in RUNS:
         outputs = [(option, None) for option in options.split()]
@@ -179,13 +179,13 @@ def aims() -> list[Aim]:
     return found
 
 
-def drawn(count: int, seed: int) -> list[Aim]:
-    """So many, drawn with replacement."""
+def draw_aims(count: int, seed: int) -> list[Aim]:
+    """Draw aims with replacement."""
     return random.Random(seed).choices(aims(), k=count)
 
 
-def cleared(place: Path) -> Path:
-    """An empty folder for links and outputs."""
+def make_empty_folder(place: Path) -> Path:
+    """Make an empty folder for links and outputs."""
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
     return place

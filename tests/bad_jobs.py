@@ -1,4 +1,4 @@
-"""Jobs for workers, most of which go wrong; importable where nothing else of the tests is."""
+"""Jobs for worker processes, most of which fail; imports nothing else of the tests."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from px4fuse.errors import LogError
 
 
 class Unreadable:
-    """Pickles, and cannot be read back."""
+    """Object that can be pickled but not unpickled."""
 
     def __reduce__(self) -> Any:
         return int, ("no number",)
 
 
 def act(job: tuple[str, Any]) -> Any:
-    """What a job says."""
+    """Perform the action that a job names."""
     what, value = job
     match what:
         case "square":

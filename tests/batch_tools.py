@@ -1,4 +1,4 @@
-"""What the tests of many logs share: tiny flights, jobs that go wrong, processes of Dask's."""
+"""Helpers for tests of many logs: small flights, failing jobs, Dask processes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 def tiny_log(seed: int, **options: object) -> bytes:
-    """A simulated flight of a quarter of a minute, compared within a second."""
+    """Return the log of a simulated flight of 15 s, which compare analyses within 1 s."""
     from px4fuse.simulation.flights import simulate, to_ulog  # workers import this file
     from px4fuse.simulation.scenario import Scenario
 
@@ -36,7 +36,7 @@ def tiny_logs(folder: Path, count: int, **options: object) -> Path:
 
 
 class Clock:
-    """Put forward: what hangs need not be waited for."""
+    """Clock that can be set ahead, so that a time limit passes without waiting."""
 
     ahead_s = 0.0
 
@@ -45,27 +45,27 @@ class Clock:
 
 
 def analyse(work: job.Job) -> job.Outcome:
-    """As the worker does, but a log called "hang" never ends, and one called "crash" crashes."""
+    """Analyse a log like the worker; a log named "hang" never ends, one named "crash" crashes."""
     name = Path(work.address).stem
     if name in ("hang", "crash"):
         bad_jobs.act(("hang", 0) if name == "hang" else ("exit", 3))
-    return analyse_once(work)
+    return analyse_cached(work)
 
 
-# Where what was found in a log is kept, for the tests of what surrounds that
+# Environment variable with the folder of cached analyses
 MEMORY = "PX4FUSE_TESTS_MEMORY"
 
 
-def analyse_once(work: job.Job) -> job.Outcome:
-    """As the worker does, but what was found in the same log before serves again."""
-    with mock.patch.object(job, "_compare_log", _remembered):  # the worker is also other tests'
+def analyse_cached(work: job.Job) -> job.Outcome:
+    """Analyse a log like the worker, or return the cached result of the same log."""
+    with mock.patch.object(job, "_compare_log", _compare_cached):  # other tests use the same worker
         return job.analyse(work)
 
 
 _compare_log = job._compare_log
 
 
-def _remembered(work: job.Job, path: Path, sha256: str) -> job.Outcome:
+def _compare_cached(work: job.Job, path: Path, sha256: str) -> job.Outcome:
     known = repr((path.name, sha256, work.request, work.reports))
     kept = Path(os.environ[MEMORY]) / hashlib.sha256(known.encode()).hexdigest()
     if not kept.is_file():
@@ -80,8 +80,8 @@ def environment(**more: str) -> dict[str, str]:
 
 
 @contextmanager
-def started(*command: str, says: str, log: Path, **more: str) -> Iterator[str]:
-    """A process of Dask's, once it has said that it is ready; the line in which it said so."""
+def start_dask(*command: str, says: str, log: Path, **more: str) -> Iterator[str]:
+    """Start a Dask process; yield the line of its output that contains ``says``."""
     with (
         log.open("w") as file,
         subprocess.Popen(

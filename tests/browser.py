@@ -1,4 +1,4 @@
-"""What tests read web pages with: an HTML parser, and Chromium without a window."""
+"""Tools to test web pages: an HTML parser, and headless Chromium."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-# Where a browser may be that is not on the path
+# Locations of browsers that are not on PATH
 PLACES = (
     "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
     "/Applications/Chromium.app/Contents/MacOS/Chromium",
@@ -27,7 +27,7 @@ PLACES = (
 
 
 class Elements(HTMLParser):
-    """Every element and attribute, as an HTML parser finds them."""
+    """All elements and attributes of a page, from an HTML parser."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -39,18 +39,18 @@ class Elements(HTMLParser):
 
 
 def content(text: str) -> Any:
-    """What the script of a page with a table reads."""
+    """Return the JSON data that a page with a table contains for its script."""
     (found,) = re.findall(r'<script type="application/json" id="content">(.*?)</script>', text)
     return json.loads(found)
 
 
 class Browser:
-    """Chromium without a window, driven by its DevTools protocol over a pair of pipes."""
+    """Headless Chromium, controlled by its DevTools protocol over two pipes."""
 
     def __init__(self, program: str, profile: Path) -> None:
         its_input, self._out = os.pipe()
         self._in, its_output = os.pipe()
-        # Chromium talks on descriptors 3 and 4
+        # Chromium reads file descriptor 3 and writes 4
         wire = (
             "import os, sys; os.dup2(int(sys.argv[1]), 100); os.dup2(int(sys.argv[2]), 101);"
             "os.dup2(100, 3); os.dup2(101, 4); os.execv(sys.argv[3], sys.argv[3:])"
@@ -61,7 +61,7 @@ class Browser:
                 "--headless=new", "--remote-debugging-pipe", "--no-sandbox", "--disable-gpu",
                 "--no-first-run", "--disable-background-networking", "--disable-component-update",
                 "--disable-sync", "--disable-dev-shm-usage", "--hide-scrollbars",
-                # No request gets anywhere
+                # block all requests
                 "--proxy-server=127.0.0.1:9", "--host-resolver-rules=MAP * ~NOTFOUND",
                 f"--user-data-dir={profile}", "about:blank",
             ],
@@ -127,7 +127,7 @@ class Browser:
             self.events.append(self._next())
 
     def resize(self, width: int, height: int, scale: float = 1.0) -> None:
-        """Until the page is laid out anew: a small screen is first shown a page that is wider."""
+        """Set the window size and wait for the new layout; on a small screen it comes late."""
         self._measure(width, height, scale)
         self.ask_later("new Promise((done) => requestAnimationFrame(() => setTimeout(done)))")
 
@@ -138,12 +138,13 @@ class Browser:
         )  # fmt: skip
 
     def ask(self, script: str) -> Any:
+        """Evaluate a JavaScript expression and return its value."""
         answer = self.call("Runtime.evaluate", expression=script, returnByValue=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
     def ask_later(self, script: str) -> Any:
-        """What a promise gives."""
+        """Evaluate an expression that returns a promise, and return its result."""
         answer = self.call(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
         )
@@ -151,12 +152,12 @@ class Browser:
         return answer["result"].get("value")
 
     def scheme(self, name: str) -> None:
-        """Whether the reader prefers "light" or "dark"; "" for what is usual."""
+        """Set the preferred colour scheme, "light" or "dark"; "" for the default."""
         features = [{"name": "prefers-color-scheme", "value": name}] if name else []
         self.call("Emulation.setEmulatedMedia", features=features)
 
     def click(self, selector: str) -> None:
-        """Where a finger would: so that it fails on what is covered or hidden."""
+        """Click at the position of an element, so that a covered or hidden one fails."""
         x, y = self.ask(
             f"(() => {{ const node = document.querySelector({json.dumps(selector)});"
             "node.scrollIntoView({block: 'center'}); const box = node.getClientRects()[0];"
@@ -178,7 +179,7 @@ class Browser:
         self.call("Input.insertText", text=text)
 
     def choose(self, selector: str, value: str) -> None:
-        """An option of a select."""
+        """Choose an option of a select element."""
         self.ask(
             f"(() => {{ const select = document.querySelector({json.dumps(selector)});"
             f"select.value = {json.dumps(value)};"
@@ -186,7 +187,7 @@ class Browser:
         )
 
     def names(self) -> list[str]:
-        """What the table's rows are called."""
+        """Return the names in the rows of the table."""
         return list(
             self.ask(
                 "[...document.querySelectorAll('.list > tbody > tr[data-row] .name')]"
@@ -195,13 +196,13 @@ class Browser:
         )
 
     def complaints(self) -> list[Any]:
-        """Script errors, console messages, refusals by the policy."""
+        """Return script errors, console messages and violations of the security policy."""
         kinds = ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded")
-        self.ask("1")  # whatever is on its way comes before the answer
+        self.ask("1")  # pending events arrive before the answer
         return [event["params"] for event in self.events if event["method"] in kinds]
 
     def requests(self) -> set[str]:
-        """Schemes of everything that the page asked for."""
+        """Return the URL schemes of all requests of the page."""
         self.ask("1")
         return {
             event["params"]["request"]["url"].split(":")[0]

@@ -1,4 +1,4 @@
-"""Classes made up for tests: reports under any name, exports of platforms, and grading at once."""
+"""Artificial classes for tests: reports of any student, exports, grading in one process."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextvars import copy_context
 from pathlib import Path
 
-from conftest import REPORT, page_of
+from conftest import REPORT, blank_page
 
 from px4fuse import workers
 from px4fuse.grading import grade as grading
@@ -21,59 +21,59 @@ from px4fuse.verification.verification import log_sha256, verify
 VERIFIED = Verdict("verified", ("the log gives every value again",), True, page_status="same")
 
 
-def report_of(name: str, student_id: str, log: str = "") -> bytes:
-    """The sample's report on an empty page, with another student and log in its results."""
+def make_report(name: str, student_id: str, log: str = "") -> bytes:
+    """Return an empty page with the sample's results, for another student and log."""
     results = json.loads(REPORT.with_suffix(".json").read_text(encoding="utf-8"))
     results["student"] = {"name": name, "id": student_id, "notes": ""}
     if log:
         results["log"]["sha256"] = log
-    return page_of(None, json.dumps(results))
+    return blank_page(None, json.dumps(results))
 
 
-def at_once(monkeypatch) -> list[str]:
-    """Grade in this process, and believe every report whose log is there; gives what was verified.
+def skip_verification(monkeypatch) -> list[str]:
+    """Grade in this process, accept each report with a known log; return the verified ids.
 
-    Bounds and verification have tests of their own, and take seconds per report.
+    Other tests cover limits and verification, which take seconds per report.
     """
-    asked: list[str] = []
+    verified_ids: list[str] = []
 
-    def believed(results, pdf, logs):
-        asked.append(results.student.id)
+    def verify_by_log(results, pdf, logs):
+        verified_ids.append(results.student.id)
         return VERIFIED if log_sha256(results) in logs else verify(results, pdf, logs)
 
-    monkeypatch.setattr(records, "verify", believed)
+    monkeypatch.setattr(records, "verify", verify_by_log)
     in_this_process(monkeypatch)
-    return asked
+    return verified_ids
 
 
-def in_turn(function, jobs, **_):
-    """One job after the other, in this process, whose limits stay as they are."""
+def run_in_turn(function, jobs, **_):
+    """Run jobs one after the other in this process, in a copy of its context."""
     for index, job in enumerate(jobs):
         function_, job_ = pickle.loads(pickle.dumps((function, job)))
         yield index, pickle.loads(pickle.dumps(copy_context().run(function_, job_)))
 
 
 def in_this_process(monkeypatch) -> None:
-    """Do without the processes that keep what strangers wrote within bounds: each takes seconds.
+    """Run jobs in this process instead of workers with limits, which take seconds to start.
 
-    What goes to them and what comes back is pickled all the same.
+    Jobs and results are pickled nevertheless.
     """
 
     for module in (grading, workers):
-        monkeypatch.setattr(module, "run_bounded", in_turn)
+        monkeypatch.setattr(module, "run_bounded", run_in_turn)
 
 
-def zipped(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 0, 0)) -> Path:
+def write_zip(path: Path, entries: Mapping[str, bytes], date=(2026, 11, 20, 12, 0, 0)) -> Path:
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in entries.items():
             archive.writestr(zipfile.ZipInfo(name, date), content)
     return path
 
 
-def graded(
+def graded_report(
     name: str, *points: float, student: str = "", student_id: str = "", **more
 ) -> GradedReport:
-    """A report with items A, B, … of ten points each."""
+    """Return a graded report with items A, B, … of 10 points each."""
     items = tuple(
         Item(chr(ord("A") + at), each, 10.0, "Because.") for at, each in enumerate(points)
     )
@@ -82,5 +82,7 @@ def graded(
 
 
 def entry(student_id: str, name: str, total: float | None, **more) -> Entry:
-    one = None if total is None else graded(f"{student_id}.pdf", total, student_id=student_id)
+    one = (
+        None if total is None else graded_report(f"{student_id}.pdf", total, student_id=student_id)
+    )
     return Entry(name, student_id, one, total=total, **({"of": 10.0} | more))

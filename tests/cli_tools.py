@@ -1,4 +1,4 @@
-"""The commands as a user types them."""
+"""Run px4fuse commands in tests."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from px4fuse.errors import Px4FuseError
 
 
 def run(*arguments: object) -> Result:
-    """In a pipe, in which no line is wrapped, whatever runs the tests says of its own width."""
+    """Run a command as in a pipe, so that no line is wrapped."""
     return CliRunner(env={"COLUMNS": None}).invoke(cli, [str(argument) for argument in arguments])
 
 
-def done(*arguments: object, code: int = 0) -> Result:
-    """A command that ends with this exit code."""
+def run_checked(*arguments: object, code: int = 0) -> Result:
+    """Run a command and check its exit code."""
     result = run(*arguments)
     assert result.exit_code == code, (arguments, result.output, result.exception)
     return result
 
 
-def refused(*arguments: object) -> str:
-    """What is said, in one line, of what cannot be done."""
+def error_line(*arguments: object) -> str:
+    """Run a command that fails, check that its error is one line, and return the error."""
     result = run(*arguments)
     assert isinstance(result.exception, Px4FuseError), (arguments, result.output)
     assert result.stdout == ""
@@ -34,7 +34,7 @@ def refused(*arguments: object) -> str:
 
 
 def run_main(monkeypatch, capsys, *arguments: str | Path) -> tuple[int, str, str]:
-    """The real entry point: exit code, standard output, standard error."""
+    """Run the entry point; return exit code, standard output and standard error."""
     monkeypatch.setattr(sys, "argv", ["px4fuse", *map(str, arguments)])
     with pytest.raises(SystemExit) as stopped:
         main()
@@ -43,5 +43,5 @@ def run_main(monkeypatch, capsys, *arguments: str | Path) -> tuple[int, str, str
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file in a folder by its name."""
+    """Return the content of each file in a folder by its name."""
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

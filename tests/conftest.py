@@ -1,11 +1,10 @@
-"""Fixtures that every test file shares, and how Hypothesis chooses its examples.
+"""Fixtures of all test files, and the settings of Hypothesis.
 
-The suite tries the same examples every time. A search with new random examples, as before each
-release::
+Each run uses the same examples. Search with new random examples, for example before a release::
 
     python -m pytest --hypothesis-profile=random
 
-Keep what it finds as an ``@example`` of the test.
+Add each failing example as ``@example`` to its test.
 """
 
 from __future__ import annotations
@@ -47,14 +46,14 @@ LOG = SAMPLES / "aisle_uwb.ulg"
 REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
 SHARED = REPOSITORY.parent / "shared"
 
-# A shell's background jobs ignore Ctrl-C, and so would all that the tests start
+# Background jobs of a shell ignore SIGINT, and processes started by tests would inherit that
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No limit on time: a slow machine must not fail
 settings.register_profile(
     "steady",
-    max_examples=50,  # they are the same each time
+    max_examples=50,  # the same in each run
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
     derandomize=True,
@@ -66,15 +65,15 @@ settings.register_profile(
 settings.load_profile("steady")
 
 
-# Objects made since garbage was last looked for; a report that is drawn makes a hundred thousand
+# Number of new objects before the next garbage collection; drawing a report makes 100,000
 MANY_OBJECTS = 500_000
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Look for garbage between tests only, as collecting them makes none.
+    """Collect garbage between tests only.
 
-    The processes of the tests, which are begun after this, keep what they compile, as there are a
-    hundred; not those of a study, which changes the code.
+    Test processes may write bytecode, which saves the compilation in each; processes of a study
+    may not, because the study changes the code.
     """
     gc.disable()
     if config.getoption("numprocesses", None):
@@ -82,17 +81,17 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave what was imported and collected out of every search for garbage."""
+    """Exclude imported modules and collected tests from garbage collection."""
     gc.collect()
     gc.freeze()
 
 
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """Forget what a file's functions have cached once its tests are done: analyses are large.
+    """Clear the caches of a test file after its last test, because analyses are large.
 
-    Commands turn the search for garbage off for their process, which is that of all tests here.
+    Commands change the garbage collection of their process, which is that of the tests here.
     """
-    gc.disable()  # `px4fuse batch` turns it on
+    gc.disable()  # `px4fuse batch` enables it
     if gc.get_count()[0] > MANY_OBJECTS:
         gc.collect()
     module = getattr(item, "module", None)
@@ -104,7 +103,7 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 @pytest.fixture(scope="session")
 def sample_log() -> Path:
-    """The sample flight that ships with the project."""
+    """Log of the sample flight that is included in the project."""
     return LOG
 
 
@@ -116,18 +115,18 @@ def sample_flight(sample_log: Path) -> Flight:
 
 @pytest.fixture(scope="session")
 def model(sample_flight: Flight) -> Model:
-    """The sample's model of EKF2; what it has replayed it keeps."""
+    """EKF2 model of the sample flight; it caches its replays."""
     return opened(sample_flight)
 
 
 @pytest.fixture(scope="session")
 def sample(sample_log: Path) -> analysis.Analysis:
     """The sample flight, analysed once; tests must not change it."""
-    return _run_once(ComparisonRequest(log=str(sample_log)))
+    return _run_cached(ComparisonRequest(log=str(sample_log)))
 
 
 def shared(name: str) -> Path:
-    """A folder of what is not part of the project."""
+    """Return a folder next to the repository; skip the test without it."""
     folder = SHARED / name
     if not folder.is_dir():
         pytest.skip(f"the further files ../shared/{name} are not beside the repository")
@@ -136,13 +135,13 @@ def shared(name: str) -> Path:
 
 @pytest.fixture(scope="session")
 def shared_logs() -> Path:
-    """Further flight logs."""
+    """Folder of further flight logs, next to the repository."""
     return shared("logs")
 
 
 @pytest.fixture(scope="session")
 def model_of() -> Callable[[Path], Model | Unavailable]:
-    """EKF2's model of a log; the last ones of a process are kept."""
+    """Function that returns the EKF2 model of a log; the last 8 are cached."""
     return lru_cache(8)(lambda path: open_model(read_log(path)))
 
 
@@ -161,8 +160,8 @@ def read(tmp_path: Path) -> Callable[..., Flight]:
     return write_and_read
 
 
-def page_of(*drawn: Any) -> bytes:
-    """An empty page with results attached: the text that is last of what is drawn."""
+def blank_page(*drawn: Any) -> bytes:
+    """Return an empty PDF page with results (the last argument) attached."""
     writer = PdfWriter()
     writer.add_blank_page(100, 100)
     writer.add_attachment(pdf.RESULTS_NAME, drawn[-1].encode())
@@ -173,37 +172,37 @@ def page_of(*drawn: Any) -> bytes:
 
 @pytest.fixture
 def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages take most of the time; for tests that look at none of them."""
-    monkeypatch.setattr(pdf, "render", page_of)
+    """Replace the pages of reports by an empty one, for tests that do not examine them."""
+    monkeypatch.setattr(pdf, "render", blank_page)
 
 
-# The last ones of a process are kept
+# Size of each cache
 MOST_ANALYSES = 16
-_drawn: dict[str, bytes] = {}
+_page_cache: dict[str, bytes] = {}
 
 
 @pytest.fixture
-def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same results are drawn once; for tests of what follows."""
+def cached_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw the pages of equal results once per process."""
     render = pdf.render
 
     def from_memory(found: object, results: object, text: str) -> bytes:
-        if text not in _drawn:
-            _drawn[text] = render(found, results, text)
-            if len(_drawn) > MOST_ANALYSES:
-                del _drawn[next(iter(_drawn))]
-        return _drawn[text]
+        if text not in _page_cache:
+            _page_cache[text] = render(found, results, text)
+            if len(_page_cache) > MOST_ANALYSES:
+                del _page_cache[next(iter(_page_cache))]
+        return _page_cache[text]
 
     monkeypatch.setattr(pdf, "render", from_memory)
 
 
-# Of the unchanged program: they are there before any test patches them
+# The original functions, saved before a test replaces them
 _run, _read = analysis.run, analysis.read_flight
-_kept: dict[tuple[str | bytes, ...] | None, Any] = {}
+_cache: dict[tuple[str | bytes, ...] | None, Any] = {}
 
 
-def _known(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | None:
-    """What it is kept under: where the files lie is no part of it, verification has links."""
+def _cache_key(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | None:
+    """Return the cache key: names and contents of the files, without their folders."""
     position = request.position
     paths = [request.log, request.mavlink, None if position is None else position.path]
     files = [Path(path) for path in paths if path is not None]
@@ -218,52 +217,56 @@ def _known(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | N
     return (what, repr(named), *(sha256(file.read_bytes()).digest() for file in files))
 
 
-def _known_flight(request: ComparisonRequest) -> tuple[str | bytes, ...] | None:
+def _flight_key(request: ComparisonRequest) -> tuple[str | bytes, ...] | None:
     names = ("log", "mavlink", "system", "position", "clock_offset_s")
-    return _known(ComparisonRequest(**{name: getattr(request, name) for name in names}), "flight")
+    return _cache_key(
+        ComparisonRequest(**{name: getattr(request, name) for name in names}), "flight"
+    )
 
 
-def _once(known: tuple[str | bytes, ...] | None, make: Callable[[], Any]) -> Any:
+def _cached(known: tuple[str | bytes, ...] | None, make: Callable[[], Any]) -> Any:
     if known is None:
         return make()
-    # the last one used stands last
-    _kept[known] = _kept.pop(known) if known in _kept else make()
-    if len(_kept) > 2 * MOST_ANALYSES:
-        del _kept[next(iter(_kept))]
-    return _kept[known]
+    # the most recently used entry is last
+    _cache[known] = _cache.pop(known) if known in _cache else make()
+    if len(_cache) > 2 * MOST_ANALYSES:
+        del _cache[next(iter(_cache))]
+    return _cache[known]
 
 
-def _read_once(request: ComparisonRequest, progress: analysis.Progress = analysis.silent) -> Flight:
-    return _once(_known_flight(request), lambda: _read(request, progress))
+def _read_cached(
+    request: ComparisonRequest, progress: analysis.Progress = analysis.ignore_progress
+) -> Flight:
+    return _cached(_flight_key(request), lambda: _read(request, progress))
 
 
-def _log_once(path: str | Path, *, system: int | None = None) -> Flight:
-    return _read_once(ComparisonRequest(log=str(path), system=system))
+def _read_log_cached(path: str | Path, *, system: int | None = None) -> Flight:
+    return _read_cached(ComparisonRequest(log=str(path), system=system))
 
 
-def _run_once(
+def _run_cached(
     request: ComparisonRequest,
-    progress: analysis.Progress = analysis.silent,
+    progress: analysis.Progress = analysis.ignore_progress,
     flight: Flight | None = None,
 ) -> analysis.Analysis:
-    if flight is not None and flight is not _kept.get(_known_flight(request)):
+    if flight is not None and flight is not _cache.get(_flight_key(request)):
         return _run(request, progress, flight)
-    return _once(_known(request, "analysis"), lambda: _run(request, progress, flight))
+    return _cached(_cache_key(request, "analysis"), lambda: _run(request, progress, flight))
 
 
 @pytest.fixture(scope="module")
-def analysed_once() -> Iterator[None]:
-    """The same request on the same files is read and analysed once; where nothing is patched."""
+def cached_analyses() -> Iterator[None]:
+    """Analyse equal requests on equal files once; for tests that replace no analysis."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(analysis, "read_flight", _read_once)
-        patch.setattr(tracks, "read_log", _log_once)
+        patch.setattr(analysis, "read_flight", _read_cached)
+        patch.setattr(tracks, "read_log", _read_log_cached)
         for place in (analysis, api):
-            patch.setattr(place, "run", _run_once)
+            patch.setattr(place, "run", _run_cached)
         yield
 
 
 @pytest.fixture
 def quick_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Our filter to 1e-9 in less time, see test_likelihood.py; for tests of what surrounds it."""
+    """Replace KF by the fast filter, which agrees within 1e-9 (test_likelihood.py)."""
     for module in (comparison, truth):
         monkeypatch.setattr(module, "replay", quick_replay)

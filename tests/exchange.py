@@ -1,4 +1,4 @@
-"""Records with other values, whether they are structs or dataclasses."""
+"""Copies of records (structs or dataclasses) with changed fields."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 def replace(record: T, /, **changes: Any) -> T:
-    """The same record with these values."""
+    """Return a copy of the record with changed fields."""
     if isinstance(record, msgspec.Struct):
         return msgspec.structs.replace(record, **changes)
     return dataclasses.replace(record, **changes)  # type: ignore[type-var]

@@ -64,7 +64,7 @@ def log(**parts: Any) -> Any:
     usual = {
         "parameters": {}, "notes": (), "format": "ULog", "has_ulog": True, "autopilot": "PX4",
         "dropouts": (), "damage": (), "ends_in_flight": False, "duration_s": 60.0, "bytes": 0,
-        "bytes_read": 0, "restarts": None, "receipt_went_back": None, "dropped": {},
+        "bytes_read": 0, "restarts": None, "receive_time_reversals": None, "dropped": {},
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **parts})
 
@@ -103,7 +103,7 @@ def analysis(
     return SimpleNamespace(  # type: ignore[return-value]
         flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,
         lines=tuple(axis.axis for axis in axes), segment=SEGMENT, settings=settings, notes=notes,
-        missing=missing, **{"tuning": {}, "why": {}, "causes": (), **usual, **parts},
+        missing=missing, **{"tuning": {}, "difference_steps": {}, "causes": (), **usual, **parts},
     )  # fmt: skip
 
 
@@ -133,20 +133,20 @@ def tried(
     """Make the result of a re-run: the share of a statistic that a change explains."""
     after = before ** (1.0 - explains)
     return Intervention(
-        of=of, filter=owner, axis=axis, change=change, before=before, after=after,
-        explains=explains, brings_into_band=explains == 1.0,
+        statistic=of, filter=owner, axis=axis, change=change, before=before, after=after,
+        explained_fraction=explains, is_sufficient=explains == 1.0,
     )  # fmt: skip
 
 
 def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> Any:
     """Make the consistency of a filter with this mean NIS."""
-    usual = {"lag1_autocorrelation": 0.0, "outside_gate": 0.0, "innovation_std_m": 0.3,
+    usual = {"lag1_autocorrelation": 0.0, "fraction_outside_gate": 0.0, "innovation_std_m": 0.3,
              "innovation_mean_m": 0.4}  # fmt: skip
     return made(
         Consistency,
         nis_mean=nis,
         nis_band=(0.8, 1.2),
-        sigma_factor=nis**-0.5,
+        sigma_ratio=nis**0.5,
         verdict=verdict,
         **{**usual, **parts},
     )
@@ -201,7 +201,7 @@ def tuned(
     right = Noise(1.0, 0.9, 1.1)
     usual = {"name": "horizontal", "before": NONE, "held_out": NONE, "outlier_time_s": np.array([])}
     noises = (sigma_z or right).as_fields("sigma_z_m") | (sigma_a or right).as_fields(
-        "filter_sigma_a_m_s2"
+        "sigma_a_two_state_m_s2"
     )
     one = made(AxisTuning, **noises, **{**usual, **parts})
     return {HORIZONTAL: one}
@@ -213,8 +213,8 @@ def late(
     offset_s = applied_s + remaining_s
     halves = tuple(PartOffset(0.0, 1.0, at, 0.1) for at in (offset_s - 0.2, offset_s + 0.2))
     usual = {
-        "interval_s": (offset_s - 0.01, offset_s + 0.02), "determinable": True, "change_p": None,
-        "parts": halves,
+        "interval_s": (offset_s - 0.01, offset_s + 0.02), "is_determinable": True,
+        "change_p_value": None, "parts": halves,
     }  # fmt: skip
     return made(
         ClockOffset, offset_s=offset_s, applied_s=applied_s, sigma_s=sigma_s, **{**usual, **parts}

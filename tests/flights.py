@@ -81,7 +81,7 @@ class Estimator:
     noise_m: float = 0.10
     nis: float = 1.0
     every: int = 1
-    rejected_share: float = 0.0
+    rejected_fraction: float = 0.0
     fusing: tuple[tuple[float, float], ...] | None = ((0.0, 1.0),)
     fusing_yaw: float = 1.0
     resets: tuple[Reset, ...] = ()
@@ -237,7 +237,7 @@ def _ekf2(
         part[time >= reset.time_s] += reset.delta
     second = times(duration_s, 1.0)
     variances = np.repeat([made.sigma_p_m**2, made.sigma_v_m_s**2], 3)
-    rejected = rng.random(len(updates)) < made.rejected_share
+    rejected = rng.random(len(updates)) < made.rejected_fraction
     return Ekf2(
         state=table(time, np.hstack([position, velocity]), Columns.POSITION + Columns.VELOCITY),
         variance=table(
@@ -339,7 +339,8 @@ def unexplained(comparison: Comparison) -> Analysis:
     parts = {part.name: getattr(comparison, part.name) for part in fields(Comparison)}
     return Analysis(
         **parts, tuning={}, clock=unavailable("clock offset"),
-        ekf2_model=unavailable("EKF2 replay"), why={}, loop=unavailable("loop closure"),
+        ekf2_model=unavailable("EKF2 replay"), difference_steps={},
+        loop=unavailable("loop closure"),
         heading=unavailable("heading error"),
     )  # fmt: skip
 

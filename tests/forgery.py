@@ -1,4 +1,4 @@
-"""Reports forged with care: one thing changed, everything else as px4fuse wrote it."""
+"""Forged reports: one change, everything else as px4fuse wrote it."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ ESCAPED = {0x08: b"\\b", 0x09: b"\\t", 0x0A: b"\\n", 0x0C: b"\\f", 0x0D: b"\\r",
 
 
 def forged(pdf: bytes, *changes: Forge) -> bytes:
-    """The file with something changed in it."""
+    """Return the PDF with changes."""
     writer = PdfWriter(clone_from=io.BytesIO(pdf))
     for change in changes:
         change(writer)
-    return saved(writer)
+    return pdf_bytes(writer)
 
 
-def saved(writer: PdfWriter) -> bytes:
-    """The bytes of what was written."""
+def pdf_bytes(writer: PdfWriter) -> bytes:
+    """Return the file that a writer contains."""
     out = io.BytesIO()
     writer.write(out)
     return out.getvalue()
 
 
-def edited(stream: Any, change: Edit) -> DecodedStreamObject:
-    """A stream with other content."""
+def edit_stream(stream: Any, change: Edit) -> DecodedStreamObject:
+    """Return a stream with changed content."""
     before = stream.get_data()
     content = change(before)
     assert content != before, "nothing was forged"
@@ -64,28 +64,28 @@ def edited(stream: Any, change: Edit) -> DecodedStreamObject:
     return made
 
 
-def replaced(holder: Any, key: str, change: Edit) -> Forge:
-    """Another stream in place of the one that a dictionary holds."""
+def replace_stream(holder: Any, key: str, change: Edit) -> Forge:
+    """Replace the stream at a key of a dictionary by a changed one."""
 
     def forge(writer: PdfWriter) -> None:
         held = holder(writer)
-        held[NameObject(key)] = writer._add_object(edited(held[key].get_object(), change))
+        held[NameObject(key)] = writer._add_object(edit_stream(held[key].get_object(), change))
 
     return forge
 
 
 def on_page(number: int, change: Edit) -> Forge:
-    """What a page draws, changed."""
-    return replaced(lambda writer: writer.pages[number - 1], "/Contents", change)
+    """Change the content stream of a page."""
+    return replace_stream(lambda writer: writer.pages[number - 1], "/Contents", change)
 
 
 def with_results(text: str) -> Forge:
-    """Other results attached."""
+    """Replace the attached results."""
 
     def forge(writer: PdfWriter) -> None:
         files: Any = writer.root_object["/Names"]["/EmbeddedFiles"]["/Names"]  # type: ignore[index]
         held = files[1].get_object()["/EF"]
-        made = writer._add_object(edited(held["/F"].get_object(), lambda _: text.encode()))
+        made = writer._add_object(edit_stream(held["/F"].get_object(), lambda _: text.encode()))
         for key in ("/F", "/UF"):
             held[NameObject(key)] = made
 
@@ -93,7 +93,7 @@ def with_results(text: str) -> Forge:
 
 
 def font(name: str) -> Callable[[PdfWriter], Any]:
-    """A font of the first page."""
+    """Return a function that finds a font of the first page."""
 
     def find(writer: PdfWriter) -> Any:
         return writer.pages[0]["/Resources"]["/Font"][name].get_object()  # type: ignore[index]
@@ -102,14 +102,14 @@ def font(name: str) -> Callable[[PdfWriter], Any]:
 
 
 def glyphs(holder: DictionaryObject) -> dict[str, int]:
-    """Numbers of the glyphs by the letters that they stand for."""
+    """Return glyph numbers by their characters."""
     names: Any = holder["/ToUnicode"]
     pairs = re.findall(rb"<([0-9a-fA-F]{4})> <([0-9a-fA-F]{4})>\s", names.get_data())
     return {chr(int(letter, 16)): int(glyph, 16) for glyph, letter in pairs}
 
 
 def text(glyph: int) -> bytes:
-    """A glyph as it is written in a text."""
+    """Encode a glyph number as in a text string."""
     return b"".join(
         ESCAPED.get(byte, bytes([byte]) if 0x20 <= byte < 0x7F else b"\\%03o" % byte)
         for byte in glyph.to_bytes(2, "big")
@@ -148,28 +148,28 @@ def stream(data: bytes, **entries: Any) -> DecodedStreamObject:
     return made
 
 
-def root(key: str, value: Any) -> Forge:
-    """An entry of the catalogue."""
+def catalogue(key: str, value: Any) -> Forge:
+    """Set an entry of the document catalogue."""
     return lambda writer: entry(key, value)(writer.root_object)
 
 
-def titled(**entries: str) -> Forge:
-    """Entries of the document information."""
+def document_info(**entries: str) -> Forge:
+    """Set entries of the document information."""
     return lambda writer: writer.add_metadata({f"/{key}": held for key, held in entries.items()})
 
 
-def appended(pdf: bytes, change: Forge) -> bytes:
-    """An incremental update, as viewers append one."""
+def append_update(pdf: bytes, change: Forge) -> bytes:
+    """Append an incremental update, as viewers do."""
     writer = PdfWriter(io.BytesIO(pdf), incremental=True)
     change(writer)
-    return saved(writer)
+    return pdf_bytes(writer)
 
 
 # ------------------------------------------------------------------ reports that verify
 
 
-def put(value: Any, *path: Any) -> Change:
-    """Another value at a place in the results; behind the end of a list it is added."""
+def set_value(value: Any, *path: Any) -> Change:
+    """Set the value at a path in the results; the index after the end of a list appends."""
 
     def change(results: dict[str, Any]) -> None:
         part: Any = results
@@ -183,25 +183,25 @@ def put(value: Any, *path: Any) -> Change:
     return change
 
 
-def report_of(pdf: bytes) -> Reported:
-    """A report, read without care: tests of reading are elsewhere."""
+def attached_results(pdf: bytes) -> Reported:
+    """Read the attached results without the checks of read_report."""
     return read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
 
 
-def plain(report: Reported) -> dict[str, Any]:
-    """The results of a report, to be changed."""
+def to_dict(report: Reported) -> dict[str, Any]:
+    """Convert results to a dictionary that can be changed."""
     made: dict[str, Any] = json.loads(to_json(report))
     return made
 
 
 def read_again(results: dict[str, Any]) -> Reported:
-    """Changed results, as they are read from a report."""
+    """Decode changed results as from a report."""
     return read_results(to_json(results).encode())
 
 
 @dataclass(frozen=True)
-class Base:
-    """A report that is verified, and its analysis, computed once."""
+class VerifiedReport:
+    """Report that is verified, with its analysis, which is computed once."""
 
     pdf: bytes
     results: dict[str, Any]
@@ -209,9 +209,9 @@ class Base:
     files: Mapping[str, Path]
 
     def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdict:
-        """What a new run gives; from memory where everything that it rests on is recorded so."""
+        """Return the analysis; the stored one if request, student, log and versions are equal."""
         ours, theirs = (
-            # the recorded command is made anew from the request
+            # the command is derived from the request
             (held.request, held.student, verification.log_sha256(held),
              msgspec.structs.replace(held.provenance, command=""))
             for held in (self.again[0], results)
@@ -219,20 +219,20 @@ class Base:
         return self.again if ours == theirs else verification.recompute(results, logs)
 
     def verified(self, pdf: bytes) -> Verdict:
-        """The verdict on a forged report, with the log."""
+        """Verify a forged report with the log."""
         try:
-            report = report_of(pdf)
-        except ResultsError as error:  # refused before there is anything to verify
+            report = attached_results(pdf)
+        except ResultsError as error:  # rejected before verification
             return Verdict("cannot verify", (str(error),), with_log=False)
         return verify(report, pdf, self.files, recompute=self.recompute)
 
     def with_results(self, results: dict[str, Any]) -> bytes:
-        """The report with other results attached."""
+        """Return the report with other results attached."""
         return forged(self.pdf, with_results(to_json(results)))
 
 
-def base(pdf: bytes, log: Path) -> Base:
+def make_verified_report(pdf: bytes, log: Path) -> VerifiedReport:
     files = files_by_sha256([log])
-    again = verification.recompute(report_of(pdf), files)
+    again = verification.recompute(attached_results(pdf), files)
     drawn = again[1]()
-    return Base(drawn, plain(report_of(drawn)), (again[0], lambda: drawn), files)
+    return VerifiedReport(drawn, to_dict(attached_results(drawn)), (again[0], lambda: drawn), files)

@@ -35,7 +35,7 @@ NUMBER = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
 LAST_DIGITS = re.compile(r"\b[0-9a-f]{64}\b|\b[0-9a-f]{12,32}…|(?<=iterations )\d+")
 
 
-def agrees(name: str, lines: list[str], paragraph: int | None = None) -> None:
+def assert_matches_golden(name: str, lines: list[str], paragraph: int | None = None) -> None:
     """Compare lines with a golden file; decimal numbers may differ by one in the last digit."""
     path, kept, found = GOLDEN / f"{name}.txt", [""], "\n".join(lines)
     if paragraph is not None:

@@ -45,8 +45,10 @@ def made_up(count: int, seed: int = 1) -> pd.DataFrame:
             continue
         sigma = 0.1 * (3.0 if late and number % 3 == 0 else 1.0) * np.exp(rng.normal(0.0, 0.1))
         offset = (0.08 if late and number % 3 == 1 else 0.01) + rng.normal(0.0, 0.004)
-        findings = ["source_gap"] * (number % 4 == 0) + ["ekf2_rejecting"] * (number % 5 == 0)
-        findings += ["sigma_z_small"] if sigma > 0.2 else []
+        findings = ["source_gap"] * (number % 4 == 0) + ["ekf2_rejects_positions"] * (
+            number % 5 == 0
+        )
+        findings += ["sigma_z_too_small"] if sigma > 0.2 else []
         for axis in ("north", "east", "down"):
             nis = np.exp(rng.normal(0.0, 0.2)) * (sigma / 0.1) ** 2
             theirs = 0.3 * np.exp(rng.normal(0.0, 0.6)) * (sigma / 0.1) ** 2
@@ -55,16 +57,16 @@ def made_up(count: int, seed: int = 1) -> pd.DataFrame:
                 row
                 | {
                     "axis": axis, "updates": int(row["duration_s"] * 10),
-                    "kf_nis_mean": nis, "kf_factor": 1.0 / nis,
+                    "kf_nis_mean": nis, "kf_sigma_ratio": nis**0.5,
                     "kf_verdict": "overconfident" if nis > 1.3 else "consistent",
-                    "ekf2_nis_mean": theirs, "ekf2_factor": 1.0 / theirs,
+                    "ekf2_nis_mean": theirs, "ekf2_sigma_ratio": theirs**0.5,
                     "ekf2_verdict": "underconfident" if theirs < 0.8 else "consistent",
-                    "position_rmse_m": error, "velocity_rmse_m_s": 2.0 * error,
+                    "position_rms_m": error, "velocity_rms_m_s": 2.0 * error,
                     "sigma_z_m": sigma, "sigma_z_low_m": 0.9 * sigma, "sigma_z_high_m": 1.1 * sigma,
                     "sigma_a_m_s2": 0.3, "sigma_a_low_m_s2": 0.2, "sigma_a_high_m_s2": 0.4,
                     "clock_offset_s": offset, "clock_offset_low_s": offset - 0.006,
-                    "clock_offset_high_s": offset + 0.006, "rejected_share": 0.01,
-                    "model_correlation": 0.97, "story": STORY, "findings": ";".join(findings),
+                    "clock_offset_high_s": offset + 0.006, "rejected_fraction": 0.01,
+                    "model_correlation": 0.97, "summary": STORY, "findings": ";".join(findings),
                     "results": f"results/flight {number:04d}.json",
                     "report": f"reports/flight {number:04d}.pdf",
                 }

@@ -1,4 +1,4 @@
-"""Linear algebra in one thread, as commands do it; imported before NumPy, which reads it once."""
+"""Set linear algebra to one thread, as in the commands; must be imported before NumPy."""
 
 import os
 

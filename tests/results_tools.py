@@ -1,11 +1,11 @@
-"""Results to change in tests: of the shipped report, and of a small loop."""
+"""Results for tests: those of the example report, and of a small loop."""
 
 import copy
 import json
 from pathlib import Path
 from typing import Any
 
-from px4fuse.loop.model import Closure, Correction, KnownEnd, LoopResult, OdometryNoise
+from px4fuse.loop.model import Closure, Correction, LoopResult, OdometryNoise, TrueEnd
 from px4fuse.record import Unavailable
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_plain
@@ -25,21 +25,21 @@ NONE = Unavailable("it", "nobody asked", "Ask.")
 
 
 def correction(rmse: float, moved_m: float) -> Correction:
-    """A correction with one score."""
+    """Return a correction with one score."""
     statistics = Statistics(9, rmse, rmse, rmse, 0.0, rmse, rmse)
     score = Score(
         alignment="se3",
         alignment_reason="asked",
         transform=Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
         association=Association("interpolate", 9, 0.1, 0, 0, 1.0, 1.0),
-        time_offset=TimeOffset(offset_s=0.0, determinable=True, reason=""),
+        time_offset=TimeOffset(offset_s=0.0, is_determinable=True, reason=""),
         ate=AbsoluteError(statistics, Interval(rmse, rmse, 1, 9.0), NONE),
         rpe=(RelativeError(5.0, "m", True, "reference", statistics, NONE, NONE),),
         notes=(),
         warnings=(),
     )
     return Correction(
-        moved_max_m=moved_m, moved_rms_m=moved_m, scores={"slam.tum": score, "ekf2": NONE}
+        correction_max_m=moved_m, correction_rms_m=moved_m, scores={"slam.tum": score, "ekf2": NONE}
     )
 
 
@@ -61,7 +61,7 @@ LOOP = to_plain(
             key_frame_spacing_m=0.5,
             path_length_m=87.7,
             end_from_start_m={"north": 1.42, "east": 0.0, "down": 0.0},
-            known_end=KnownEnd(
+            true_end=TrueEnd(
                 displacement_m={"north": 0.0, "east": 0.0, "down": 0.0},
                 sigma_m=0.1,
                 source="landing",
@@ -70,7 +70,7 @@ LOOP = to_plain(
             closure_error_m=1.42,
             closure_percent=1.62,
             heading_error_deg=NONE,
-            absolute=False,
+            is_absolute_track=False,
             odometry_noise=OdometryNoise(),
             closures=(
                 Closure(
@@ -100,8 +100,8 @@ LOOP = to_plain(
 )
 
 
-def changed(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
-    """Results with the values at some paths, "__" for dots, replaced; ``...`` removes."""
+def changed_results(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
+    """Return results with changed values by path ("__" instead of dots); ``...`` removes one."""
     changed_ = copy.deepcopy(results)
     for path, value in values.items():
         *parents, last = path.split("__")
@@ -115,11 +115,11 @@ def changed(results: dict[str, Any] = EXAMPLE, **values: Any) -> dict[str, Any]:
     return changed_
 
 
-def decoded(results: dict[str, Any]) -> Results:
-    """Results as they are read from a report."""
+def decode_results(results: dict[str, Any]) -> Results:
+    """Decode results as from a report."""
     return read_results(json.dumps(results).encode())
 
 
 def finding(name: str, severity: str = "warning") -> dict[str, Any]:
-    """A finding as results hold it."""
+    """Return a finding as in results."""
     return {"id": name, "severity": severity, "message": "", "evidence": {}, "remedy": ""}

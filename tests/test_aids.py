@@ -67,14 +67,14 @@ def evaluate(log: AidLog, name: str = "gnss_pos") -> AidResult:
 
 
 @pytest.mark.parametrize(("sigma", "verdict"), [
-    (0.5, "consistent"), (0.58, "consistent"), (0.68, "variance understated"),
-    (0.43, "consistent"), (0.37, "variance overstated"),
+    (0.5, "consistent"), (0.58, "consistent"), (0.68, "overconfident"),
+    (0.43, "consistent"), (0.37, "underconfident"),
 ])  # fmt: skip
 def test_aid_verdict_sigma_ratio_has_tolerance(sigma, verdict) -> None:
     aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
-    assert aid.axes["north"].sigma_factor == pytest.approx(0.5 / sigma, rel=0.04)
+    assert aid.axes["north"].sigma_ratio == pytest.approx(sigma / 0.5, rel=0.04)
     assert len(TIMES) - 5 < aid.axes["east"].samples <= len(TIMES)
     assert aid.axes["north"].s_sqrt_median == pytest.approx(0.5)
 
@@ -83,7 +83,7 @@ def test_aid_verdict_large_mean_innovation_is_biased() -> None:
     assert evaluate(aid_log(mean=0.35)).verdict == "biased"
     assert evaluate(aid_log(mean=0.2)).verdict == "consistent"
     # small compared with √S: EKF2 hardly follows
-    assert evaluate(aid_log(sigma=0.05, mean=0.09)).verdict == "variance overstated"
+    assert evaluate(aid_log(sigma=0.05, mean=0.09)).verdict == "underconfident"
     assert evaluate(aid_log(sigma=0.05, mean=0.11)).verdict == "biased"
 
 
@@ -91,13 +91,13 @@ def test_aid_gap_counts_only_if_it_begins_while_enabled() -> None:
     log = aid_log(enabled=steps((0.0, 1.0), (26.0, 0.0), (40.0, 1.0)))
     before_gap = log.samples.loc[:20.0]
     outage = evaluate(replace(log, samples=pd.concat([before_gap, log.samples.loc[40.0:]])))
-    assert (outage.verdict, outage.longest_without_s) == ("starved", (20.0, 40.0))
+    assert (outage.verdict, outage.longest_gap_s) == ("not_fused", (20.0, 40.0))
     # disabled at once: no gap
     enabled = steps((0.0, 1.0), (20.05, 0.0), (40.0, 1.0))
     given_up = evaluate(replace(log, samples=outage_free(log, 20.0, 40.0), enabled=enabled))
     assert given_up.verdict == "consistent"
-    assert given_up.longest_without == pytest.approx(0.1, abs=0.01)
-    assert given_up.intended_share == pytest.approx(40.0 / 60.0, abs=0.02)
+    assert given_up.longest_gap_duration_s == pytest.approx(0.1, abs=0.01)
+    assert given_up.enabled_fraction == pytest.approx(40.0 / 60.0, abs=0.02)
 
 
 def outage_free(log: AidLog, start_s: float, end_s: float) -> pd.DataFrame:
@@ -107,9 +107,9 @@ def outage_free(log: AidLog, start_s: float, end_s: float) -> pd.DataFrame:
 
 def test_aid_verdict_never_enabled_is_idle() -> None:
     log = aid_log()
-    assert evaluate(replace(log, enabled=steps((0.0, 0.0)))).verdict == "idle"
+    assert evaluate(replace(log, enabled=steps((0.0, 0.0)))).verdict == "disabled"
     few = evaluate(replace(log, samples=log.samples.iloc[::80], enabled=steps((0.0, 1.0))))
-    assert (few.verdict, few.axes) == ("starved", {})
+    assert (few.verdict, few.axes) == ("not_fused", {})
     three_hertz = pd.DataFrame(log.samples.iloc[:9])
     assert evaluate(replace(log, samples=three_hertz, enabled=steps((0.0, 1.0), (0.9, 0.0)))
                   ).verdict == "too few samples"  # fmt: skip
@@ -134,7 +134,7 @@ def test_aid_gate_is_from_test_ratios_or_parameter() -> None:
     # without rejection flags the gate decides
     aid = evaluate(aid_log(own=False, sigma=1.0, EKF2_GPS_P_GATE=2.0))
     inside = 0.6827**2  # both axes within 1 σ
-    assert aid.rejected_share == pytest.approx(1.0 - inside, abs=0.05)
+    assert aid.rejected_fraction == pytest.approx(1.0 - inside, abs=0.05)
     assert not aid.fused_logged
 
 
@@ -158,7 +158,7 @@ def test_aid_verdict_slow_logging_is_consistent() -> None:
     """Rows of zeros are samples that EKF2 logged between two measurements."""
     log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     decimated = replace(log, samples=log.samples.iloc[::10])
-    for gap_s, verdict in ((7.6, "consistent"), (12.0, "starved")):
+    for gap_s, verdict in ((7.6, "consistent"), (12.0, "not_fused")):
         samples = outage_free(decimated, 20.0, 20.0 + gap_s)
         assert evaluate(replace(decimated, samples=samples)).verdict == verdict
 
@@ -171,12 +171,12 @@ def test_aid_findings_contain_aid_numbers_and_times() -> None:
         ev_pos=aid_log(sigma=9.0), rng_hgt=log,
     ))  # fmt: skip
     by_id = {one.id: one for one in find_aids(found)}
-    assert set(by_id) == {"aid_starved", "aid_understated", "aid_biased"}
-    assert "GNSS position, GNSS velocity" in by_id["aid_starved"].headline
-    assert by_id["aid_starved"].spans_s == ((20.0, 41.0),)
-    assert "EKF2_BARO_NOISE" in by_id["aid_understated"].remedy
-    assert by_id["aid_biased"].evidence["aid"] == "mag"
-    assert by_id["aid_biased"].evidence["innovation_mean"] == pytest.approx(-0.4, abs=0.05)
+    assert set(by_id) == {"aid_not_fused", "aid_overconfident", "aid_innovation_bias"}
+    assert "GNSS position, GNSS velocity" in by_id["aid_not_fused"].title
+    assert by_id["aid_not_fused"].spans_s == ((20.0, 41.0),)
+    assert "EKF2_BARO_NOISE" in by_id["aid_overconfident"].remedy
+    assert by_id["aid_innovation_bias"].evidence["aid"] == "mag"
+    assert by_id["aid_innovation_bias"].evidence["innovation_mean"] == pytest.approx(-0.4, abs=0.05)
 
 
 def test_aid_mean_change_is_reported_with_time() -> None:
@@ -192,14 +192,14 @@ def test_aid_mean_change_is_reported_with_time() -> None:
         assert moved == pytest.approx(-1.4, abs=0.4)
     (finding,) = find_aids({"mag": found})
     assert (finding.id, finding.severity, finding.evidence["axis"]) == (
-        "aid_changed",
+        "aid_innovation_shift",
         "warning",
         "east",
     )
     # a change of KF's own source is another finding
     assert not [*detect_in_aids({"gnss_vel": found}, "gnss_pos")]
     # the same for an aid that is rejected after the change
-    rejected = replace(found, verdict="starved")
+    rejected = replace(found, verdict="not_fused")
     (starved,) = detect_in_aids({"gnss_vel": rejected}, "gnss_pos")
     assert starved.evidence[CAUSE] == SENSOR
     assert next(detect_in_aids({"mag": rejected}, "gnss_pos")).evidence[CAUSE] == CHANGE
@@ -223,9 +223,9 @@ def test_read_aids_each_release_has_one_sign_convention(generation, tmp_path):
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert (log.samples["variance_north"] == 0.25).all()
     aid = evaluate_aids(flight)["gnss_pos"]  # type: ignore[index]
-    assert aid.intended_share == 1.0
+    assert aid.enabled_fraction == 1.0
     assert aid.fused_logged is (generation in ("v1.14", "v1.16"))
-    assert aid.verdict == "variance overstated"
+    assert aid.verdict == "underconfident"
 
 
 # ---------------------------------------------------------------------------- reporting
@@ -234,7 +234,7 @@ def test_read_aids_each_release_has_one_sign_convention(generation, tmp_path):
 def test_compare_checks_bad_ekf2_verdict_exits_with_1(tmp_path, monkeypatch, capsys) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     code, _, err = run_main(monkeypatch, capsys, "compare", log, "--checks", "-o", report)
-    bad = [each.label for each in evaluate_aids(read_log(log)).values() if each.is_bad]
+    bad = [each.label for each in evaluate_aids(read_log(log)).values() if each.is_faulty]
     assert code == (1 if bad else 0)
     assert [line.partition(": ")[0] for line in err.splitlines()] == bad
 
@@ -244,7 +244,7 @@ def test_failed_checks_list_overconfident_aids_only(sigma: float, bad: bool) -> 
     """Overconfident aids fail, underconfident ones do not."""
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
-    assert failed_checks(alone) == ({"GNSS position": "variance understated"} if bad else {})
+    assert failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})
 
 
 def test_compare_without_position_evaluates_aids(tmp_path: Path) -> None:

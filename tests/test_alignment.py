@@ -1,4 +1,4 @@
-"""External position files placed into flights, against injected clocks, frames and yaws."""
+"""Alignment of external position files with flights, for known clocks, frames and yaws."""
 
 import json
 import re
@@ -27,7 +27,7 @@ from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read
 
 BOOT_S = 2416.25
 OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock
-# x, y, z of the file from north, east, down: written out, not taken from the code
+# x, y, z of the file from north, east, down; independent of the code under test
 FROM_NED: dict[str, Any] = {
     "ned": lambda n, e, d: (n, e, d),
     "enu": lambda n, e, d: (e, n, -d),
@@ -35,19 +35,19 @@ FROM_NED: dict[str, Any] = {
 }
 
 
-# A pass along the aisle begins at each of these times and ends at this share of its length
+# Start time (s) of each pass along the aisle: share of the aisle's length at its end
 PASSES = {6: 1.0, 18: 0.25, 27: 0.8, 41: 0, 52: 0.9, 66: 0.1, 75: 0.7, 90: 0.3, 104: 1, 112: 0.5}
 PASS_S = 6.0
 
 
 def smooth_step(time_s: Array) -> Array:
-    """Go from 0 to 1 with least jerk."""
+    """Minimum-jerk motion from 0 to 1."""
     u = np.clip(time_s / PASS_S, 0.0, 1.0)
     return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
 
 
 def passes(time_s: Array, heading_deg: float, length_m: float, across_m: float = 0.2) -> Array:
-    """Passes along the aisle of which no two are alike; shape (n, 3), NED."""
+    """Return positions of different passes along the aisle; shape (n, 3), NED."""
     along, lever_arm_m = 0.0 * time_s, 0.0
     for start_s, share in PASSES.items():
         along += (share * length_m - lever_arm_m) * smooth_step(time_s - start_s)
@@ -59,7 +59,7 @@ def passes(time_s: Array, heading_deg: float, length_m: float, across_m: float =
 
 
 def flight_along(path: Any = passes, *, boot_s: float = BOOT_S, **parts: Any) -> Flight:
-    """Fly another path than the aisle's, which is periodic."""
+    """Simulate a flight on this path; that of aisle_flight is periodic."""
 
     def motion(time_s: Array, heading_deg: float, length_m: float) -> tuple[Array, Array, Array]:
         h = 1e-3
@@ -84,11 +84,11 @@ def position_file(
     )  # fmt: skip
 
 
-def recorded(
+def uwb_file(
     flight: Flight, *, offset_s: float = OFFSET_S, frame: str = "enu", yaw_deg: float = 0.0,
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0), **made: Any,
 ) -> PositionRecording:  # fmt: skip
-    """Record the flight's UWB on another clock and in another frame."""
+    """Write the flight's UWB positions with another clock and in another frame."""
     samples = flight.positions[0].samples
     n, e, d = (samples[Columns.POSITION].to_numpy() - origin_m).T
     c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
@@ -96,21 +96,23 @@ def recorded(
     return position_file(samples.index.to_numpy() + flight.log.boot_time_s - offset_s, xyz, **made)
 
 
-def placed(
+def align(
     flight: Flight, file: PositionRecording, **options: Any
 ) -> tuple[Alignment, PositionTrack]:
     track = align_position_file(flight, file, **options).positions[0]
     return track.alignment, track
 
 
-def off_s(alignment: Alignment, true_s: float = OFFSET_S, sigma_s: Span = (0.0, np.inf)) -> float:
-    """How far the clock offset is off (s), with a standard deviation between two bounds."""
+def clock_error_s(
+    alignment: Alignment, true_s: float = OFFSET_S, sigma_s: Span = (0.0, np.inf)
+) -> float:
+    """Return the error of the clock offset (s); check that its σ is between two bounds."""
     assert sigma_s[0] < alignment.clock_offset_sigma_s < sigma_s[1]
     return abs(alignment.clock_offset_s - true_s)
 
 
-def turn(one_deg: float, other_deg: float) -> float:
-    """Angle between two yaws."""
+def yaw_difference_deg(one_deg: float, other_deg: float) -> float:
+    """Return the absolute difference of two yaws."""
     return abs((one_deg - other_deg + 180.0) % 360.0 - 180.0)
 
 
@@ -131,7 +133,7 @@ def external(sample_log: Path) -> PositionRecording:
 
 @pytest.fixture(scope="module")
 def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
-    """Boot clock minus the file's, from the positions that both hold."""
+    """Boot clock minus the file's clock, from positions that both contain."""
     logged = sample_flight.positions[0].samples
     places = logged[["east_m", "north_m"]].round(3).itertuples(index=False, name=None)
     time_of = dict(zip(places, logged.index, strict=True))
@@ -148,15 +150,17 @@ def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
 # -- the sample flight -----------------------------------------------------------------------------
 
 
-def test_sample_file_is_placed_without_any_option(sample_flight, external, true_offset_s) -> None:
-    alignment, track = placed(sample_flight, external)
+def test_align_sample_file_without_options_recovers_placement(
+    sample_flight, external, true_offset_s
+) -> None:
+    alignment, track = align(sample_flight, external)
     assert alignment.frame == "enu"
     assert "fits EKF2 position best" in alignment.frame_reason
     assert alignment.reference == EKF2_POSITION
     assert alignment.yaw_deg == 0.0
     assert alignment.yaw_sigma_deg is None
     assert alignment.origin_m == (0.0, 0.0, 0.0)
-    error = off_s(alignment, true_offset_s, (0.003, 0.03))
+    error = clock_error_s(alignment, true_offset_s, (0.003, 0.03))
     assert error < min(0.03, 3.0 * (alignment.clock_offset_sigma_s or 0.0))
     assert alignment.correlation == pytest.approx(0.9994, abs=3e-4)
     assert alignment.residual_rms_m == pytest.approx(0.115, abs=0.01)
@@ -172,32 +176,32 @@ def test_sample_file_is_placed_without_any_option(sample_flight, external, true_
 @given(
     seed=st.integers(0, 3),
     frame=st.sampled_from(sorted(FROM_NED)),
-    told=st.booleans(),
+    frame_given=st.booleans(),
     offset_s=st.floats(-2e9, 2e9),
     yaw_deg=st.floats(-179.0, 179.0),
     origin_m=st.tuples(*[st.floats(-8.0, 8.0)] * 3),
 )
-def test_any_clock_frame_yaw_and_origin_is_recovered(
-    seed, frame, told, offset_s, yaw_deg, origin_m
+def test_align_any_clock_frame_yaw_and_origin_is_recovered(
+    seed, frame, frame_given, offset_s, yaw_deg, origin_m
 ):
     flight = flight_along(seed=seed)
-    file = recorded(flight, offset_s=offset_s, frame=frame, yaw_deg=yaw_deg, origin_m=origin_m)
-    alignment, track = placed(flight, file, frame=frame if told else None, yaw_deg="auto")
-    if told:
-        assert turn(alignment.yaw_deg, yaw_deg) < 0.5
+    file = uwb_file(flight, offset_s=offset_s, frame=frame, yaw_deg=yaw_deg, origin_m=origin_m)
+    alignment, track = align(flight, file, frame=frame if frame_given else None, yaw_deg="auto")
+    if frame_given:
+        assert yaw_difference_deg(alignment.yaw_deg, yaw_deg) < 0.5
         np.testing.assert_allclose(alignment.origin_m, origin_m, atol=0.05)
     else:
         assert alignment.frame == {"ned": "ned"}.get(frame, "enu")
     assert_same_track(track, flight.positions[0], 0.1)
-    assert off_s(alignment, offset_s, (5e-4, 0.02)) < 0.03
+    assert clock_error_s(alignment, offset_s, (5e-4, 0.02)) < 0.03
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_sigmas_of_clock_and_yaw_are_the_scatter_over_many_flights() -> None:
+def test_align_clock_and_yaw_sigma_match_scatter_of_flights() -> None:
     clock, yaw = [], []
     for seed in range(24):
         flight = flight_along(seed=seed, duration_s=60.0)
-        alignment, _ = placed(flight, recorded(flight), frame="enu", yaw_deg="auto")
+        alignment, _ = align(flight, uwb_file(flight), frame="enu", yaw_deg="auto")
         clock.append((alignment.clock_offset_s - OFFSET_S) / (alignment.clock_offset_sigma_s or 0))
         yaw.append(alignment.yaw_deg / (alignment.yaw_sigma_deg or 0))
     # 95 % of the root mean squares of 24 normal variables lie between 0.72 and 1.28
@@ -206,47 +210,47 @@ def test_sigmas_of_clock_and_yaw_are_the_scatter_over_many_flights() -> None:
 
 
 @pytest.mark.parametrize("frame", sorted(FROM_NED))
-def test_frame_is_told_by_the_fit_unless_the_columns_name_it(flight: Flight, frame: str) -> None:
-    file = recorded(flight, frame=frame)
-    alignment, track = placed(flight, file)
+def test_align_frame_is_from_columns_or_best_fit(flight: Flight, frame: str) -> None:
+    file = uwb_file(flight, frame=frame)
+    alignment, track = align(flight, file)
     assert alignment.frame == frame
     assert alignment.frame_reason.startswith(f"fits EKF2 position best; residuals: {frame} 0.1")
     assert_same_track(track, flight.positions[0], 1e-9)
-    alignment, _ = placed(flight, replace(file, frame=frame))
+    alignment, _ = align(flight, replace(file, frame=frame))
     assert alignment.frame == frame
     assert alignment.frame_reason == "from the column names of the file"
 
 
-def test_an_aisle_at_45_degrees_without_height_does_not_tell_the_frame() -> None:
+def test_align_aisle_at_45_degrees_without_height_needs_frame() -> None:
     flight = flight_along(partial(passes, across_m=0.0), heading_deg=45.0)
-    file = recorded(flight, frame="enu")
+    file = uwb_file(flight, frame="enu")
     file.samples["z_m"] = np.nan
     with pytest.raises(MissingDataError, match=r"no frame fits .*Give `frame`"):
         align_position_file(flight, file)
-    alignment, track = placed(flight, file, frame="enu")
-    assert off_s(alignment) < 0.03
+    alignment, track = align(flight, file, frame="enu")
+    assert clock_error_s(alignment) < 0.03
     assert track.samples["down_m"].isna().all()
     assert track.samples["north_m"].notna().all()
 
 
-def test_variances_turn_with_the_track(flight: Flight) -> None:
-    file = recorded(flight, frame="enu", yaw_deg=90.0, sigma_m=[0.1, 0.2, 0.3])
+def test_align_rotates_variances_with_track(flight: Flight) -> None:
+    file = uwb_file(flight, frame="enu", yaw_deg=90.0, sigma_m=[0.1, 0.2, 0.3])
     options: dict[str, Any] = {"frame": "enu", "clock_offset_s": OFFSET_S}
     variances = [
-        placed(flight, file, yaw_deg=yaw, **options)[1].samples[Columns.POSITION_VARIANCE].iloc[7]
+        align(flight, file, yaw_deg=yaw, **options)[1].samples[Columns.POSITION_VARIANCE].iloc[7]
         for yaw in (0.0, 90.0, 30.0)
     ]
     np.testing.assert_allclose(variances[0], [0.04, 0.01, 0.09])
     np.testing.assert_allclose(variances[1], [0.01, 0.04, 0.09])
     # cos² 30° = 3/4
     np.testing.assert_allclose(variances[2], [0.0325, 0.0175, 0.09])
-    alignment, track = placed(flight, file, yaw_deg=90.0, **options)
+    alignment, track = align(flight, file, yaw_deg=90.0, **options)
     assert (alignment.yaw_deg, alignment.yaw_reason) == (90.0, "given with --position-yaw")
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Flight) -> None:
-    result = align_position_file(flight, recorded(flight))
+def test_align_result_contains_track_file_and_reader_notes(flight: Flight) -> None:
+    result = align_position_file(flight, uwb_file(flight))
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
     assert (track.origin, track.frame) == (POSITION_FILE, "NED")
@@ -263,61 +267,61 @@ def test_the_flight_gets_the_track_the_file_and_what_its_reader_said(flight: Fli
     (90.0, (0.0, 0.0, 0.0)), (-12.0, (1.0, 2.0, 0.0)), (180.0, (5.0, 0.0, 0.0)),
     (0.0, (2.0, 0.0, 0.0)),
 ])  # fmt: skip
-def test_a_turned_frame_is_warned_of_and_does_not_spoil_the_clock(flight, yaw_deg, origin_m):
-    file = recorded(flight, yaw_deg=yaw_deg, origin_m=origin_m)
-    alignment, _ = placed(flight, file, frame="enu")
+def test_align_misaligned_frame_warns_and_recovers_clock(flight, yaw_deg, origin_m):
+    file = uwb_file(flight, yaw_deg=yaw_deg, origin_m=origin_m)
+    alignment, _ = align(flight, file, frame="enu")
     assert alignment.yaw_deg == 0.0
-    assert off_s(alignment) < 0.03
+    assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.misplaced
     seen = re.search(r"rotated by ([-0-9.]+)° and shifted by ([0-9.]+) m relative", warning)
     assert seen
     turned, shifted = map(float, seen.groups())
-    assert turn(turned, yaw_deg) < 0.5
+    assert yaw_difference_deg(turned, yaw_deg) < 0.5
     assert shifted == pytest.approx(np.hypot(*origin_m[:2]), abs=0.1)
     assert warning.endswith("Give --position-yaw auto.")
-    alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
+    alignment, _ = align(flight, file, frame="enu", yaw_deg="auto")
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_a_given_offset_is_used_and_warned_of_where_it_is_wrong(flight: Flight) -> None:
-    wrong, _ = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
+def test_align_given_clock_offset_is_used_and_checked(flight: Flight) -> None:
+    wrong, _ = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings
     assert warning.startswith("The position file does not match the EKF2 position (correlation ")
     assert wrong.correlation < 0.7
-    file = recorded(flight, yaw_deg=40.0)
-    alignment, track = placed(flight, file, yaw_deg="auto", clock_offset_s=OFFSET_S)
+    file = uwb_file(flight, yaw_deg=40.0)
+    alignment, track = align(flight, file, yaw_deg="auto", clock_offset_s=OFFSET_S)
     assert alignment.yaw_deg == pytest.approx(40.0, abs=0.5)
     assert alignment.clock_offset_sigma_s is None
     assert_same_track(track, flight.positions[0], 0.1)
 
 
-def test_a_height_that_runs_against_ekf2s_and_another_day_are_warned_of(flight: Flight) -> None:
-    file = recorded(flight)
+def test_align_inverted_height_or_other_start_time_warns(flight: Flight) -> None:
+    file = uwb_file(flight)
     file.samples["z_m"] *= -1.0
     other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
-    alignment = placed(other, file, frame="enu")[0]
+    alignment = align(other, file, frame="enu")[0]
     (height,), (day,) = alignment.misplaced, alignment.warnings
     assert "heights of file and EKF2" in height
     assert "file and log differ by 100 s" in day
 
 
-# -- what real files are like ----------------------------------------------------------------------
+# -- outliers, gaps and resets ---------------------------------------------------------------------
 
 
-def test_outliers_and_gaps_move_the_clock_little() -> None:
+def test_align_outliers_and_gap_keep_clock_and_yaw() -> None:
     flight = flight_along(uwb=Uwb(outlier_share=0.08, gap_s=(30.0, 48.0)))
-    alignment, _ = placed(flight, recorded(flight), frame="enu", yaw_deg="auto")
-    assert off_s(alignment) < 0.03
+    alignment, _ = align(flight, uwb_file(flight), frame="enu", yaw_deg="auto")
+    assert clock_error_s(alignment) < 0.03
     assert abs(alignment.yaw_deg) < 0.5
     np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
 
 
 @pytest.mark.parametrize("delta", [(3.0, -2.0, 0.5), (100.0, 40.0, 0.0)])
-def test_a_reset_of_ekf2_does_no_harm(delta: tuple[float, float, float]) -> None:
+def test_align_ekf2_position_reset_keeps_placement(delta: tuple[float, float, float]) -> None:
     flight = flight_along(ekf2=Estimator(resets=(Reset(70.0, "position", delta),)))
     for yaw in (None, "auto"):
-        alignment, track = placed(flight, recorded(flight), frame="enu", yaw_deg=yaw)
-        assert off_s(alignment) < 0.03
+        alignment, track = align(flight, uwb_file(flight), frame="enu", yaw_deg=yaw)
+        assert clock_error_s(alignment) < 0.03
         assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
         assert_same_track(track, flight.positions[0], 0.1)
         assert alignment.misplaced == alignment.warnings == ()
@@ -329,12 +333,12 @@ QUIET = Imu(sigma_a_m_s2=0.1)
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.5])
-def test_without_ekf2_the_imu_gives_clock_and_yaw(noise: float) -> None:
+def test_align_without_ekf2_uses_imu_for_clock_and_yaw(noise: float) -> None:
     flight = flight_along(imu=Imu(sigma_a_m_s2=noise), ekf2=None)
-    file = recorded(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
-    alignment, _ = placed(flight, file, frame="enu", yaw_deg="auto")
+    file = uwb_file(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
+    alignment, _ = align(flight, file, frame="enu", yaw_deg="auto")
     assert alignment.reference == IMU
-    assert off_s(alignment, sigma_s=(2e-3, 0.05)) < 0.05
+    assert clock_error_s(alignment, sigma_s=(2e-3, 0.05)) < 0.05
     assert alignment.yaw_deg == pytest.approx(25.0, abs=3.0)
     assert alignment.origin_m == (0.0, 0.0, 0.0)
     assert alignment.residual_rms_m is None
@@ -342,56 +346,56 @@ def test_without_ekf2_the_imu_gives_clock_and_yaw(noise: float) -> None:
     assert any("set to 0" in warning for warning in alignment.warnings)
 
 
-def test_the_imu_tells_the_frame_and_that_it_is_turned() -> None:
+def test_align_without_ekf2_imu_finds_frame_and_misalignment() -> None:
     flight = flight_along(imu=QUIET)
     blind = replace(flight, ekf2=unavailable("EKF2"))
-    assert placed(blind, recorded(flight, frame="nwu"))[0].frame == "nwu"
-    alignment, _ = placed(blind, recorded(flight, yaw_deg=120.0), frame="enu")
-    assert off_s(alignment) < 0.05
+    assert align(blind, uwb_file(flight, frame="nwu"))[0].frame == "nwu"
+    alignment, _ = align(blind, uwb_file(flight, yaw_deg=120.0), frame="enu")
+    assert clock_error_s(alignment) < 0.05
     assert "is rotated by 1" in alignment.misplaced[-1]
     assert "shifted" not in alignment.misplaced[-1]
-    # an EKF2 that stands still leaves it to the IMU
+    # with a constant EKF2 position the IMU is the reference
     still = replace(flight, ekf2=replace(flight.ekf2, state=flight.ekf2.state * 0.0))
-    alignment, _ = placed(still, recorded(flight), frame="enu")
+    alignment, _ = align(still, uwb_file(flight), frame="enu")
     assert alignment.reference == IMU
-    assert off_s(alignment) < 0.05
+    assert clock_error_s(alignment) < 0.05
 
 
-# -- what cannot be placed -------------------------------------------------------------------------
+# -- files without alignment -----------------------------------------------------------------------
 
 BOTH_SPANS = r"the log covers 2416\.25 s to 2536\.25 s of the boot clock, the file 1795253666\.45 s"
 
 
-def test_what_stands_still_is_placed_by_a_given_offset_alone() -> None:
+def test_align_vehicle_at_rest_needs_clock_offset() -> None:
     flight = flight_along(partial(passes, across_m=0.0), length_m=0.0)
     for parts in ({}, {"ekf2": unavailable("EKF2")}):
         said = rf"^uwb\.csv: .*hardly change; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
         with pytest.raises(MissingDataError, match=said):
-            align_position_file(replace(flight, **parts), recorded(flight), frame="enu")
-    alignment, track = placed(flight, recorded(flight), frame="enu", clock_offset_s=OFFSET_S)
+            align_position_file(replace(flight, **parts), uwb_file(flight), frame="enu")
+    alignment, track = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S)
     assert alignment.misplaced == alignment.warnings == ()
     assert alignment.correlation is None
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_no_reference_at_all() -> None:
+def test_align_without_ekf2_and_imu_needs_offset_and_frame() -> None:
     flight = flight_along(imu=None, ekf2=None)
-    file = recorded(flight)
+    file = uwb_file(flight)
     said = f"no EKF2 position; the log has no acceleration.*{BOTH_SPANS}.*"
     with pytest.raises(MissingDataError, match=said + r"Give `clock_offset_s` and `frame`\.$"):
         align_position_file(flight, file)
     with pytest.raises(MissingDataError, match=r"Give `yaw_deg`\.$"):
         align_position_file(flight, file, frame="enu", yaw_deg="auto", clock_offset_s=OFFSET_S)
-    alignment, track = placed(flight, file, frame="enu", clock_offset_s=OFFSET_S)
+    alignment, track = align(flight, file, frame="enu", clock_offset_s=OFFSET_S)
     assert alignment.reference == ""
     assert alignment.correlation is alignment.residual_rms_m is None
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_files_that_cannot_be_of_the_flight_are_refused(flight: Flight) -> None:
-    """By an offset without overlap, over days, of a few positions."""
-    file = recorded(flight)
+def test_align_no_overlap_long_or_short_file_is_refused(flight: Flight) -> None:
+    """No overlap with the log, more than one day, or fewer than 10 positions."""
+    file = uwb_file(flight)
     for offset in (0.0, OFFSET_S + 121.0, OFFSET_S - 121.0):
         with pytest.raises(MissingDataError, match="does not overlap the log ." + BOTH_SPANS):
             align_position_file(flight, file, frame="enu", clock_offset_s=offset)
@@ -405,35 +409,35 @@ def test_files_that_cannot_be_of_the_flight_are_refused(flight: Flight) -> None:
         align_position_file(flight, replace(file, samples=file.samples.iloc[:9]))
 
 
-def test_a_file_of_another_flight_is_refused(flight: Flight) -> None:
+def test_align_file_of_other_flight_is_refused(flight: Flight) -> None:
     def other(time_s: Array, heading_deg: float, length_m: float) -> Array:
         angle = 2.0 * np.pi * time_s / 55.0
         radius = 3.0 + np.sin(7.0 * angle)
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1)
 
     with pytest.raises(MissingDataError, match="does not match the EKF2 position"):
-        align_position_file(flight, recorded(flight_along(other)), frame="enu")
+        align_position_file(flight, uwb_file(flight_along(other)), frame="enu")
 
 
 @pytest.mark.parametrize("yaw", [None, "auto"])
-def test_a_flight_that_repeats_itself_needs_the_offset(yaw: Any) -> None:
+def test_align_periodic_path_needs_clock_offset(yaw: Any) -> None:
     flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
-    file = recorded(flight)
+    file = uwb_file(flight)
     said = r"from this path; offsets that differ by [1-6]0\.\d s fit.*"
     with pytest.raises(MissingDataError, match=said + BOTH_SPANS + r".*Give `clock_offset_s`\.$"):
         align_position_file(flight, file, frame="enu", yaw_deg=yaw)
-    alignment, _ = placed(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
+    alignment, _ = align(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
 
 
-def test_a_flight_that_nearly_repeats_itself_is_warned_of() -> None:
-    def ever_faster(time_s: Array, heading_deg: float, length_m: float) -> Array:
+def test_align_almost_periodic_path_warns() -> None:
+    def accelerating_passes(time_s: Array, heading_deg: float, length_m: float) -> Array:
         along = 5.0 * (1.0 - np.cos(2.0 * np.pi * (time_s / 20.0 + time_s**2 / 2e5)))
         return np.stack([along, 0.0 * along, 0.0 * along], axis=1)
 
-    flight = flight_along(ever_faster)
-    alignment, _ = placed(flight, recorded(flight), frame="enu")
-    assert off_s(alignment) < 0.03
+    flight = flight_along(accelerating_passes)
+    alignment, _ = align(flight, uwb_file(flight), frame="enu")
+    assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.warnings
     assert re.match(r"A time offset that differs by [-+]19\.\d s fits nearly as well ", warning)
 
@@ -444,9 +448,11 @@ def test_a_flight_that_nearly_repeats_itself_is_warned_of() -> None:
     ({"yaw_deg": "north"}, "`yaw_deg` north is not valid: give degrees or auto."),
     ({"clock_offset_s": float("inf")}, "`clock_offset_s` inf is not a finite number."),
 ])  # fmt: skip
-def test_invalid_options(flight: Flight, options: dict[str, Any], message: str) -> None:
+def test_align_invalid_options_raise_settings_error(
+    flight: Flight, options: dict[str, Any], message: str
+) -> None:
     with pytest.raises(SettingsError) as caught:
-        align_position_file(flight, recorded(flight), **options)
+        align_position_file(flight, uwb_file(flight), **options)
     assert str(caught.value) == message
 
 
@@ -455,7 +461,7 @@ def test_invalid_options(flight: Flight, options: dict[str, Any], message: str) 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.14.4_aisle_nominal", "v1.16.1_aisle_nlos"])
-def test_simulated_flights(shared_logs: Path, name: str) -> None:
+def test_align_simulated_logs_recovers_clock_and_frame(shared_logs: Path, name: str) -> None:
     log = shared_logs / "simulated" / f"{name}.ulg"
     record = json.loads(log.with_suffix(".json").read_text())
     stamps = np.array([sample["t_unix"] for sample in record["uwb"]])
@@ -463,14 +469,16 @@ def test_simulated_flights(shared_logs: Path, name: str) -> None:
     flight = read_log(log)
     true_s = record["clock"]["px4_boot_minus_companion_unix_ns"] * 1e-9
     for options in ({"frame": "ned"}, {"yaw_deg": "auto"}):
-        alignment, track = placed(flight, file, **options)
+        alignment, track = align(flight, file, **options)
         assert alignment.frame == "ned"
-        # EKF2 itself lags by about 15 ms
-        assert off_s(alignment, true_s) < min(0.05, 3.0 * (alignment.clock_offset_sigma_s or 0.0))
+        # EKF2 lags by about 15 ms
+        assert clock_error_s(alignment, true_s) < min(
+            0.05, 3.0 * (alignment.clock_offset_sigma_s or 0.0)
+        )
         assert abs(alignment.yaw_deg) < 0.5
         np.testing.assert_allclose(alignment.origin_m[:2], 0.0, atol=0.05)
         truth = np.array([sample["truth"] for sample in record["uwb"]])
         error_m = track.samples[Columns.POSITION[:2]].to_numpy() - truth[:, :2]
         assert np.median(np.abs(error_m)) < 0.08
-    alignment, _ = placed(replace(flight, ekf2=unavailable("EKF2")), file, frame="ned")
-    assert off_s(alignment, true_s) < 2.0 * (alignment.clock_offset_sigma_s or 0.0)
+    alignment, _ = align(replace(flight, ekf2=unavailable("EKF2")), file, frame="ned")
+    assert clock_error_s(alignment, true_s) < 2.0 * (alignment.clock_offset_sigma_s or 0.0)

@@ -1,4 +1,4 @@
-"""The form: what is filled in is what is read, and nonsense is refused."""
+"""Answer form: values are read as filled in, and invalid forms are refused."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_tools import done, refused
+from cli_tools import error_line, run_checked
 from flights import aisle_flight
 from pypdf import PdfReader
 
-from px4fuse.answer_form import MISTAKES, ClaimedMistake, draw_questions, form_text, read_answers
+from px4fuse.answer_form import MISTAKES, StudentMistake, draw_questions, form_text, read_answers
 from px4fuse.assignment.truth import quantity_truth
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
@@ -31,7 +31,7 @@ def read(tmp_path: Path, text: str):
     return read_answers(path)
 
 
-def test_an_empty_form_says_nothing_and_explains_every_mistake(tmp_path: Path) -> None:
+def test_empty_form_has_no_answers_and_lists_every_mistake(tmp_path: Path) -> None:
     found = read(tmp_path, EMPTY)
     assert found.log_sha256 == SHA256
     assert (found.mistakes, found.quantities) == ((), (None, None, None))
@@ -40,16 +40,16 @@ def test_an_empty_form_says_nothing_and_explains_every_mistake(tmp_path: Path) -
         assert f"#     {name} " in EMPTY
 
 
-def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
+def test_read_answers_returns_filled_in_values(tmp_path: Path) -> None:
     text = EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = -0.367")
     text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
-    found = read(tmp_path, text.replace('verdict_ours = ""', 'verdict_ours = "overstated"'))
+    found = read(tmp_path, text.replace('verdict_kf = ""', 'verdict_kf = "overstated"'))
     (claim,) = found.mistakes
     assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)
-    assert found.verdict_ours == "underconfident"
-    assert ClaimedMistake("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
-    assert ClaimedMistake("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
+    assert found.verdict_kf == "underconfident"
+    assert StudentMistake("scale", 1.14, "factor").size_in_first_unit() == pytest.approx(14.0)
+    assert StudentMistake("clock-offset", 200.0, "ms").size_in_first_unit() == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(
@@ -74,14 +74,16 @@ def test_what_is_filled_in_is_what_is_read(tmp_path: Path) -> None:
         (EMPTY.replace("ekf2_did = []", 'ekf2_did = ["slept"]'), "'slept' is not one of"),
     ],
 )  # fmt: skip
-def test_nonsense_is_one_line_that_says_where(tmp_path: Path, text: str, said: str) -> None:
+def test_read_answers_invalid_form_names_place_in_one_line(
+    tmp_path: Path, text: str, said: str
+) -> None:
     with pytest.raises(SettingsError) as error:
         read(tmp_path, text)
     assert said in str(error.value)
     assert "\n" not in str(error.value).replace("\\n", "")
 
 
-def test_quantities_differ_between_logs_and_are_those_of_a_replay() -> None:
+def test_quantities_depend_on_log_and_match_replay() -> None:
     drawn = {draw_questions(f"{n:064x}") for n in range(200)}
     assert len(drawn) == 200
     kinds = {quantity.kind for each in drawn for quantity in each}
@@ -99,8 +101,8 @@ def test_quantities_differ_between_logs_and_are_those_of_a_replay() -> None:
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
-def test_silence_is_predicted_step_by_step() -> None:
-    """Against the closed form: P grows by F P Fᵀ + Q for each step of DT."""
+def test_quantity_truth_source_gap_matches_closed_form() -> None:
+    """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(
         q for n in range(99) for q in draw_questions(f"{n:064x}") if q.kind == "silence"
@@ -112,22 +114,24 @@ def test_silence_is_predicted_step_by_step() -> None:
                                     "velocity_variance_m2_s2"]]  # fmt: skip
     dt, n = settings.dt_s, round(quantity.extra / settings.dt_s)
     t = n * dt
-    # a step's acceleration moves the position by dt²/2 at once and by dt for each later step
+    # the acceleration of a step moves the position by dt²/2, and by dt² in each later step
     lags = dt * (np.arange(n) + 0.5)
     grown = settings.sigma_a_m_s2**2 * dt**2 * float((lags**2).sum())
     expected = np.sqrt(p0 + 2.0 * t * p1 + t**2 * p2 + grown)
     assert quantity_truth(main, quantity) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.usefixtures("analysed_once", "drawn_once")
-def test_the_way_of_a_form(tmp_path: Path, sample_log: Path) -> None:
-    """``answers`` writes it, ``compare`` reads it into page and results."""
+@pytest.mark.usefixtures("cached_analyses", "cached_pages")
+def test_compare_answers_option_adds_form_to_page_and_results(
+    tmp_path: Path, sample_log: Path
+) -> None:
+    """``answers`` writes the form, ``compare`` reads it."""
     form, report = tmp_path / "f.toml", tmp_path / "r.pdf"
-    done("answers", sample_log, "-o", form)
-    assert "f.toml exists and was not overwritten" in refused("answers", sample_log, "-o", form)
+    run_checked("answers", sample_log, "-o", form)
+    assert "f.toml exists and was not overwritten" in error_line("answers", sample_log, "-o", form)
     text = form.read_text(encoding="utf-8").replace('kind = ""', 'kind = "none"')
     form.write_text(text, encoding="utf-8")
-    done("compare", sample_log, "--answers", form, "-o", report)
+    run_checked("compare", sample_log, "--answers", form, "-o", report)
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)

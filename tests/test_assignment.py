@@ -1,4 +1,4 @@
-"""Assignments: a flight for everyone, the roster they come from, and the answer key."""
+"""Assignments: one flight per student, the class list, and the answer key."""
 
 import hashlib
 import json
@@ -10,7 +10,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from cli_tools import done
+from cli_tools import run_checked
 from detector_rates import rates
 
 import px4fuse
@@ -37,27 +37,27 @@ from px4fuse.simulation.mistakes import parse
 
 pytestmark = pytest.mark.usefixtures("quick_filter")
 SECRET = b"a secret for tests"
-# What the secret gives student s1: seed, noise and heading, and the mistakes
+# Flight of student s1 with SECRET: seed, noise and heading, and the mistakes
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
-# What names each mistake that is drawn
+# Finding that reports each mistake
 FINDINGS = {
-    "clock-offset": "source_clock_offset", "clock-jump": "source_stamps_of_arrival",
-    "yaw": "source_frame_turned", "nlos": "source_outliers", "dropout": "source_gap",
-    "imu-rate": "logging_rate_low", "ekf2-noise": "ekf2_variance_understated",
-    "ekf2-gate": "ekf2_rejecting", "ekf2-delay": "ekf2_ev_delay_wrong",
+    "clock-offset": "source_time_offset", "clock-jump": "source_timestamps_are_arrival_times",
+    "yaw": "source_frame_misaligned", "nlos": "source_outliers", "dropout": "source_gap",
+    "imu-rate": "imu_rate_too_low", "ekf2-noise": "ekf2_overconfident",
+    "ekf2-gate": "ekf2_rejects_positions", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
 CHOICE = {choice.mistake: choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind}
 
 
-def chosen(drawn):
+def choices_of(drawn):
     return [CHOICE[typed.partition("=")[0]] for typed in drawn.typed]
 
 
 @pytest.fixture(autouse=True, scope="module")
-def flown_once():
-    """Each flight is made once, but for the test that it is made the same again."""
+def cached_flights():
+    """Simulate each flight once, except in the test of equal bytes."""
     made = {}
 
     def from_memory(*given):
@@ -78,16 +78,16 @@ def files(folder):
 
 
 class TestDraw:
-    def test_same_secret_and_id_same_bytes(self):
+    def test_same_secret_and_id_give_same_bytes(self):
         given = SECRET, CLASS[0], "aisle", 2, True
         assert fly(*given) == assignment.fly(*given)
-        # as a platform may spell it in another export
+        # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
-    def test_pinned_so_that_next_term_gives_the_same(self):
+    def test_draw_of_pinned_secret_is_unchanged(self):
         drawn = draw(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
-        # a loop does not tell where it landed
+        # a loop contains no ground truth, which would show the landing
         assert scenario.truth
         assert not draw(SECRET, "s1", "loop").scenario.truth
         assert not draw(SECRET, "s1", "aisle", truth=False).scenario.truth
@@ -97,37 +97,37 @@ class TestDraw:
         assert loops == [1, 5, 9, 11]
 
     @pytest.mark.parametrize("kind", ["aisle", "loop", "mixed"])
-    def test_students_secrets_and_kinds_differ(self, kind):
+    def test_other_students_or_secrets_give_other_flights(self, kind):
         drawn = [draw(SECRET, f"s{n}", kind).scenario for n in range(200)]
         drawn += [draw(b"another secret", f"s{n}", kind).scenario for n in range(200)]
         assert len({one.seed for one in drawn}) == 400
         assert len({(one.sigma_a_m_s2, one.heading_deg, one.speed_m_s) for one in drawn}) > 390
 
     @pytest.mark.parametrize("kind", ["aisle", "loop"])
-    def test_shares_of_counts_and_mistakes(self, kind):
+    def test_mistake_counts_have_configured_shares(self, kind):
         flights = [draw(SECRET, f"s{n}", kind) for n in range(1000)]
         for count, share in enumerate(COUNTS[kind]):
             found = sum(len(one.typed) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
-        names = {choice.mistake for one in flights for choice in chosen(one)}
+        names = {choice.mistake for one in flights for choice in choices_of(one)}
         assert names == {choice.mistake for choice in ASSIGNABLE_MISTAKES[kind]}
 
-    def test_a_mixed_class_has_both_kinds_as_each_would_be_drawn_alone(self):
+    def test_mixed_kind_equals_separate_draws_of_each_kind(self):
         mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
         assert kinds["loop"] / 1000 == pytest.approx(LOOP_SHARE, abs=0.05)
         assert all(one == draw(SECRET, f"s{n}", one.scenario.kind) for n, one in enumerate(mixed))
 
-    def test_two_go_together_and_lie_within_their_sizes(self):
+    def test_two_mistakes_are_compatible_and_within_size_limits(self):
         signs = Counter()
         for n in range(300):
             drawn = draw(SECRET, f"s{n}", "aisle", 2)
-            first, second = chosen(drawn)
+            first, second = choices_of(drawn)
             assert first.goes_with(second)
             assert second.goes_with(first)
             parse(drawn.typed)
             ratios = [EASIEST_DIFFICULTY]
-            for choice, text in zip(chosen(drawn), drawn.typed, strict=True):
+            for choice, text in zip(choices_of(drawn), drawn.typed, strict=True):
                 if choice.limit is None:
                     assert text == choice.mistake
                     continue
@@ -143,8 +143,8 @@ class TestDraw:
         both = {choice.mistake for choice in ASSIGNABLE_MISTAKES["aisle"] if choice.either_sign}
         assert {name for name, positive in signs if not positive} == both
 
-    def test_limits_are_the_smallest_sizes_that_are_found(self):
-        """tests/studies/rates.csv: at the limit and beyond in 19 flights of 20, below in fewer."""
+    def test_size_limits_are_smallest_detected_sizes(self):
+        """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
         for choice in (choice for kind in ASSIGNABLE_MISTAKES.values() for choice in kind):
@@ -158,11 +158,11 @@ class TestDraw:
                 continue
             assert choice.limit == (max if choice.less_is_plainer else min)(found)
             assert found[choice.limit].flights >= 20
-            # and no larger one is missed
+            # each larger size is found, too
             larger = [s for s in sizes if (s < choice.limit) == choice.less_is_plainer]
             assert set(larger) <= {choice.limit, *found}
 
-    def test_difficulties_are_spread_over_the_band(self):
+    def test_difficulties_are_spread_over_their_range(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 90
@@ -171,7 +171,7 @@ class TestDraw:
 @pytest.mark.parametrize(
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
-def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count):
+def test_fly_log_has_finding_of_each_mistake_in_key(tmp_path, kind, number, count):
     log, answer = assignment.fly(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
@@ -182,7 +182,7 @@ def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count)
     else:
         found = find(explain(compare(flight, axes=("north", "east"))))
     drawn = draw(SECRET, CLASS[number].student_id, kind, count)
-    wanted = {FINDINGS[choice.mistake] for choice in chosen(drawn)}
+    wanted = {FINDINGS[choice.mistake] for choice in choices_of(drawn)}
     assert len(wanted) == count
     assert wanted <= {finding.id for finding in found}
 
@@ -191,14 +191,14 @@ def test_what_the_key_expects_is_found_in_the_log(tmp_path, kind, number, count)
 
 
 class TestAssign:
-    """Two mistakes each, so that the flights are the same everywhere and are made once."""
+    """All tests use flights with two mistakes, which are simulated once."""
 
     @pytest.fixture(autouse=True)
-    def one_secret_is_made_up(self, monkeypatch):
+    def fixed_secret(self, monkeypatch):
         made_up = iter([SECRET.decode()])
         monkeypatch.setattr(secrets, "token_urlsafe", lambda _: next(made_up))
 
-    def test_logs_and_key(self, tmp_path):
+    def test_assign_writes_logs_forms_and_key(self, tmp_path):
         folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
         made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 2)
         key = read_key(key_file)
@@ -218,7 +218,7 @@ class TestAssign:
         if os.name == "posix":
             assert stat.S_IMODE(key_file.stat().st_mode) == 0o600
 
-    def test_second_run_changes_nothing_and_may_add_students(self, tmp_path):
+    def test_assign_again_keeps_files_and_adds_students(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         assert assign(CLASS[:2], folder, key_file, None, "aisle", 2)[0].secret
         before = files(folder) | {"key": key_file.read_bytes()}
@@ -227,11 +227,11 @@ class TestAssign:
         key, written = assign(CLASS, folder, key_file, None, "aisle", 2)
         assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
-        # the secret that was made up serves as one that is given
+        # the generated secret can be given later
         assign(CLASS, folder, key_file, key.secret.encode(), "aisle", 2)
         assert read_key(key_file).secret == key.secret
 
-    def test_other_flights_and_keys_are_not_replaced(self, tmp_path):
+    def test_assign_other_flights_or_key_are_not_overwritten(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         before = files(folder) | {"key": key_file.read_bytes()}
@@ -246,7 +246,7 @@ class TestAssign:
             assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         assert files(folder) == {k: v for k, v in before.items() if k != "key"}
 
-    def test_an_interrupted_run_can_go_on(self, tmp_path, monkeypatch):
+    def test_assign_interrupted_run_is_continued(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         flown = assignment.fly
 
@@ -262,7 +262,7 @@ class TestAssign:
         assert len(read_key(key_file).answers) == 2
         assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
 
-    def test_run_with_blocked_folder_goes_on_in_another(self, tmp_path):
+    def test_assign_after_write_error_continues_elsewhere(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
@@ -280,7 +280,7 @@ class TestAssign:
         assert stat.S_IMODE(kept.stat().st_mode) == 0o600 or os.name == "nt"
         assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_key(kept), 1)
 
-    def test_place_of_the_key(self, tmp_path, monkeypatch):
+    def test_key_path_is_outside_the_students_folder(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         flights = tmp_path / "flights"
         assert key_path(flights, None) == tmp_path / "flights_answers.json"
@@ -299,25 +299,26 @@ class TestKey:
         answers = (assignment.fly(SECRET, one, "aisle", 2, True)[1] for one in CLASS[:2])
         return AnswerKey("aisle", tuple(answers), "s")
 
-    def test_round_trip(self, tmp_path):
+    def test_key_text_is_read_back_equal(self, tmp_path):
         path = tmp_path / "key.json"
         path.write_text(key_text(self.key()), encoding="utf-8")
         assert read_key(path) == self.key()
         assert "Do not hand it out" in path.read_text(encoding="utf-8")
 
-    def test_edited_and_hostile_keys(self, tmp_path):
+    def test_read_key_invalid_content_raises_one_line(self, tmp_path):
         good = json.loads(key_text(self.key()))
 
-        def spoilt(**values):
+        def with_values(**values):
             return json.dumps({**good, **values})
 
         def with_student(**values):
-            return spoilt(students=[{**good["students"][0], **values}])
+            return with_values(students=[{**good["students"][0], **values}])
 
         texts = [
-            "", "[" * 1_000_000, "9" * 10_000, spoilt(schema={**good["schema"], "version": 99}),
-            spoilt(students=[]), spoilt(students=[good["students"][0]] * 2),
-            spoilt(students=good["students"] * 600), with_student(id=" "),
+            "", "[" * 1_000_000, "9" * 10_000,
+            with_values(schema={**good["schema"], "version": 99}),
+            with_values(students=[]), with_values(students=[good["students"][0]] * 2),
+            with_values(students=good["students"] * 600), with_student(id=" "),
             with_student(sha256="x" * 64), with_student(name="x" * 2000),
             with_student(mistakes=["x"] * 100), with_student(truth={"sigma_z_m": True}),
         ]  # fmt: skip
@@ -344,15 +345,15 @@ class TestCommand:
         (tmp_path / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
         return tmp_path
 
-    def test_preview_prints_what_is_then_drawn_and_writes_nothing(self, at):
+    def test_simulate_preview_prints_flights_and_writes_nothing(self, at):
         given = ("--assignment", "roster.csv", "-o", "f", "--kind", "mixed", "--mistakes", "1",
                  "--secret-file", "secret.txt")  # fmt: skip
         before = files(at)
-        shown = done("simulate", *given, "--preview").output
+        shown = run_checked("simulate", *given, "--preview").output
         assert files(at) == before
         assert "nothing was written" in shown
-        done("simulate", *given)
-        assert "0 written, 2 existed already" in done("simulate", *given).output
+        run_checked("simulate", *given)
+        assert "0 written, 2 existed already" in run_checked("simulate", *given).output
         assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
         key = read_key(at / "f_answers.json")
         lines = shown.splitlines()
@@ -361,11 +362,11 @@ class TestCommand:
             for part in (answer.name, answer.scenario["kind"], *answer.mistakes):
                 assert part in line
             assert line.strip().endswith(f"{answer.difficulty:.2f}")
-        # the key's secret serves where none is given
+        # without a given secret that of the key is used
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
-        kept = done("simulate", *given).output
+        kept = run_checked("simulate", *given).output
         assert "stored in the answers" in kept
         assert read_key(at / "g_answers.json").secret not in kept
-        again = done("simulate", *given, "--preview").output
+        again = run_checked("simulate", *given, "--preview").output
         for answer in read_key(at / "g_answers.json").answers:
             assert " ".join(answer.mistakes) in again

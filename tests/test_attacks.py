@@ -1,8 +1,7 @@
-"""Reports as a clever student would forge or pad them: none earns more than the honest one.
+"""Forged or padded reports: none gets more points than the unchanged report.
 
-Every row of :data:`FILES` is one attack. Words that say nothing
-about the flight earn no more than no words; a file whose numbers nobody can compute again earns
-nothing that counts, and is never called verified.
+Each row of :data:`FILES` is one attack. Notes without content add no points. A report whose
+numbers cannot be recomputed has no points that count, and its status is never "verified".
 """
 
 from __future__ import annotations
@@ -14,11 +13,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from cli_tools import done
-from conftest import page_of
+from cli_tools import run_checked
+from conftest import blank_page
 from exchange import replace
-from forgery import Base, Change, base, forged, on_page, put, read_again, report_of
-from results_tools import LOOP, changed, decoded
+from forgery import (
+    Change,
+    VerifiedReport,
+    attached_results,
+    forged,
+    make_verified_report,
+    on_page,
+    read_again,
+    set_value,
+)
+from results_tools import LOOP, changed_results, decode_results
 
 from px4fuse.answer_form import form_text
 from px4fuse.assignment.key import Answer, AnswerKey
@@ -36,7 +44,7 @@ from px4fuse.verification.model import Verdict
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import cannot_verify
 
-pytestmark = pytest.mark.usefixtures("analysed_once", "_pages_here")
+pytestmark = pytest.mark.usefixtures("cached_analyses", "_compare_pages_in_process")
 
 MISTAKES = ("nlos=3%", "dropout=5s,30s")
 GAP = '[[mistake]]\nkind = "dropout"\nsize = 5\nfrom_s = 30\nuntil_s = 35\npanel = "innovations"\n'
@@ -60,9 +68,9 @@ time I would move the anchor at the end of the aisle and log the ranges themselv
 
 @dataclass(frozen=True)
 class Flight:
-    """A flight that was handed out, the honest report on it, and the answer key."""
+    """Assigned flight with an unchanged report and the answer key."""
 
-    honest: Base
+    honest: VerifiedReport
     key: AnswerKey
 
     def graded(
@@ -75,7 +83,7 @@ class Flight:
         return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
 
     def with_notes(self, text: str, rubric: Rubric) -> GradedReport:
-        """As if the report had been made with these notes, which verifies."""
+        """Grade the report with other notes, as verified."""
         results = copy.deepcopy(self.honest.results)
         results["student"]["notes"] = text
         return self.graded(
@@ -84,8 +92,8 @@ class Flight:
 
 
 @pytest.fixture
-def _pages_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
+def _compare_pages_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compare pages in this process; test_pages.py tests the separate one."""
     monkeypatch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
 
 
@@ -107,9 +115,9 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     notes.write_text(HONEST, encoding="utf-8")
     own = "--student", "Ada", "--id", "s01", "--notes", notes, "--answers", folder / "a.toml"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pdf_module, "render", page_of)  # drawn below, from its results
-        done("compare", log, "-o", pdf, *own)
-    honest = base(pdf.read_bytes(), log)
+        patch.setattr(pdf_module, "render", blank_page)  # drawn below from the results
+        run_checked("compare", log, "-o", pdf, *own)
+    honest = make_verified_report(pdf.read_bytes(), log)
     (sha256,) = honest.files
     truth = form_truth(simulation, sha256)
     answers = (
@@ -122,10 +130,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
 @pytest.fixture(scope="module")
 def honest(flight: Flight, rubric: Rubric) -> GradedReport:
     verdict = flight.honest.verified(flight.honest.pdf)
-    return flight.graded(report_of(flight.honest.pdf), verdict, rubric)
+    return flight.graded(attached_results(flight.honest.pdf), verdict, rubric)
 
 
-def test_the_honest_report_is_verified_and_names_both(honest: GradedReport) -> None:
+def test_grade_honest_report_is_verified_with_points(honest: GradedReport) -> None:
     assert honest.status == "verified"
     assert honest.pending == ""
     assert honest.flags == ()
@@ -147,7 +155,7 @@ def test_the_honest_report_is_verified_and_names_both(honest: GradedReport) -> N
         "a_" * 90_000,
     ],
 )
-def test_no_sentence_earns_anything(
+def test_grade_notes_without_content_earn_no_points(
     flight: Flight, honest: GradedReport, rubric: Rubric, text: str
 ) -> None:
     graded = flight.with_notes(text, rubric)
@@ -159,8 +167,8 @@ def test_no_sentence_earns_anything(
 # ------------------------------------------------------------------ files
 
 
-def position(results: dict[str, Any]) -> None:
-    """The attack that was paid best: numbers at will, and a file that nobody has."""
+def forge_position_file(results: dict[str, Any]) -> None:
+    """Set numbers at will, and name a position file that is not available."""
     results["request"]["position"] = {"path": "uwb.csv"}
     results["provenance"]["command"] += " --position uwb.csv"
     for axis in results["axes"].values():
@@ -168,62 +176,70 @@ def position(results: dict[str, Any]) -> None:
     results["findings"] = []
 
 
-def joined(results: dict[str, Any]) -> None:
-    position(results)
+def forge_joined_file(results: dict[str, Any]) -> None:
+    forge_position_file(results)
     results["log"]["joined"] = [
         {"name": "uwb.csv", "sha256": "a" * 64, "bytes": 9, "role": "position"}
     ]
 
 
-# Change of the attached results, what the report is then called, and what pending says
+# Change of the attached results, the status of the report, and the text of pending
 FILES: dict[str, tuple[Change, str, str]] = {
-    "--position uwb.csv": (position, "cannot verify", "Add uwb.csv to --logs."),
-    "--position with a hash": (joined, "cannot verify", "Add uwb.csv to --logs."),
-    "--mavlink that nobody has": (
-        put("a.tlog", "request", "mavlink"), "cannot verify", "Add a.tlog to --logs.",
+    "--position uwb.csv": (forge_position_file, "cannot verify", "Add uwb.csv to --logs."),
+    "--position with a hash": (forge_joined_file, "cannot verify", "Add uwb.csv to --logs."),
+    "--mavlink file not available": (
+        set_value("a.tlog", "request", "mavlink"), "cannot verify", "Add a.tlog to --logs.",
     ),
-    "command for people alone": (
-        put("px4fuse compare s01.ulg --position uwb.csv", "provenance", "command"),
+    "changed printed command": (
+        set_value("px4fuse compare s01.ulg --position uwb.csv", "provenance", "command"),
         "numbers differ", "",
     ),
     "another version": (
-        put("0.1.1", "provenance", "px4fuse"), "cannot verify", "Verify it with px4fuse 0.1.1.",
+        set_value("0.1.1", "provenance", "px4fuse"), "cannot verify",
+        "Verify it with px4fuse 0.1.1.",
     ),
     "another schema": (
-        put("9.9", "schema", "version"), "cannot verify", "use the px4fuse version that wrote it",
+        set_value("9.9", "schema", "version"), "cannot verify",
+        "use the px4fuse version that wrote it",
     ),
-    "libraries left out": (put({}, "provenance", "libraries"), "cannot verify", "Ask how"),
-    "an unknown log": (put("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
-    "the log of another": (put("b" * 64, "log", "sha256"), "other log", "given to s02"),
-    "a better NIS": (put(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", ""),
-    "no finding": (put([], "findings"), "numbers differ", ""),
-    "other settings": (put(0.3, "request", "sigma_a_m_s2"), "numbers differ", ""),
-    "another part of the flight": (put(20.0, "request", "start_s"), "numbers differ", ""),
-    "settings that no run can have": (
-        put(1e9, "request", "sigma_a_m_s2"), "cannot verify", "Ask how",
+    "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
+    "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
+    "log of another student": (set_value("b" * 64, "log", "sha256"), "other log", "given to s02"),
+    "better NIS": (
+        set_value(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", "",
     ),
-    "a path": (put("../../etc/passwd", "request", "log"), "cannot verify", "Ask how"),
-    "the folder above": (put("..", "request", "log"), "cannot verify", "Ask how"),
-    "a step that fails": (put(1e-9, "request", "dt_s"), "cannot verify", "Ask how"),
+    "findings removed": (set_value([], "findings"), "numbers differ", ""),
+    "other settings": (set_value(0.3, "request", "sigma_a_m_s2"), "numbers differ", ""),
+    "another part of the flight": (set_value(20.0, "request", "start_s"), "numbers differ", ""),
+    "setting out of range": (
+        set_value(1e9, "request", "sigma_a_m_s2"), "cannot verify", "Ask how",
+    ),
+    "path as log": (set_value("../../etc/passwd", "request", "log"), "cannot verify", "Ask how"),
+    "log is parent folder": (set_value("..", "request", "log"), "cannot verify", "Ask how"),
+    "DT too small": (set_value(1e-9, "request", "dt_s"), "cannot verify", "Ask how"),
     "ten thousand lines of notes": (
-        put("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
+        set_value("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
     ),
-    "the id of another student": (put("s02", "student", "id"), "page differs", "given to s01"),
+    "the id of another student": (
+        set_value("s02", "student", "id"), "page differs", "given to s01",
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_files(
+def test_grade_forged_results_are_not_verified(
     flight: Flight, honest: GradedReport, rubric: Rubric, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, status, pending = FILES[name]
-    if status == "numbers differ":  # whatever the pages look like
-        monkeypatch.setattr(pdf_module, "render", page_of)
+    if status == "numbers differ":  # numbers decide, not pages
+        monkeypatch.setattr(pdf_module, "render", blank_page)
     results = copy.deepcopy(flight.honest.results)
     change(results)
-    # only where numbers agree are pages compared
+    # pages are compared only if the numbers agree
     text = json.dumps(results)
-    pdf = flight.honest.with_results(results) if status == "page differs" else page_of(None, text)
+    pdf = (
+        flight.honest.with_results(results) if status == "page differs" else blank_page(None, text)
+    )
     try:
         report: Reported | ResultsError = read_report(pdf, "a.pdf")
         verdict = flight.honest.verified(pdf)
@@ -239,16 +255,18 @@ def test_files(
     assert graded.points <= honest.points + 1e-9
 
 
-def test_pages_that_were_painted_over(flight: Flight, honest: GradedReport, rubric: Rubric) -> None:
-    """The numbers are verified, the page is not, and what is scored is the redrawn report."""
+def test_grade_painted_page_is_scored_from_redrawn_report(
+    flight: Flight, honest: GradedReport, rubric: Rubric
+) -> None:
+    """The numbers are verified and the page is not; the redrawn report is scored."""
     painted = on_page(1, lambda stream: stream + b"\n0 0 0 rg 100 300 200 200 re f\n")
     pdf = forged(flight.honest.pdf, painted)
     verdict = flight.honest.verified(pdf)
-    graded = flight.graded(report_of(pdf), verdict, rubric)
+    graded = flight.graded(attached_results(pdf), verdict, rubric)
     assert graded.status == "page differs"
     assert graded.points == honest.points
     for rule, counted in (("pending", None), ("zero", 0.0)):
-        strict = flight.graded(report_of(pdf), verdict, replace(rubric, pages=rule))
+        strict = flight.graded(attached_results(pdf), verdict, replace(rubric, pages=rule))
         assert strict.counted == counted
 
 
@@ -261,15 +279,15 @@ REJECTED = {"closures": [{**LOOP["loop"]["closures"][0], "p": 1e-9, "d2": 60.0, 
 NO_END: dict[str, Any] = {
     "closures": [],
     "closure_error_m": ...,
-    "known_end": {"what": "m", "reason": "r", "remedy": ""},
+    "true_end": {"what": "m", "reason": "r", "remedy": ""},
 }
 
 
-def looped(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> GradedReport:
-    """Points of the item on the loop."""
+def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> GradedReport:
+    """Grade the item on the loop."""
     values = {f"request__{name}": value for name, value in request.items()}
     values |= {f"loop__{name}": value for name, value in loop.items()}
-    results = decoded(changed(LOOP, student__id="s01", **values))
+    results = decode_results(changed_results(LOOP, student__id="s01", **values))
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
     made = assess(results, verdict, read_rubric(None), key)
@@ -278,16 +296,16 @@ def looped(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> GradedR
 
 
 LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}
-# Truth of the answer key, options, what the loop then has, the points of 40, and flags
+# Truth of the answer key, options, fields of the loop, points of 40, number of flags
 LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
     "closed": (CLOSED, {}, {}, 40, 0),
     "closed, without a key": (None, {}, {}, 40, 0),
     "open end, rejected": (OPEN_END, {}, REJECTED, 40, 0),
     "open end, rejected, without a key": (None, {}, REJECTED, 10, 0),
-    "open end, left open": (OPEN_END, {"came_back": False}, NO_END, 40, 0),
-    "open end, left open, without a key": (None, {"came_back": False}, NO_END, 0, 0),
+    "open end, left open": (OPEN_END, {"closed_loop": False}, NO_END, 40, 0),
+    "open end, left open, without a key": (None, {"closed_loop": False}, NO_END, 0, 0),
     "open end, landing stated": (OPEN_END, LANDED, {}, 40, 0),
-    "closed, left open": (CLOSED, {"came_back": False}, NO_END, 0, 0),
+    "closed, left open": (CLOSED, {"closed_loop": False}, NO_END, 0, 0),
     "closed, rejected by a small drift": (CLOSED, {"position_drift_m": 0.01}, REJECTED, 10, 1),
     "open end, accepted by a large drift": (OPEN_END, {"position_drift_m": 50.0}, {}, 40, 1),
     "open end, accepted by a heading drift": (OPEN_END, {"heading_drift_deg": 90.0}, {}, 40, 1),
@@ -298,6 +316,6 @@ LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
 @pytest.mark.parametrize("name", LOOPS)
 def test_loop_item_points_and_flags(name: str) -> None:
     truth, request, loop, points, flags = LOOPS[name]
-    graded = looped(truth, request, loop)
+    graded = grade_loop(truth, request, loop)
     assert graded.points == pytest.approx(points), graded.items
     assert len(graded.flags) == flags, graded.flags

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from patience import patience
+from time_limit import time_limit
 from ulog_tools import Log, make_log, position, seconds_of, selector, stamps, take, topic
 
 from px4fuse.analysis import run_or_evaluate_aids
@@ -34,7 +34,7 @@ def read_or_error(path: Path) -> Flight | Px4FuseError:
     """Return the flight or the px4fuse error; fail on any other exception or printed text."""
     printed = io.StringIO()
     result: Flight | Px4FuseError
-    with contextlib.redirect_stdout(printed), patience():
+    with contextlib.redirect_stdout(printed), time_limit():
         try:
             result = read_log(path)
         except Px4FuseError as error:

@@ -22,10 +22,10 @@ import jsonschema
 import pandas as pd
 import psutil
 import pytest
-from batch_tools import environment, started, tiny_log, tiny_logs
-from class_tools import in_turn
-from cli_tools import done, refused
-from cli_tools import run as typed
+from batch_tools import environment, start_dask, tiny_log, tiny_logs
+from class_tools import run_in_turn
+from cli_tools import error_line, run_checked
+from cli_tools import run as run_cli
 from made_up_fleet import DAMAGED, made_up
 from msgspec import structs
 from ulog_tools import gnss_log
@@ -57,7 +57,7 @@ def one_worker(monkeypatch) -> None:
 @pytest.fixture
 def in_this_process(monkeypatch) -> None:
     """Run jobs in the process of the test."""
-    monkeypatch.setattr(run, "run_bounded", in_turn)
+    monkeypatch.setattr(run, "run_bounded", run_in_turn)
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def remembered(monkeypatch, memory: Path) -> None:
 
 def remember(patch: pytest.MonkeyPatch, memory: Path) -> None:
     patch.setenv(batch_tools.MEMORY, str(memory))
-    patch.setattr(run, "analyse", batch_tools.analyse_once)
+    patch.setattr(run, "analyse", batch_tools.analyse_cached)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def flights(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def undisturbed(flights, memory, tmp_path_factory) -> pd.DataFrame:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "run_bounded", in_turn)
+        patch.setattr(run, "run_bounded", run_in_turn)
         remember(patch, memory)
         return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"), workers=1)
 
@@ -108,7 +108,7 @@ def wait_for_first_result(process: subprocess.Popen[str], output: Path) -> None:
 
 
 def command(*arguments: str | Path) -> Any:
-    return typed("batch", *arguments)
+    return run_cli("batch", *arguments)
 
 
 # ------------------------------------------------------------------ the table
@@ -135,7 +135,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     assert list(first["kf_nis_mean"]) == [
         axis.filters["kf"].nis_mean for axis in analysis.axes.values()
     ]
-    assert list(first["kf_factor"] ** 2 * first["kf_nis_mean"]) == pytest.approx([1.0] * 4)
+    assert list(first["kf_sigma_ratio"] ** 2) == pytest.approx(list(first["kf_nis_mean"]))
     tuned = analysis.tuning["horizontal"].sigma_z
     assert first.loc[0, ["sigma_z_m", "sigma_z_low_m", "sigma_z_high_m"]].tolist() == [
         tuned.value, tuned.low, tuned.high,
@@ -143,7 +143,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     assert (first["status"] == "done").all()
     results = read_results((output / first.loc[0, "results"]).read_bytes())
     assert results.request.log == "f1.ulg"
-    assert results.story == tuple(first.loc[0, "story"].split("\n"))
+    assert results.summary == tuple(first.loc[0, "summary"].split("\n"))
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
     # a log whose clock is out of range has no date
     beyond = structs.replace(results.log, start_unix_s=1e18)
@@ -151,7 +151,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     assert log_columns(beyond)["date"] == ""
     # the clock offset is present only if it is determinable
     rows = axis_rows(
-        structs.replace(results, clock=structs.replace(results.clock, determinable=False))
+        structs.replace(results, clock=structs.replace(results.clock, is_determinable=False))
     )
     assert first["clock_offset_s"].tolist() == pytest.approx([results.clock.offset_s] * 4)
     assert all("clock_offset_s" not in row for row in rows)
@@ -203,7 +203,7 @@ def test_batch_log_without_position_is_not_compared(tmp_path):
     assert row["firmware"] == "PX4 v1.16.0"
     assert row["duration_s"] > 10
     assert "--position" in row["remedy"]
-    assert row["aids"].startswith("gnss_pos variance overstated")
+    assert row["aids"].startswith("gnss_pos underconfident")
     assert "1 reused from an earlier run" in command(log, "-o", tmp_path / "out").output
 
 
@@ -213,7 +213,7 @@ def test_batch_gnss_flight_has_rows(shared_logs):
     (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
     table = px4fuse.batch(log)
     assert table["axis"].tolist() == ["aisle", "north", "east"]
-    assert table["aids"].str.startswith("gnss_pos variance overstated;gnss_vel ").all()
+    assert table["aids"].str.startswith("gnss_pos underconfident;gnss_vel ").all()
 
 
 # ------------------------------------------------------------------ resuming
@@ -260,7 +260,7 @@ def test_batch_ctrl_c_keeps_results_and_prints_one_line(flights, undisturbed, tm
     assert process.returncode == 130
     assert said.startswith("px4fuse: interrupted; finished results are in")
     assert said.count("\n") == 1
-    again = done("batch", flights, "-o", tmp_path).output
+    again = run_checked("batch", flights, "-o", tmp_path).output
     assert "3 logs: 3 done" in again
     assert "; 0 reused" not in again
     assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)
@@ -349,7 +349,7 @@ def test_batch_two_runs_in_one_folder_keep_tables_valid(tmp_path):
         while not out.exists():
             assert other.poll() is None
             time.sleep(0.01)
-        done("batch", logs, "-o", out)
+        run_checked("batch", logs, "-o", out)
         assert (other.communicate(timeout=300)[1], other.returncode) == ("", 0)
     table = pd.read_parquet(out / "fleet.parquet")
     assert table.groupby("name")["status"].unique().map(list).to_dict() == {
@@ -364,7 +364,7 @@ def test_batch_invalid_logs_have_one_row_each(tmp_path):
     for number in range(160):
         rng = random.Random(number)
         (folder / f"{number}.ulg").write_bytes(rng.randbytes(rng.choice((0, 7, 200, 5000))))
-    done("batch", folder, "-o", tmp_path / "out")
+    run_checked("batch", folder, "-o", tmp_path / "out")
     table = pd.read_parquet(tmp_path / "out" / "fleet.parquet")
     assert len(table) == 160
     assert set(table["status"]) <= {"failed", "not compared"}
@@ -459,7 +459,7 @@ def started_worker(address: str, log: Path, path: str) -> Any:
     """Start a Dask worker without the process that would restart it."""
     local = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
     says = "Starting Worker plugin"
-    return started("worker", address, *local, says=says, log=log, PYTHONPATH=path)
+    return start_dask("worker", address, *local, says=says, log=log, PYTHONPATH=path)
 
 
 def test_batch_running_cluster_gives_the_same_table(flights, undisturbed, tmp_path):
@@ -467,7 +467,7 @@ def test_batch_running_cluster_gives_the_same_table(flights, undisturbed, tmp_pa
     path = os.pathsep.join((str(batch_tools.REPOSITORY / "tests"), str(batch_tools.REPOSITORY)))
     ports = ("--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")
     named = {"says": "Scheduler at:", "log": tmp_path / "scheduler", "PYTHONPATH": path}
-    with started("scheduler", *ports, **named) as line:
+    with start_dask("scheduler", *ports, **named) as line:
         address = line.split()[-1]
         with (
             started_worker(address, tmp_path / "one", path),
@@ -481,14 +481,14 @@ def test_batch_running_cluster_gives_the_same_table(flights, undisturbed, tmp_pa
 def assert_cluster_gives_the_same_table(address, flights, undisturbed, tmp_path):
     """Assert the table of the cluster; a worker with another version of px4fuse is refused."""
     arguments = [flights, "-o", tmp_path / "out", "--scheduler", address]
-    done("batch", *arguments, "--fail-on", "failed")
+    run_checked("batch", *arguments, "--fail-on", "failed")
     assert_same(pd.read_parquet(tmp_path / "out" / "fleet.parquet"), undisturbed)
     other = tmp_path / "px4fuse-9.9.dist-info"
     other.mkdir()
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
     path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
     with started_worker(address, tmp_path / "third", path):
-        assert "runs px4fuse 9.9, but this computer runs" in refused("batch", *arguments)
+        assert "runs px4fuse 9.9, but this computer runs" in error_line("batch", *arguments)
 
 
 def assert_failed_job_does_not_affect_others(address):

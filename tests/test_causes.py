@@ -6,7 +6,7 @@ import pytest
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings import NAMES, Finding, cause_grouping
+from px4fuse.findings import TITLES, Finding, cause_grouping
 from px4fuse.findings.cause_grouping import CONSEQUENCES, NOISES, RECORDING, group_by_cause
 from px4fuse.report.phrases import format_verdict, verdict_notes
 
@@ -17,7 +17,7 @@ def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
 
 def test_consequences_name_existing_findings_only() -> None:
     listed = {name.split(":")[0] for names in CONSEQUENCES.values() for name in names}
-    assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(NAMES)
+    assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(TITLES)
     kinds = {name.partition(":")[2] for names in CONSEQUENCES.values() for name in names}
     assert kinds - {""} <= {value for name, value in vars(cause_grouping).items() if name.isupper()
                             and isinstance(value, str)}  # fmt: skip
@@ -30,7 +30,7 @@ def test_consequences_list_inner_causes_first() -> None:
         assert inner <= set(outer[:at])
 
 
-UNDERSTATED, REJECTING = "ekf2_variance_understated", "ekf2_rejecting"
+UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
 
 
 @pytest.mark.parametrize(
@@ -40,31 +40,33 @@ UNDERSTATED, REJECTING = "ekf2_variance_understated", "ekf2_rejecting"
         ([one(REJECTING, "error"), one(UNDERSTATED)],
          [(UNDERSTATED, "error", None), (REJECTING, "error", UNDERSTATED)]),
         # a wrong variance is a consequence of the cause in its evidence
-        ([one("source_outliers"), one("kf_variance_understated", cause="outliers")],
+        ([one("source_outliers"), one("kf_overconfident", cause="outliers")],
          [("source_outliers", "warning", None),
-          ("kf_variance_understated", "warning", "source_outliers")]),
-        ([one("source_outliers"), one("kf_variance_understated", cause="measurement noise")],
-         [("source_outliers", "warning", None), ("kf_variance_understated", "warning", None)]),
+          ("kf_overconfident", "warning", "source_outliers")]),
+        ([one("source_outliers"), one("kf_overconfident", cause="measurement noise")],
+         [("source_outliers", "warning", None), ("kf_overconfident", "warning", None)]),
         # consequences of consequences
         ([one("source_outliers", "error"), one(UNDERSTATED, cause="outliers"), one(REJECTING)],
          [("source_outliers", "error", None), (UNDERSTATED, "warning", "source_outliers"),
           (REJECTING, "warning", UNDERSTATED)]),
         # jump and scale are consequences of changed noise; a jump's consequence follows the jump
-        ([*map(one, ("source_noise_changes", "source_jumps", "source_scale_wrong", "ekf2_resets"))],
-         [("source_noise_changes", "warning", None),
-          ("source_jumps", "warning", "source_noise_changes"),
-          ("ekf2_resets", "warning", "source_jumps"),
-          ("source_scale_wrong", "warning", "source_noise_changes")]),
+        ([*map(one, ("source_noise_varies", "source_position_jump", "source_scale_error",
+                     "ekf2_resets"))],
+         [("source_noise_varies", "warning", None),
+          ("source_position_jump", "warning", "source_noise_varies"),
+          ("ekf2_resets", "warning", "source_position_jump"),
+          ("source_scale_error", "warning", "source_noise_varies")]),
         # the severity of a KF variance does not raise that of advice
-        ([one("sigma_z_large", "info"),
-          one("kf_variance_overstated", "error", cause="measurement noise")],
-         [("sigma_z_large", "info", None), ("kf_variance_overstated", "error", "sigma_z_large")]),
+        ([one("sigma_z_too_large", "note"),
+          one("kf_underconfident", "error", cause="measurement noise")],
+         [("sigma_z_too_large", "note", None),
+          ("kf_underconfident", "error", "sigma_z_too_large")]),
         # findings about the recording come before noises
-        ([one("no_motion"), one("sigma_a_large", "error"), one("ekf2_resets", "info"),
-          one("source_gap"), one("source_clock_changes", "error")],
-         [("source_clock_changes", "error", None), ("source_gap", "warning", None),
-          ("sigma_a_large", "error", None), ("no_motion", "warning", None),
-          ("ekf2_resets", "info", None)]),
+        ([one("no_motion"), one("sigma_a_too_large", "error"), one("ekf2_resets", "note"),
+          one("source_gap"), one("source_time_offset_changes", "error")],
+         [("source_time_offset_changes", "error", None), ("source_gap", "warning", None),
+          ("sigma_a_too_large", "error", None), ("no_motion", "warning", None),
+          ("ekf2_resets", "note", None)]),
     ],
 )  # fmt: skip
 def test_group_by_cause_lists_consequences_after_cause(given: Any, told: Any) -> None:

@@ -1,4 +1,4 @@
-"""The class page in a real browser, and what it may not do with what students wrote."""
+"""Class page in a browser; text of students is never interpreted as HTML or script."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 from browser import Browser, Elements, content
-from golden_tools import agrees, of_values
+from golden_tools import assert_matches_golden, of_values
 from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
-from px4fuse.answer_form import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, StudentMistake
 from px4fuse.grading.class_page import html_text, tenths
 from px4fuse.grading.model import Entry, GradedReport, Item, Override
 from px4fuse.grading.outputs import anonymise_entry
@@ -50,7 +50,7 @@ OF_ENTRY = ("handed_in_at", "late_s", "deduction", "overrides", "comment", "tota
 
 
 def row(name: str, points: float | None, **more: Any) -> Entry:
-    """A student with one report; what Entry has goes there, the rest to the report."""
+    """Make the entry of a student with one report; other arguments are for the report."""
     own = {key: more.pop(key) for key in OF_ENTRY if key in more}
     one = graded(name, points, **more)
     own["handed_in"] = own.pop("handed_in_at", "")
@@ -60,7 +60,7 @@ def row(name: str, points: float | None, **more: Any) -> Entry:
 
 FORM = Answers(
     log_sha256="a" * 64,
-    mistakes=(ClaimedMistake(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),),
+    mistakes=(StudentMistake(MARKUP, 1.0, BREAKOUT, panel=MARKUP, parameter=BREAKOUT),),
 )
 CLASS = (
     row(
@@ -115,16 +115,16 @@ def shape(text: str) -> list[tuple[str, list[str]]]:
     return [(tag, sorted(attributes)) for tag, attributes in Elements(text).found]
 
 
-def test_the_page_holds_what_it_held() -> None:
+def test_class_page_matches_golden_file() -> None:
     text = html_text(CLASS, "Class", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
     lines = [line for line in above if line.strip() and "sha256" not in line]
     lines += of_values(content(text))
-    agrees("class_page", [line[:300] for line in lines])
+    assert_matches_golden("class_page", [line[:300] for line in lines])
 
 
 @given(text=st.text(max_size=60) | st.sampled_from([MARKUP, BREAKOUT, "\0\x1b\ud800", "$title"]))
-def test_text_makes_no_elements(text: str) -> None:
+def test_class_page_any_text_adds_no_html_elements(text: str) -> None:
     def page(word: str) -> str:
         one = row(
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
@@ -140,22 +140,22 @@ def test_text_makes_no_elements(text: str) -> None:
     assert shape(made) == shape(page("x" if text else ""))
 
 
-def test_pending_points_stand_apart_from_those_that_count() -> None:
+def test_class_page_pending_points_are_not_averaged() -> None:
     said = {"Notes": Override(9.0, "Good.")}
     entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0), row("Cy", 12.0, pending="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
     text = html_text(entries, "Class", "px4fuse 1")
-    assert "2 min late" in text  # a minute is not nothing
-    assert "14.3 <small>of 20" in text  # of 10, 20 and 13
+    assert "2 min late" in text  # 61 s are rounded up
+    assert "14.3 <small>of 20" in text  # mean of 10, 20 and 13
     assert "1 <small>12 points, not counted" in text
-    # of 16 points for notes those that count had 6, 16 and 9
+    # mean of 6, 16 and 9 of 16 points for notes
     assert "10.3&nbsp;/&nbsp;16" in text
     cells = [row[0][3] for row in content(text)["rows"]]
     assert cells[2:] == [["pending", "", "12 proposed"],
                          ["13 / 20", 13.0, "set by instructor", "", 0.65]]  # fmt: skip
 
 
-def test_what_is_not_finite_too_long_or_too_much() -> None:
+def test_class_page_limits_long_text_and_omits_nan() -> None:
     odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
     text = html_text([odd], "Class", "px4fuse 1")
     assert "nan" not in text.lower().split("<script>")[0]
@@ -195,7 +195,7 @@ def anonymous_class() -> list[Entry]:
     return entries
 
 
-def test_an_anonymous_class_names_nobody() -> None:
+def test_class_page_anonymous_contains_no_names() -> None:
     text = html_text(anonymous_class(), "Class", "px4fuse 1")
     written = unicodedata.normalize("NFC", text + json.dumps(content(text), ensure_ascii=False))
     for name, student_id, file in PEOPLE:
@@ -207,7 +207,7 @@ def test_an_anonymous_class_names_nobody() -> None:
     points = [part[3] for part in parts if part[1] == "Points (proposed)"]
     assert {tuple(row) for rows in points for row in rows} == {("Settings", "9", "20", "")}
     assert ["list", "Mistakes of this flight", ["positions that jump: not named"], False] in parts
-    # nothing of a text, no link to a PDF, no boxes for what has no owner
+    # no text of students, no link to a PDF, no input boxes without an owner
     assert not {"boxes", "prose", "links"} & {part[0] for part in parts}
     for there in ("Lovelace", ".pdf", "data:image/png"):
         assert there not in written
@@ -228,12 +228,12 @@ HEADS = ("Student", "Id", "Status", "Points", "Handed in", "Flags", "Pages", "No
          "mean NIS", MARKUP)  # fmt: skip
 
 
-def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
+def test_class_page_filters_by_text_and_status(page: Browser) -> None:
     count = "document.querySelector('.count').textContent"
     assert page.ask(count) == f"Showing {len(CLASS)} of {len(CLASS)}"
     page.click("#text")
     page.write("zoe")
-    # Her own row, and the one whose flag names her
+    # the row of Zoë, and one with a flag that contains the name
     assert page.names() == ["Zoë", "ada"]
     assert page.ask(count) == f"Showing 2 of {len(CLASS)}"
     page.write(" nobody")
@@ -250,7 +250,7 @@ def test_filters_by_text_and_status_with_a_count(page: Browser) -> None:
     assert page.complaints() == []
 
 
-def test_a_row_unfolds_with_its_report(page: Browser) -> None:
+def test_class_page_row_opens_report_details(page: Browser) -> None:
     assert page.ask("[...document.querySelectorAll('.bar')].every((one) => one.ariaHidden)")
     assert page.ask("document.querySelector('tr:first-child .bar').closest('td').innerText") == (
         "18.5 / 20"
@@ -259,7 +259,7 @@ def test_a_row_unfolds_with_its_report(page: Browser) -> None:
     assert page.ask("document.querySelector('.unfold').ariaExpanded") == "true"
     assert "There." in page.ask("document.querySelector('.more').innerText")
     assert page.ask("document.querySelector('.beside a').href").endswith("/reports/1007.pdf")
-    # It moves with its row, and hides with it
+    # details are sorted and filtered with their row
     page.click(f".list > thead th:nth-child({HEADS.index('Points') + 1}) button")
     before = "document.querySelector('.more').previousElementSibling.querySelector('.name')"
     assert page.ask(f"{before}.textContent") == "Zoë"
@@ -270,14 +270,14 @@ def test_a_row_unfolds_with_its_report(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_keys_step_through_the_reports(page: Browser) -> None:
+def test_class_page_keys_step_through_reports(page: Browser) -> None:
     opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
     for key, name in (("j", "Zoë"), ("n", "ada"), ("j", "Émile"), ("k", "ada"), ("p", "Zoë")):
         page.press(key, key)
         assert page.ask(opened) == [name]
     assert page.ask("document.activeElement.textContent") == "Zoë"
     page.press("Escape")
-    # what is typed into the search is text
+    # in the search field keys are text
     page.press("/", "/")
     page.press("j", "j")
     assert page.ask("document.activeElement.id + document.activeElement.value") == "textj"
@@ -298,7 +298,7 @@ def test_tenths_count_values_by_lower_edge() -> None:
     ]
 
 
-def test_what_students_wrote_stays_text(page: Browser) -> None:
+def test_class_page_student_markup_is_shown_as_text(page: Browser) -> None:
     page.ask("[...document.querySelectorAll('.unfold')].forEach((button) => button.click())")
     named = [TURNED if one.student == REVERSED else one.display_name for one in CLASS]
     assert page.names() == named
@@ -321,7 +321,7 @@ def test_what_students_wrote_stays_text(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_the_policy_stops_what_would_come_to_life(page: Browser) -> None:
+def test_class_page_policy_blocks_images_and_requests(page: Browser) -> None:
     page.ask(
         "document.body.insertAdjacentHTML('beforeend',"
         ' \'<img src="http://127.0.0.1:9/x.png" onerror="window.alive=3">\')'
@@ -333,7 +333,7 @@ def test_the_policy_stops_what_would_come_to_life(page: Browser) -> None:
     assert any("img-src" in text and "127.0.0.1" in text for text in refusals)
 
 
-def test_printed_every_page_has_the_table_s_head(browser: Browser, tmp_path: Path) -> None:
+def test_class_page_print_repeats_table_header(browser: Browser, tmp_path: Path) -> None:
     file = tmp_path / "class.html"
     many = [row(f"Student {n}", 9.0, flags=("Look here.",)) for n in range(130)]
     file.write_bytes(html_text(many, "Class", "px4fuse 1").encode())
@@ -344,11 +344,11 @@ def test_printed_every_page_has_the_table_s_head(browser: Browser, tmp_path: Pat
     assert len(listed) > 1
     assert all("Points" in text for text in listed)
     assert not any("Find" in text for text in pages)
-    # all of them, not those on screen
+    # rows outside the screen are printed, too
     assert "Student 129" in "".join(pages)
 
 
-def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Browser) -> None:
+def test_class_page_points_and_comments_download_as_csv(page: Browser) -> None:
     page.ask("URL.createObjectURL = (one) => { window.table = one.text(); return '#'; }; 0")
     assert not page.ask("document.querySelector('#save').checkVisibility()")
     page.ask("document.querySelector('.list > tbody > tr .unfold').click()")
@@ -359,11 +359,11 @@ def test_points_and_words_of_the_instructor_are_downloaded_as_a_table(page: Brow
         " words.dispatchEvent(new Event('input')); })()"
     )
     leave = "window.dispatchEvent(new Event('beforeunload', { cancelable: true }))"
-    assert not page.ask(leave)  # the browser asks whether to leave what is not saved
+    assert not page.ask(leave)  # the browser warns of unsaved changes
     page.click("#save")
     made = str(page.ask_later("window.table"))
     rows = list(csv.reader(io.StringIO(made.removeprefix("\ufeff"))))
     assert page.ask(leave)
     assert rows[0] == ["id", "item", "points", "comment"]
     assert ["1007", "total", "7.5", '\'=1+1, "well"'] in rows
-    assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # what was said before stays
+    assert ["'" + FORMULA, BREAKOUT, "", MARKUP] in rows  # earlier comments are kept

@@ -1,4 +1,4 @@
-"""The class as CSV, opened by programs that execute what looks like a formula."""
+"""Class table as CSV: no cell is executed as a formula by a spreadsheet program."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def may_be_formula(cell: str) -> bool:
 
 
 @given(texts)
-def test_no_cell_is_live_whatever_the_program_splits_at(text: str) -> None:
+def test_csv_text_any_delimiter_has_no_formula_cell(text: str) -> None:
     made = csv_text([graded(text, {text: -3.25})])
     made.encode()
     for delimiter in (",", ";", "\t"):
@@ -74,7 +74,9 @@ def test_no_cell_is_live_whatever_the_program_splits_at(text: str) -> None:
 
 
 @given(st.lists(st.tuples(texts, st.dictionaries(texts, finite, max_size=3)), max_size=4))
-def test_read_back_it_is_what_was_made_safe(rows: list[tuple[str, dict[str, float]]]) -> None:
+def test_csv_text_is_read_back_as_neutralised_values(
+    rows: list[tuple[str, dict[str, float]]],
+) -> None:
     head, *rest = cells(csv_text([graded(text, numbers) for text, numbers in rows]))
     assert tuple(head[: len(FIRST_COLUMNS)]) == FIRST_COLUMNS
     assert tuple(head[-len(LAST_COLUMNS) :]) == LAST_COLUMNS
@@ -108,13 +110,13 @@ def test_read_back_it_is_what_was_made_safe(rows: list[tuple[str, dict[str, floa
 
 
 @given(texts)
-def test_what_is_safe_stays_so(text: str) -> None:
+def test_neutralise_formulas_twice_equals_once(text: str) -> None:
     once = neutralise_formulas(text)
     assert neutralise_formulas(once).replace("'", "") == once.replace("'", "")
     assert not may_be_formula(once)
 
 
-def test_every_known_trick_is_stopped_and_what_is_harmless_left_alone() -> None:
+def test_neutralise_formulas_changes_formulas_only() -> None:
     for text in DANGEROUS:
         assert neutralise_formulas(text) != text
         assert not may_be_formula(neutralise_formulas(text)), text
@@ -124,7 +126,7 @@ def test_every_known_trick_is_stopped_and_what_is_harmless_left_alone() -> None:
         assert neutralise_id(text) == text
 
 
-def test_excel_knows_the_encoding_and_the_line_ends() -> None:
+def test_csv_text_has_bom_and_crlf() -> None:
     made = csv_text([graded("Zoë 李雷", {"NIS": float("nan")}, points=0.1 + 0.2)])
     assert made.encode().startswith(b"\xef\xbb\xbffile,student,")
     assert made.count("\r\n") == made.count("\n") == 2
@@ -132,7 +134,7 @@ def test_excel_knows_the_encoding_and_the_line_ends() -> None:
     assert row[len(FIRST_COLUMNS) : -len(LAST_COLUMNS)] == ["0.3", ""]
 
 
-def test_late_pending_and_missing_ones_say_so() -> None:
+def test_csv_text_lists_late_pending_and_missing() -> None:
     one = GradedReport("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, pending="Run 0.1.1."), total=None)
@@ -145,4 +147,6 @@ def test_late_pending_and_missing_ones_say_so() -> None:
         ["-17", "missing", "", "", "", "", "", "", ""],
     ]
     assert len(cells(csv_text([]))) == 1
-    assert len(neutralise_formulas("=" * 10**6)) <= MAX_CHARACTERS + 1  # what a cell of Excel takes
+    assert (
+        len(neutralise_formulas("=" * 10**6)) <= MAX_CHARACTERS + 1
+    )  # maximum length of a cell in Excel

@@ -11,12 +11,12 @@ import jsonschema
 import pypdf
 import pytest
 from batch_tools import tiny_log
-from cli_tools import contents, done, refused, run_main
+from cli_tools import contents, error_line, run_checked, run_main
 from conftest import REPOSITORY as ROOT
 
 from px4fuse.results.contract import schema
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 
 def test_libraries_use_one_thread_unless_set_by_user(monkeypatch, capsys):
@@ -42,7 +42,9 @@ def report(tmp_path_factory, sample_log) -> tuple[Path, str]:
         encoding="utf-8",
     )
     own = "--student", "Ana $x$ Müller 李 " * 9, "--id", "$^2_", "--notes", notes
-    result = done("compare", sample_log, "-o", folder / "report.pdf", *own, "--sigma-z", "0.12")
+    result = run_checked(
+        "compare", sample_log, "-o", folder / "report.pdf", *own, "--sigma-z", "0.12"
+    )
     return folder, result.output
 
 
@@ -67,9 +69,9 @@ def test_compare_report_prints_special_characters(report):
 
 
 @pytest.mark.usefixtures("no_drawing")
-@pytest.mark.parametrize(("severity", "code"), [("info", 1), ("error", 0)])
+@pytest.mark.parametrize(("severity", "code"), [("note", 1), ("error", 0)])
 def test_compare_fail_on_sets_exit_code(tmp_path, sample_log, severity, code):
-    done("compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity, code=code)
+    run_checked("compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity, code=code)
 
 
 def test_help_imports_no_slow_library():
@@ -81,15 +83,17 @@ def test_help_imports_no_slow_library():
         "heavy = {'pandas', 'matplotlib', 'scipy', 'numpy', 'pyulog', 'filterpy', 'rich'}\n"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "compare" in done.stdout
+    finished = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert "compare" in finished.stdout
 
 
 def test_compare_accepts_invalid_bytes_and_long_student_id(tmp_path, sample_log):
     part = "--axis", "north", "--start", "20", "--end", "40"
     own = "--student", "bad\udcff", "--id", "9" * 10_000
-    done("compare", sample_log, *part, "-o", tmp_path / "r.pdf", *own)
+    run_checked("compare", sample_log, *part, "-o", tmp_path / "r.pdf", *own)
     student = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["student"]
     assert student == {"name": "bad?", "id": "9" * 10_000, "notes": ""}
 
@@ -108,27 +112,27 @@ def samples_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("samples_installed")
 def test_sample_writes_logs_and_prints_next_command() -> None:
-    assert done("sample").output.splitlines()[0].split(maxsplit=1) == [
+    assert run_checked("sample").output.splitlines()[0].split(maxsplit=1) == [
         "Run", f"px4fuse compare {Path('sample_logs') / 'aisle_uwb.ulg'}"
     ]  # fmt: skip
     report, shipped = (contents(folder / "sample_logs") for folder in (Path(), ROOT))
     assert report.items() <= shipped.items()
     assert report.keys() >= {"aisle_uwb.ulg", "aisle_uwb.tlog", "loop_vio.ulg", "loop_slam.tum"}
-    done("sample")  # identical files may be overwritten
+    run_checked("sample")  # identical files may be overwritten
 
 
 @pytest.mark.usefixtures("samples_installed")
 def test_sample_existing_other_file_is_refused() -> None:
     Path("flights").mkdir()
     Path("flights/loop_slam.tum").write_text("mine")
-    said = refused("sample", "-o", "flights")
+    said = error_line("sample", "-o", "flights")
     assert "loop_slam.tum already exists and is another file. Nothing was written." in said
     assert contents(Path("flights")) == {"loop_slam.tum": b"mine"}
 
 
 def test_sample_without_package_prints_install_command(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
-    assert 'not installed. Run pip install "px4fuse[samples]".' in refused("sample")
+    assert 'not installed. Run pip install "px4fuse[samples]".' in error_line("sample")
 
 
 @pytest.mark.parametrize(("words", "loaded"), [("info", False), ("extract -o out", True)])
@@ -141,8 +145,8 @@ def test_commands_without_tables_do_not_import_pyarrow(words, loaded, sample_log
         "print('pyarrow', bool(sys.modules.get('pyarrow')), 'dask' in sys.modules)"
     )
     command = [sys.executable, "-c", script]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
-    assert done.stdout.splitlines()[-1] == f"pyarrow {loaded} False"
+    finished = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert finished.stdout.splitlines()[-1] == f"pyarrow {loaded} False"
 
 
 def test_commands_legacy_code_page_open_files_as_utf8(tmp_path: Path) -> None:
@@ -162,5 +166,7 @@ def test_commands_legacy_code_page_open_files_as_utf8(tmp_path: Path) -> None:
     console = {"PYTHONUTF8": "0", "LC_ALL": "de_DE.UTF-8", "PYTHONIOENCODING": "cp1252"}
     environment = {**os.environ, **console, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-X", "warn_default_encoding", "-c", script]
-    done = subprocess.run(command, capture_output=True, cwd=tmp_path, env=environment, check=False)
-    assert done.returncode == 0, done.stderr.decode("cp1252")[-300:]
+    finished = subprocess.run(
+        command, capture_output=True, cwd=tmp_path, env=environment, check=False
+    )
+    assert finished.returncode == 0, finished.stderr.decode("cp1252")[-300:]

@@ -29,7 +29,7 @@ from scipy.stats import binom, chi2, ttest_ind
 from px4fuse.arrays import Array
 from px4fuse.comparison import estimates
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import MIN_PARTS, noises_and_clock, widen_for_drift
+from px4fuse.comparison.estimates import MIN_PARTS, estimate_noises_and_clock, widen_for_drift
 from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.imu_motion import (
@@ -359,7 +359,7 @@ def test_clock_interval_contains_true_offset_95_percent() -> None:
         inside.append(covers(found, true_s))
         normalised.append((found.offset_s - true_s) / found.sigma_s)
         # tilt and biases do not disturb the offset, and the noise is recovered
-        assert found.determinable
+        assert found.is_determinable
         assert found.offset_s == pytest.approx(true_s, abs=0.03)
         assert found.sigma_z_m == pytest.approx(SIGMA_Z, rel=0.12)
     # 1 % in the tail of the binomial distribution
@@ -370,10 +370,12 @@ def test_clock_interval_contains_true_offset_95_percent() -> None:
 
 def test_clock_insufficient_data_gives_reason() -> None:
     hovering = estimate(made_flight(3, moving=0.0)[0])
-    assert not hovering.determinable
+    assert not hovering.is_determinable
     assert "too little acceleration" in hovering.reason
-    assert (hovering.parts, hovering.change_p) == ((), None)
-    assert not estimate(made_flight(11, offset_s=0.9)[0]).determinable  # outside the search range
+    assert (hovering.parts, hovering.change_p_value) == ((), None)
+    assert not estimate(
+        made_flight(11, offset_s=0.9)[0]
+    ).is_determinable  # outside the search range
     flight, _ = made_flight(1)
     for part in ("imu", "attitude"):
         assert estimate(replace(flight, **{part: unavailable(part)})).what == part
@@ -384,7 +386,7 @@ def test_clock_insufficient_data_gives_reason() -> None:
 
 def test_clock_jump_and_drift_are_found_in_parts() -> None:
     found = estimate(made_flight(4, duration_s=120.0, jump_s=-0.25)[0])
-    assert found.change_p < MAX_CHANGE_P
+    assert found.change_p_value < MAX_CHANGE_P
     for part in found.parts:
         true_s = -0.25 if part.start_s > 55.0 else 0.0
         if part.end_s < 60.0 or part.start_s > 55.0:
@@ -393,14 +395,14 @@ def test_clock_jump_and_drift_are_found_in_parts() -> None:
     found = estimate(made_flight(6, duration_s=240.0, drift_ppm=1000.0)[0])
     assert found.drift_ppm == pytest.approx(1000.0, abs=3.0 * found.drift_sigma_ppm)
     assert found.drift_sigma_ppm < 200.0
-    assert found.change_p < MAX_CHANGE_P
+    assert found.change_p_value < MAX_CHANGE_P
 
 
 @pytest.mark.parametrize("hole_s", [0.0, 1.0])
 def test_clock_constant_offset_shows_no_change(hole_s: float) -> None:
     found = estimate(made_flight(5, duration_s=100.0, offset_s=-0.2, hole_s=hole_s)[0])
     assert len(found.parts) == 4
-    assert found.change_p > 0.01
+    assert found.change_p_value > 0.01
     assert covers(found, -0.2)
     assert abs(found.drift_ppm) < 3.0 * found.drift_sigma_ppm
     assert not hole_s or not any(part.start_s < 50.5 < part.end_s for part in found.parts)
@@ -409,13 +411,13 @@ def test_clock_constant_offset_shows_no_change(hole_s: float) -> None:
 def test_clock_excludes_outliers_and_keeps_applied_offset() -> None:
     flight, outlier = made_flight(8, offset_s=-0.2, outliers=12)
     inside = flight.positions[0].samples.index.to_numpy()[outlier]
-    tuning, found = noises_and_clock(compare(flight, SETTINGS))
+    tuning, found = estimate_noises_and_clock(compare(flight, SETTINGS))
     hits = np.isin(tuning["horizontal"].outlier_time_s, inside)
     assert np.mean(hits) > 0.9
     assert np.sum(hits) > 0.9 * len(inside)
     assert found.offset_s == pytest.approx(-0.2, abs=0.03)
     compared = compare(flight, replace(SETTINGS, clock_offset_s=-0.2))
-    _, found = noises_and_clock(compared)
+    _, found = estimate_noises_and_clock(compared)
     assert covers(found, -0.2)
     assert (found.applied_s, found.remaining_s) == (-0.2, pytest.approx(0.0, abs=0.03))
     assert clock_advice(compared, found)["Offset"].startswith("-0.")
@@ -445,7 +447,9 @@ def test_largest_step_p_value_is_bonferroni_t_test() -> None:
 # --- sources that may drift ---
 
 
-def stated(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7) -> ClockOffset:
+def stated(
+    *offsets: float, sigma_s: float = 0.02, change_p_value: float | None = 1e-7
+) -> ClockOffset:
     parts = tuple(
         PartOffset(30.0 * i, 30.0 * (i + 1), each, sigma_s) for i, each in enumerate(offsets)
     )
@@ -453,8 +457,8 @@ def stated(*offsets: float, sigma_s: float = 0.02, change_p: float | None = 1e-7
     curve = np.array([0.0])
     return ClockOffset(
         offset_s=middle, interval_s=(middle - 0.02, middle + 0.02), sigma_s=0.01, applied_s=0.0,
-        determinable=True, curve_s=curve, curve_drop=curve, parts=parts,
-        drift_ppm=100.0, drift_sigma_ppm=50.0, change_p=change_p, sigma_a_m_s2=0.2,
+        is_determinable=True, curve_s=curve, curve_drop=curve, parts=parts,
+        drift_ppm=100.0, drift_sigma_ppm=50.0, change_p_value=change_p_value, sigma_a_m_s2=0.2,
         sigma_z_m=0.01, count=3000,
     )  # fmt: skip
 
@@ -482,8 +486,8 @@ def test_widen_for_drift_scatter_widens_interval() -> None:
     assert scatter == pytest.approx(np.std([p.offset_s for p in found.parts], ddof=1) / 0.02)
     low, high = found.interval_s
     assert (high - low) / 0.04 == pytest.approx(scatter)
-    assert found.change_p == 1.0
-    assert found.determinable
+    assert found.change_p_value == 1.0
+    assert found.is_determinable
 
 
 def test_widen_for_drift_small_scatter_changes_nothing() -> None:
@@ -493,8 +497,8 @@ def test_widen_for_drift_small_scatter_changes_nothing() -> None:
 
 def test_widen_for_drift_keeps_step_and_flags_wide_interval() -> None:
     step = widen_for_drift(stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
-    assert step.change_p < 1e-3
+    assert step.change_p_value < 1e-3
     wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))
-    assert not wide.determinable
+    assert not wide.is_determinable
     assert "as for a drifting source" in wide.reason
-    assert widen_for_drift(stated(0.0, 0.3)).change_p is None  # two parts give no scatter
+    assert widen_for_drift(stated(0.0, 0.3)).change_p_value is None  # two parts give no scatter

@@ -136,9 +136,9 @@ def test_compare_source_kind_sets_drift_and_gnss_flags(sample_flight: Flight) ->
 
 class TestMadeFlight:
     @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
-    def test_ekf2_sigma_factor_equals_simulated_one(self, nis: float) -> None:
+    def test_ekf2_sigma_ratio_equals_simulated_one(self, nis: float) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(nis=nis)))
-        assert comparison.horizontal.get("ekf2").sigma_factor == pytest.approx(nis**-0.5, rel=0.05)
+        assert comparison.horizontal.get("ekf2").sigma_ratio == pytest.approx(nis**0.5, rel=0.05)
 
     def test_ekf2_errors_and_sigmas_equal_simulated_ones(self, made: Comparison) -> None:
         """P⁻ = S - R and P⁺ = P⁻R/S, with P⁻ = (0.06 m)² and R = (0.10 m)²."""

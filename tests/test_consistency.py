@@ -45,15 +45,15 @@ def test_assess_white_innovations_95_percent_consistent() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.05, 0.5, 2.0, 90.0])
-def test_assess_scaled_variance_gives_its_sigma_factor(factor: float) -> None:
+def test_assess_scaled_variance_gives_its_sigma_ratio(factor: float) -> None:
     variance = np.random.default_rng(2).uniform(0.5, 2.0, 2000)
     result = assessed(white(1, 2000) * np.sqrt(variance), factor * variance)
-    assert result.sigma_factor == pytest.approx(factor**0.5, rel=0.04)
-    assert result.sigma_factor**2 * result.nis_mean == pytest.approx(1.0)
+    assert result.sigma_ratio == pytest.approx(factor**-0.5, rel=0.04)
+    assert result.sigma_ratio**2 == pytest.approx(result.nis_mean)
     assert result.sigma_error_factor == pytest.approx(
-        max(result.sigma_factor, 1.0 / result.sigma_factor)
+        max(result.sigma_ratio, 1.0 / result.sigma_ratio)
     )
-    assert result.verdict == f"variance {'overstated' if factor > 1 else 'understated'}"
+    assert result.verdict == ("underconfident" if factor > 1 else "overconfident")
 
 
 def test_assess_statistics_equal_their_formulas() -> None:
@@ -66,7 +66,7 @@ def test_assess_statistics_equal_their_formulas() -> None:
     assert result.sqrt_s_median_m == pytest.approx(np.median([math.sqrt(v) for v in s]))
     assert result.nis_mean == pytest.approx(sum(e * e for e in normalised) / 60)
     assert result.nis_band == nis_band(60)
-    assert result.outside_two_sigma == sum(abs(e) > 2 for e in normalised) / 60
+    assert result.fraction_outside_two_sigma == sum(abs(e) > 2 for e in normalised) / 60
     power = sum(e * e for e in normalised)
     r = [np.dot(normalised[:-lag], normalised[lag:]) / power for lag in range(1, 11)]
     q = 60 * 62 * sum(each**2 / (60 - lag) for lag, each in enumerate(r, start=1))
@@ -80,8 +80,8 @@ def test_assess_statistics_equal_their_formulas() -> None:
 def test_assess_gate_changes_share_outside_gate() -> None:
     nu = np.repeat([0.5, 2.5, 4.0, 6.0], 5)
     result = assess(nu, np.ones(20), gate=3.0)
-    assert (result.outside_two_sigma, result.outside_gate) == (0.75, 0.5)
-    assert assessed(nu).outside_gate == 0.25
+    assert (result.fraction_outside_two_sigma, result.fraction_outside_gate) == (0.75, 0.5)
+    assert assessed(nu).fraction_outside_gate == 0.25
 
 
 def test_assess_ignores_nan_and_zero_variance() -> None:
@@ -109,9 +109,9 @@ def test_assess_horizontal_is_axis_mean_with_narrower_band() -> None:
     both = (assessed(north).nis_mean + assessed(east).nis_mean) / 2
     assert result.count == 200
     assert result.nis_mean == pytest.approx(both)
-    assert result.sigma_factor == pytest.approx(both**-0.5)
+    assert result.sigma_ratio == pytest.approx(both**0.5)
     assert result.nis_band == nis_band(200, 2)
-    assert result.verdict == "variance overstated"
+    assert result.verdict == "underconfident"
 
 
 def test_assess_horizontal_few_samples_is_none() -> None:

@@ -47,7 +47,7 @@ def eventful() -> Analysis:
     made = aisle_flight(
         duration_s=100.0,
         uwb=Uwb(gap_s=(60.0, 65.0), outlier_share=0.03),
-        ekf2=Estimator(rejected_share=0.1, resets=(Reset(30.0, "position", (1.0, 0.0, 0.0)),)),
+        ekf2=Estimator(rejected_fraction=0.1, resets=(Reset(30.0, "position", (1.0, 0.0, 0.0)),)),
         dropouts=(Dropout(50.0, 0.5),),
     )
     made = replace(made, airborne=((20.0, 90.0),), modes=MODES)

@@ -1,4 +1,4 @@
-"""Moments over all lags, against sums written out."""
+"""Moments over all lags, against explicit sums."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from px4fuse.trajectory.time_offset import MIN_SECOND_PEAK_RATIO
 
 
 @pytest.mark.parametrize("is_complex", [False, True])
-def test_moments_are_those_of_every_overlap(is_complex: bool) -> None:
+def test_moments_equal_sums_at_each_lag(is_complex: bool) -> None:
     rng = np.random.default_rng(3)
     a, b = rng.normal(5.0, 1.0, 7), rng.normal(-3.0, 2.0, 11)
     if is_complex:
@@ -29,11 +29,11 @@ def test_moments_are_those_of_every_overlap(is_complex: bool) -> None:
         np.testing.assert_allclose(found.power_b[k], np.sum(np.abs(y) ** 2), atol=1e-10)
 
 
-def test_autocovariance_is_the_sum_of_products() -> None:
+def test_autocovariance_equals_sum_of_products() -> None:
     v = np.array([1.0 + 2.0j, -3.0, 0.5j, 2.0])
     expected = [sum((v[i].conj() * v[i + k]).real for i in range(4 - k)) for k in range(4)]
     np.testing.assert_allclose(autocovariance(v), expected, atol=1e-12)
 
 
-def test_a_rival_is_what_chance_allows_in_one_of_twenty() -> None:
+def test_min_second_peak_ratio_is_5_percent_f_quantile() -> None:
     assert pytest.approx(0.05, abs=0.005) == f.sf(MIN_SECOND_PEAK_RATIO**2, 80, 80)

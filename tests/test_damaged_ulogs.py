@@ -7,7 +7,7 @@ import struct
 import pandas as pd
 import pytest
 from cli_tools import run_main
-from patience import patience
+from time_limit import time_limit
 from ulog_tools import make_log
 
 from px4fuse.analysis import run_comparison
@@ -82,7 +82,7 @@ def damage(content: bytes, kind: str, place: int) -> tuple[bytes, int, int]:
 def test_read_ulog_damaged_states_the_loss(content, whole, capsys, kind: str, place: int) -> None:
     data, at, size = damage(content, kind, place)
     flight, refusal = None, ""
-    with patience():
+    with time_limit():
         try:
             flight = read_ulog("damaged.ulg", data)
         except LogError as error:
@@ -118,7 +118,7 @@ def test_read_ulog_invalid_bytes_inside_keep_the_flight(content, whole, rubbish:
 def test_read_ulog_damaged_definition_ends(content) -> None:
     """Without the fix, pyulog loops at a definition longer than the rest of the file."""
     cut = content[: content.index(b"vehicle_attitude:")]
-    with patience(), pytest.raises(LogError, match="contains no data"):
+    with time_limit(), pytest.raises(LogError, match="contains no data"):
         read_ulog("cut.ulg", cut[:-3] + struct.pack("<HB", 60_000, 0) + bytes(100))
 
 
@@ -140,7 +140,7 @@ def test_read_ulog_huge_formats_are_rejected(definitions: list[bytes]) -> None:
     subscriptions = [
         message("A", struct.pack("<BH", 0, number) + b"a") for number in range(len(definitions))
     ]
-    with patience(), pytest.raises(LogError, match=r"its topics have more than 200,000 fields"):
+    with time_limit(), pytest.raises(LogError, match=r"its topics have more than 200,000 fields"):
         read_ulog("huge.ulg", HEAD + b"".join(definitions + subscriptions))
 
 

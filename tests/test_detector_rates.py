@@ -20,11 +20,11 @@ from detector_rates import (
 
 TABLE = rates()
 # Findings listed behind their cause
-CONSEQUENCES = ("ekf2_rejecting", "aid_starved", "aid_understated")
+CONSEQUENCES = ("ekf2_rejects_positions", "aid_not_fused", "aid_overconfident")
 # Mistakes too small to be detected; the reason is in the file of the detector
 NOT_DETECTABLE = {
-    ("source_scale_wrong", "--mistake scale=5%"),
-    ("source_thinned", "--mistake decimate=2.5Hz"),
+    ("source_scale_error", "--mistake scale=5%"),
+    ("source_downsampled", "--mistake decimate=2.5Hz"),
 }
 
 
@@ -51,17 +51,17 @@ def test_rates_undetectable_mistakes_are_rarely_found() -> None:
 
 def test_find_likelihood_lost_in_rounding_is_skipped() -> None:
     """Time-correlated error of 10 m, SIGMA_Z 1 mm, an interval of 0.5 ms between two positions."""
-    jump = Condition("source_clock_changes", "--mistake clock-jump=400ms")
-    assert found(FAULTY_SEED + 2, jump)[0] == "source_clock_changes"
+    jump = Condition("source_time_offset_changes", "--mistake clock-jump=400ms")
+    assert found(FAULTY_SEED + 2, jump)[0] == "source_time_offset_changes"
 
 
 def test_find_mistakes_detected_always_are_still_found() -> None:
     certain = {(row.finding, row.condition) for row in TABLE.itertuples() if row.rate == 1.0}
     assert found(5) == ()
     for condition in (
-        Condition("source_clock_offset", "--mistake clock-offset=250ms"),
-        Condition("source_frame_turned", "--mistake yaw=30"),
-        Condition("sigma_z_large", "sigma_z_m=0.3"),
+        Condition("source_time_offset", "--mistake clock-offset=250ms"),
+        Condition("source_frame_misaligned", "--mistake yaw=30"),
+        Condition("sigma_z_too_large", "sigma_z_m=0.3"),
         Condition("source_gap", "--mistake dropout=2s"),
     ):
         assert (condition.finding, condition.typed) in certain
@@ -69,10 +69,10 @@ def test_find_mistakes_detected_always_are_still_found() -> None:
 
 
 def test_rows_count_found_and_listed_first() -> None:
-    usual, yaw = clean(DEFAULT), Condition("source_frame_turned", "--mistake yaw=30")
+    usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(
-        _rows(flown, [[()], [("source_gap", "no_motion")], [("sigma_z_large", yaw.finding)]])
+        _rows(flown, [[()], [("source_gap", "no_motion")], [("sigma_z_too_large", yaw.finding)]])
     ).set_index(["finding", "condition"])
     assert made.loc[("source_gap", CLEAN), ["rate", "first"]].tolist() == [0.5, 0.5]
     assert made.loc[("no_motion", CLEAN), ["rate", "first"]].tolist() == [0.5, 0.0]

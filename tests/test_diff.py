@@ -94,7 +94,7 @@ def test_changes_of_ekf2_noise_are_worse_in_nis_of_ekf2(clean):
     found = changes(clean, flown(506, "ekf2-noise=0.3"))
     (noise,) = [one for one in found.settings if one.name == "EKF2_EVP_NOISE"]
     assert (noise.a, noise.b) == (0.1, 0.3)
-    assert "ekf2_variance_overstated" in {one.id for one in found.findings if one.only_in == "B"}
+    assert "ekf2_underconfident" in {one.id for one in found.findings if one.only_in == "B"}
     (text,) = [text for text in found.worse if text.startswith("Mean NIS of EKF2, aisle: ")]
     assert "(consistent) → " in text
     assert text.endswith(" times too large).")
@@ -134,8 +134,8 @@ def test_changes_of_nees_beyond_limit_are_worse(clean, value, said):
 def test_changes_of_nis_need_band_and_factor_to_be_worse(clean):
     before = with_kf(clean, nis_mean=1.0, verdict="consistent")
     for nis_mean, verdict, count in (
-        (1.5, "variance understated", 0), (1.7, "variance understated", 1),
-        (1.7, "consistent", 0), (0.5, "variance overstated", 1),
+        (1.5, "overconfident", 0), (1.7, "overconfident", 1),
+        (1.7, "consistent", 0), (0.5, "underconfident", 1),
     ):  # fmt: skip
         after = with_kf(clean, nis_mean=nis_mean, verdict=verdict)
         assert len(changes(before, after).worse) == count
@@ -159,19 +159,19 @@ def test_changes_with_new_error_are_worse(clean):
 # -- the list of measures --------------------------------------------------------------------------
 
 
-def test_measures_have_no_path_twice_and_intervals_that_exist(clean):
+def test_measures_have_unique_paths_and_valid_intervals(clean):
     paths = [one["path"] for one in MEASURES]
     assert len(set(paths)) == len(paths)
     found = numbers(clean.results)
     assert {path for path, one in found.items() if one.interval} >= {
-        "tuning.horizontal.sigma_z_m", "tuning.horizontal.filter_sigma_a_m_s2", "clock.offset_s",
+        "tuning.horizontal.sigma_z_m", "tuning.horizontal.sigma_a_two_state_m_s2", "clock.offset_s",
     }  # fmt: skip
 
 
-def aid(*axes: AidAxis, rejected_share: float = 0.0) -> AidResult:
+def aid(*axes: AidAxis, rejected_fraction: float = 0.0) -> AidResult:
     return AidResult(
-        label="GNSS velocity", unit="m/s", topic="", fused_share=1.0, fused_logged=True,
-        rejected_share=rejected_share, longest_without_s=(0.0, 0.5), resets=0, gate=5.0,
+        label="GNSS velocity", unit="m/s", topic="", fused_fraction=1.0, fused_logged=True,
+        rejected_fraction=rejected_fraction, longest_gap_s=(0.0, 0.5), resets=0, gate=5.0,
         noise_from="", verdict="consistent",
         axes=dict(zip(("north", "east"), axes, strict=False)),
     )  # fmt: skip
@@ -180,21 +180,21 @@ def aid(*axes: AidAxis, rejected_share: float = 0.0) -> AidResult:
 def aid_axis(nis_mean: float) -> AidAxis:
     return AidAxis(
         samples=200, innovation_mean=0.0, innovation_std=1.0, s_sqrt_median=1.0,
-        nis_mean=nis_mean, nis_band=(0.8, 1.2), sigma_factor=1.0, rejected_share=0.0,
+        nis_mean=nis_mean, nis_band=(0.8, 1.2), sigma_ratio=1.0, rejected_fraction=0.0,
         lag1_autocorrelation=0.0, ljung_box_p=0.5, bias_p=0.5,
     )  # fmt: skip
 
 
 def test_measures_of_aids_leave_out_position_source(clean):
     axes = aid_axis(1.2), aid_axis(0.9)
-    judged = {"gnss_vel": aid(*axes, rejected_share=0.1), "ev_pos": aid(*axes)}
+    judged = {"gnss_vel": aid(*axes, rejected_fraction=0.1), "ev_pos": aid(*axes)}
     found = numbers(structs.replace(clean.results, aids=judged))
     of_aids = {path: one for path, one in found.items() if path.startswith("aids.")}
     # external vision is the source itself, and listed by axis
     assert {path.split(".")[1] for path in of_aids} == {"gnss_vel"}
     north = of_aids["aids.gnss_vel.axes.north.nis_mean"]
     assert (north.label, north.value) == ("mean NIS, GNSS velocity, north", 1.2)
-    share = of_aids["aids.gnss_vel.rejected_share"]
+    share = of_aids["aids.gnss_vel.rejected_fraction"]
     assert (share.label, share.unit) == ("rejected by EKF2, GNSS velocity", "share")
     source = structs.replace(clean.results.source, kind="gnss")
     found = numbers(structs.replace(clean.results, source=source, aids=judged))

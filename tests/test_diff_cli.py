@@ -7,8 +7,8 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from cli_tools import contents, done, refused
-from conftest import LOG, page_of
+from cli_tools import contents, error_line, run_checked
+from conftest import LOG, blank_page
 from pypdf import PdfWriter
 from results_tools import LOOP
 from ulog_tools import gnss_log
@@ -17,7 +17,7 @@ import px4fuse
 from px4fuse.report import pdf
 from px4fuse.results.contract import schema
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 
 @pytest.fixture(scope="module")
@@ -26,15 +26,15 @@ def settings(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("settings")
     files = folder / "usual.pdf", folder / "small.pdf"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pdf, "render", page_of)  # a fast replacement for the report
-        done("compare", LOG, "--axis", "aisle", "-o", files[0])
-        done("compare", LOG, "--axis", "aisle", "--sigma-z", 0.03, "-o", files[1])
+        patch.setattr(pdf, "render", blank_page)  # a fast replacement for the report
+        run_checked("compare", LOG, "--axis", "aisle", "-o", files[0])
+        run_checked("compare", LOG, "--axis", "aisle", "--sigma-z", 0.03, "-o", files[1])
     return files
 
 
 @pytest.fixture(scope="module")
 def changed(settings) -> dict[str, object]:
-    return json.loads(done("diff", *settings, "--json", "-", code=1).stdout)
+    return json.loads(run_checked("diff", *settings, "--json", "-", code=1).stdout)
 
 
 def test_diff_of_two_settings_lists_setting_and_numbers(settings, changed):
@@ -54,19 +54,19 @@ def test_diff_of_two_settings_lists_setting_and_numbers(settings, changed):
 
 def test_diff_exit_code_is_1_if_verdict_is_worse(settings, changed):
     first, second = (path.with_suffix(".json") for path in settings)
-    beside = json.loads(done("diff", first, second, "--json", "-", code=1).stdout)
+    beside = json.loads(run_checked("diff", first, second, "--json", "-", code=1).stdout)
     assert beside["numbers"] == changed["numbers"]
     assert any(text.startswith("Mean NIS of KF, aisle: ") for text in beside["worse"])
-    said = done("diff", first, second, code=1).stdout
+    said = run_checked("diff", first, second, code=1).stdout
     assert "Worse    Mean NIS of KF, aisle: " in said
-    nothing = json.loads(done("diff", settings[0], first, "--json", "-").stdout)
+    nothing = json.loads(run_checked("diff", settings[0], first, "--json", "-").stdout)
     assert [nothing[part] for part in ("settings", "numbers", "findings", "worse")] == [[]] * 4
-    assert "No verdict is worse in B." in done("diff", *settings[::-1]).stdout
+    assert "No verdict is worse in B." in run_checked("diff", *settings[::-1]).stdout
 
 
 def test_diff_of_log_and_report_uses_settings_of_report(settings, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    found = json.loads(done("diff", settings[1], LOG, "--json", "-").stdout)
+    found = json.loads(run_checked("diff", settings[1], LOG, "--json", "-").stdout)
     assert found["b"]["kind"] == "log"
     assert [found[part] for part in ("settings", "numbers", "findings", "worse")] == [[]] * 4
     assert contents(tmp_path) == {}
@@ -74,8 +74,10 @@ def test_diff_of_log_and_report_uses_settings_of_report(settings, tmp_path, monk
 
 def test_diff_takes_report_of_aids_alone(tmp_path):
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
-    done("compare", log, "-o", tmp_path / "a.pdf")
-    found = json.loads(done("diff", tmp_path / "a.pdf", tmp_path / "a.json", "--json", "-").stdout)
+    run_checked("compare", log, "-o", tmp_path / "a.pdf")
+    found = json.loads(
+        run_checked("diff", tmp_path / "a.pdf", tmp_path / "a.json", "--json", "-").stdout
+    )
     assert [found[side]["kind"] for side in "ab"] == ["report", "results"]
     assert found["numbers"] == []
 
@@ -96,8 +98,8 @@ def test_diff_unsuitable_inputs_are_refused(settings, tmp_path):
     found = json.loads(usual.with_suffix(".json").read_text(encoding="utf-8"))
     old.write_text(json.dumps({**found, "schema": {**found["schema"], "version": "1.0"}}))
     other.write_text("{}")
-    done("diff", usual, code=2)  # exactly two
-    done("diff", usual, usual, usual, code=2)
+    run_checked("diff", usual, code=2)  # exactly two
+    run_checked("diff", usual, usual, usual, code=2)
     for a, b, said in (
         (usual, usual, "the same file"),
         (usual, link, "the same file"),
@@ -110,4 +112,4 @@ def test_diff_unsuitable_inputs_are_refused(settings, tmp_path):
         (tmp_path, usual, "is a folder"),
         (text, usual, "notes.txt"),
     ):
-        assert said in refused("diff", a, b, "--json", "-")
+        assert said in error_line("diff", a, b, "--json", "-")

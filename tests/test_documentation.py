@@ -10,15 +10,15 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 from batch_tools import tiny_logs
-from class_tools import in_this_process, in_turn
-from cli_tools import done
+from class_tools import in_this_process, run_in_turn
+from cli_tools import run_checked
 from conftest import REPOSITORY as ROOT
 from matplotlib import pyplot
 
 from px4fuse.cli import COMMANDS, cli
 from px4fuse.fleet import run
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
@@ -49,7 +49,7 @@ def at_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run_command(line: str) -> str:
-    return done(*shlex.split(line, comments=True)[1:]).output
+    return run_checked(*shlex.split(line, comments=True)[1:]).output
 
 
 @pytest.mark.usefixtures("no_drawing", "at_root")  # other tests draw each kind of report
@@ -58,7 +58,7 @@ def test_page_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> N
     """Commands that README contains too run only for README."""
     if page == "docs/instructors.md":
         pytest.skip("test_instructors_commands_run_in_order makes the inputs")
-    monkeypatch.setattr(run, "run_bounded", in_turn)
+    monkeypatch.setattr(run, "run_bounded", run_in_turn)
     readme_commands = commands("README.md") if page != "README.md" else []
     for number, line in enumerate(line for line in commands(page) if line not in readme_commands):
         if line == "px4fuse practice":
@@ -74,7 +74,7 @@ def test_page_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> N
             run_command(line)
 
 
-@pytest.mark.usefixtures("drawn_once", "at_root")
+@pytest.mark.usefixtures("cached_pages", "at_root")
 def test_instructors_commands_run_in_order(monkeypatch) -> None:
     in_this_process(monkeypatch)
     Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")

@@ -49,12 +49,12 @@ def test_match_updates_uses_measurement_or_fusion_time():
 
 def test_evaluated_spans_exclude_first_5_s():
     replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
-    evaluated_spans = replay.judged_s
+    evaluated_spans = replay.evaluated_s
     assert evaluated_spans == ((15.0, 30.0), (45.0, 60.0))
     # times with flow as the only aid, and the seconds after them, are excluded
     carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
                    flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
-    assert carried.judged_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
+    assert carried.evaluated_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
     assert inside_spans(times, evaluated_spans).tolist() == [
         False,
@@ -111,17 +111,17 @@ def test_agreement_verdict_applies_limits(axis, logged, replayed_share, good, ex
 def test_logged_rejections_decide_verdict(axis, good):
     """The replay with logged rejections overrides the other verdict, good or bad."""
     own_gate = Agreement(
-        north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50, rejected_share_logged=0.2,
-        rejected_share_replayed=0.2, decisions_same=0.9, published_rms_difference_m=0.0,
-        good=not good, reason="so far",
+        north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50,
+        rejected_fraction_logged=0.2, rejected_fraction_replayed=0.2,
+        decisions_same=0.9, published_rms_difference_m=0.0, good=not good, reason="so far",
     )  # fmt: skip
     logged_gate = replace(own_gate, north=agreeing(), east=axis, decisions_same=1.0,
-                       rejected_share_replayed=0.3)  # fmt: skip
+                       rejected_fraction_replayed=0.3)  # fmt: skip
     for all_known in (False, True):
         found = with_logged_rejections(own_gate, logged_gate, has_all_decisions=all_known)
         assert found.good is good
         assert found.reason.startswith("with EKF2's logged rejections: ")
-        assert (found.decisions_same, found.rejected_share_replayed) == (0.9, 0.2)
+        assert (found.decisions_same, found.rejected_fraction_replayed) == (0.9, 0.2)
         assert found.axes == (logged_gate if all_known else own_gate).axes
 
 
@@ -134,7 +134,7 @@ def test_axis_agreement_computes_statistics():
     index = pd.Index([16.0, 17.0, 99.0])
     still = pd.DataFrame(0.0, index=index, columns=Columns.STATE)
     off = still.assign(**{Columns.STATE[1]: [3.0, 4.0, 50.0], Columns.STATE[4]: 0.25})
-    replay = SimpleNamespace(published=off, judged_s=((15.0, 20.0),))
+    replay = SimpleNamespace(published=off, evaluated_s=((15.0, 20.0),))
     found = _axis_agreement("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
     assert found.innovation_correlation == pytest.approx(1.0)
     assert found.innovation_rms_difference == pytest.approx(0.5)
@@ -153,14 +153,14 @@ def test_velocity_agreement_constant_is_empty():
     columns = [f"{of}_{axis}" for of in ("innovation", "variance") for axis in ["north", "east"]]
     samples = pd.DataFrame(0.1, index=index, columns=[*columns, "innovation_down", "variance_down"])
     ekf2 = made(Ekf2, aids={"gnss_vel": made(AidLog, samples=samples)})
-    replay = SimpleNamespace(updates=updates, judged_s=((0.0, 99.0),), other_aid_updates={})
+    replay = SimpleNamespace(updates=updates, evaluated_s=((0.0, 99.0),), other_aid_updates={})
     assert _velocity_agreement(ekf2, replay, is_own_topic=True) == ({}, True)
 
 
 def test_heading_error_without_evaluated_state_is_none():
     delayed = pd.DataFrame(index=pd.Index([1.0]))
     ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
-    replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, judged_s=((5.0, 9.0),))
+    replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, evaluated_s=((5.0, 9.0),))
     assert _heading_error_deg(ekf2, replay) is None
 
 
@@ -184,7 +184,7 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
     replay = SimpleNamespace(
         updates=updates,
         published=state,
-        judged_s=((14.5, 999.0),),
+        evaluated_s=((14.5, 999.0),),
         settings={},
         other_aid_updates={},
         flow_only_spans_s=(),
@@ -196,7 +196,7 @@ def test_agreement_needs_20_varying_innovations():
     found = compared(20)
     assert found.samples == 20
     assert found.good
-    shares = found.rejected_share_logged, found.rejected_share_replayed, found.decisions_same
+    shares = found.rejected_fraction_logged, found.rejected_fraction_replayed, found.decisions_same
     assert shares == pytest.approx((0.1, 0.05, 0.95))
     assert isinstance(few := compared(19), Unavailable)
     assert "only 19 logged innovations to compare with (at least 20" in few.reason

@@ -90,7 +90,7 @@ def test_model_sample_flight_agrees_with_log(model: Model) -> None:
     agreement = model.agreement
     assert agreement.good
     assert agreement.samples > 200
-    assert agreement.rejected_share_logged == agreement.rejected_share_replayed == 0.0
+    assert agreement.rejected_fraction_logged == agreement.rejected_fraction_replayed == 0.0
     for axis in agreement.ev_pos.values():
         assert axis.innovation_correlation > 0.999
         assert axis.innovation_rms_difference < 0.005

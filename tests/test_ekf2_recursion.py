@@ -152,7 +152,7 @@ def test_variant_timing_horizon_is_buffer_length(settings, by_delay, timing):
 
 def test_replay_delay_max_unknown_raises_error():
     rules = replace(RULES, horizon_by_delay=True)
-    received = made(ReceivedPositions, has_measurement_times=False)
+    received = made(ReceivedPositions, uses_sender_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
     model = made(Model, inputs=inputs, flight=flight)
@@ -171,14 +171,14 @@ GNSS_RULES = replace(RULES, stop_s=math.inf, reset_s=7.0, resets=1_000_000, with
     (13.9, 0.0, True, False), (14.1, 0.0, True, True), (7.1, 0.0, False, True),
 ])  # fmt: skip
 def test_fusion_gnss_reset_after_7_or_14_s(gap_s, velocity_gap_s, with_velocity, resets):
-    """As shouldResetGpsFusion, gps_control.cpp; from main of 2026 on aids are independent."""
+    """shouldResetGpsFusion of gps_control.cpp; from main of 2026 on aids are independent."""
     rules = replace(GNSS_RULES, with_velocity=with_velocity)
     _, taken, reset, *_ = deciding(gap_s=gap_s, velocity_gap_s=velocity_gap_s, rules=rules, left=9)
     assert (taken, reset) == (False, resets)
 
 
 def test_sequential_update_uses_initial_innovations():
-    """As in EKF2 the second gain uses the new covariance and the old S, so it is not optimal."""
+    """The second gain uses the new covariance and the old S, as in EKF2; it is not optimal."""
     rng = np.random.default_rng(6)
     root = rng.normal(size=(2, 15, 15))
     P, nu, R = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 6)), np.full((2, 6), 0.5)
@@ -206,7 +206,7 @@ def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> Segmen
 
 
 def test_recursion_gnss_tilt_variance_is_as_logged():
-    """As by a measurement, down to the logged variance, and only with GNSS."""
+    """Tilt is corrected as by a measurement to the logged variance, and only with GNSS."""
     fixes = [0.0] * 20
     free, limited = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
     np.testing.assert_allclose(limited.variance[1:, 0, :2], 2.5e-5, rtol=0.02)

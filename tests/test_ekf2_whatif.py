@@ -26,7 +26,7 @@ from px4fuse.ekf2.steps import (
     OUTPUT,
     STEPS,
     VELOCITY_STEP,
-    Why,
+    DifferenceExplanation,
     _longest_rejection,
     explain_by_steps,
     step_variants,
@@ -60,8 +60,8 @@ def test_what_if_has_logged_and_replayed_columns(model):
     assert made.replayed.samples > 2 * made.logged.samples  # the log has 2 of 5 samples per second
     assert isinstance(made.logged.longest_without_fusion_s, Unavailable)
     assert made.replayed.longest_without_fusion_s == pytest.approx(0.22, abs=0.04)
-    assert made.replayed.rejected_share == made.logged.rejected_share == 0.0
-    assert narrow.rejected_share > 0.2
+    assert made.replayed.rejected_fraction == made.logged.rejected_fraction == 0.0
+    assert narrow.rejected_fraction > 0.2
     assert narrow.resets > 0
     assert narrow.longest_without_fusion_s > 1.0
     assert not made.notes
@@ -76,13 +76,13 @@ def test_what_if_without_agreement_is_unavailable(model):
 
 def test_steps_add_up_to_total_difference(model):
     for axis in explain_by_steps(model).values():
-        assert axis.coast is None
+        assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == STEPS
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
             left = getattr(axis, quantity.replace("_mean", "_left_mean"))
             total = sum(getattr(step, quantity) for step in axis.steps) + left
             assert total == pytest.approx(getattr(axis, quantity), abs=1e-12)
-        assert axis.position_left_share < 0.03
+        assert axis.unexplained_fraction < 0.03
         by_name = {step.name: step for step in axis.steps}
         # properties that do not differ between the filters change nothing
         assert by_name["measurement noise"].position_moved_m < 1e-6
@@ -187,13 +187,13 @@ def test_longest_between_fusions_includes_both_ends():
 
 def test_summary_combines_north_and_east() -> None:
     north, east = (AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, m) for nis, m in ((1.0, 0.3), (3.0, 0.4)))
-    one = Summary(changed={}, north=north, east=east, samples=9, rejected_share=0.0,
+    one = Summary(changed={}, north=north, east=east, samples=9, rejected_fraction=0.0,
                   longest_without_fusion_s=0.1, resets=0)  # fmt: skip
     assert (one.nis_mean, one.position_rmse_to_truth_m) == pytest.approx((2.0, 0.5))
     blind = structs.replace(east, position_rmse_to_truth_m=NONE)
     assert replace(one, east=blind).position_rmse_to_truth_m is NONE
-    why = made(Why, position_left_mean_square_m2=1.0, position_mean_square_m2=4.0)
-    assert why.position_left_share == 0.25
+    why = made(DifferenceExplanation, unexplained_mean_square_m2=1.0, position_mean_square_m2=4.0)
+    assert why.unexplained_fraction == 0.25
 
 
 def test_what_if_late_samples_add_note():
@@ -227,13 +227,13 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
 def test_what_if_rejecting_flight_predicts_remedy(tmp_path, mistake, seed, changes):
     """Only with the logged rejections does the replay agree with these logs."""
     faulty, correct = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
-    assert faulty.agreement.rejected_share_logged > 0.35
+    assert faulty.agreement.rejected_fraction_logged > 0.35
     assert faulty.agreement.good
     (predicted,) = what_if(faulty, [changes]).whatif
     expected = what_if(correct, [{}]).logged
-    assert predicted.steady
+    assert predicted.is_predictable
     assert predicted.nis_mean == pytest.approx(expected.nis_mean, rel=0.1)
-    assert predicted.rejected_share == pytest.approx(expected.rejected_share, abs=0.03)
+    assert predicted.rejected_fraction == pytest.approx(expected.rejected_fraction, abs=0.03)
     assert predicted.position_rmse_to_truth_m == pytest.approx(
         expected.position_rmse_to_truth_m, rel=0.15
     )
@@ -243,18 +243,18 @@ def test_what_if_most_rejected_is_unpredictable(model):
     unpredictable, some, none = what_if(
         model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif
-    assert unpredictable.rejected_share > 0.35
-    assert not unpredictable.steady
-    assert some.steady
-    assert none.rejected_share <= 0.02
-    assert none.steady
+    assert unpredictable.rejected_fraction > 0.35
+    assert not unpredictable.is_predictable
+    assert some.is_predictable
+    assert none.rejected_fraction <= 0.02
+    assert none.is_predictable
 
 
 def test_what_if_noise_sensitive_result_is_unpredictable(model, monkeypatch):
     """Each of the three numbers just inside and just outside its limit."""
     north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Summary(
-        changed={"EKF2_EVP_GATE": 3.0}, north=north, east=north, samples=500, rejected_share=0.2,
+        changed={"EKF2_EVP_GATE": 3.0}, north=north, east=north, samples=500, rejected_fraction=0.2,
         longest_without_fusion_s=1.0, resets=0,
     )  # fmt: skip
     runs: list[tuple[float, int]] = []
@@ -268,7 +268,7 @@ def test_what_if_noise_sensitive_result_is_unpredictable(model, monkeypatch):
         monkeypatch.setattr(whatif, "replay_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_summarise_replay", lambda *_: changed)
         (found,) = whatif._mark_unpredictable(model, [base], ((0.0, 1.0),), {})
-        return found.steady
+        return found.is_predictable
 
     assert is_predictable(base)
     assert runs == [(0.002, 0), (0.002, 1), (0.002, 2), (0.002, 3)]
@@ -278,14 +278,16 @@ def test_what_if_noise_sensitive_result_is_unpredictable(model, monkeypatch):
         # the RMSE is that of both axes together
         (("north", "east"), "position_rmse_to_truth_m", 0.1149, True),
         (("north", "east"), "position_rmse_to_truth_m", 0.1151, False),
-        ((), "rejected_share", 0.2299, True), ((), "rejected_share", 0.2301, False),
+        ((), "rejected_fraction", 0.2299, True), ((), "rejected_fraction", 0.2301, False),
     ):  # fmt: skip
         other = structs.replace(north, **{field: value}) if axes else None
         changed = dict.fromkeys(axes, other) if axes else {field: value}
         assert is_predictable(structs.replace(base, **changed)) is steady
-    few, many = (structs.replace(base, rejected_share=share) for share in (0.02, 0.351))
+    few, many = (structs.replace(base, rejected_fraction=share) for share in (0.02, 0.351))
     runs.clear()
-    assert [one.steady for one in whatif._mark_unpredictable(model, [few, many], (), {})] == [
+    assert [
+        one.is_predictable for one in whatif._mark_unpredictable(model, [few, many], (), {})
+    ] == [
         True,
         False,
     ]

@@ -1,4 +1,4 @@
-"""One row per student: which attempt counts, what being late costs, what the instructor says."""
+"""One entry per student: counting attempt, deduction if late, overrides by the instructor."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
-from class_tools import graded
+from class_tools import graded_report
 from exchange import replace
 
-from px4fuse.answer_form import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, StudentMistake
 from px4fuse.assignment.roster import Person
 from px4fuse.errors import SettingsError
 from px4fuse.grading.class_page import _point_boxes
@@ -35,8 +35,8 @@ LATEST = Course(RUBRIC)
 PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", login="grace"))
 
 
-def laid_out(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
-    """Entries by id, of reports by the names of their files."""
+def make_entries(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
+    """Make the entries of reports, given by file name."""
     reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
     zipped, times = Path("x.zip"), packed or {}
     found = [Submission(zipped, name, name, times.get(name), origin_of(name)) for name in files]
@@ -48,148 +48,158 @@ def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
 
 
 THREE = {
-    blackboard("ada", "19-10-00-00"): graded("", 4.0),
-    blackboard("ada", "20-11-00-00"): graded("", 9.0),
-    blackboard("ada", "22-10-00-00"): graded("", 7.0),
+    blackboard("ada", "19-10-00-00"): graded_report("", 4.0),
+    blackboard("ada", "20-11-00-00"): graded_report("", 9.0),
+    blackboard("ada", "22-10-00-00"): graded_report("", 7.0),
 }
 
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
-def test_one_attempt_counts_and_the_others_are_beneath(attempt, points) -> None:
-    (ada, grace), _ = laid_out(THREE, Course(RUBRIC, attempt=attempt))
+def test_class_entries_attempt_rule_selects_counting_report(attempt, points) -> None:
+    (ada, grace), _ = make_entries(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counting.points == ada.total == points
     assert len(ada.others) == 2
     assert ada.counting not in ada.others
     assert (grace.counting, grace.total, grace.of) == (None, None, 10.0)
 
 
-def test_late_is_what_comes_after_the_due_time_in_its_zone() -> None:
+def test_class_entries_late_report_has_deduction() -> None:
     term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
-    (ada, _), _ = laid_out(THREE, term)
+    (ada, _), _ = make_entries(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
     assert ada.handed_in == "2026-11-22 10:00"
-    # of the best, the loss for being late is part
-    files = {blackboard("ada", "20-11-00-00"): graded("", 6.0),
-             blackboard("ada", "22-10-00-00"): graded("", 7.0)}  # fmt: skip
-    (ada, _), _ = laid_out(files, replace(term, attempt="best"))
+    # the best attempt is the one after deduction
+    files = {blackboard("ada", "20-11-00-00"): graded_report("", 6.0),
+             blackboard("ada", "22-10-00-00"): graded_report("", 7.0)}  # fmt: skip
+    (ada, _), _ = make_entries(files, replace(term, attempt="best"))
     assert (ada.late_s, ada.deduction, ada.total) == (0.0, 0.0, 6.0)
 
 
 @pytest.mark.parametrize(
     ("due", "rule", "late_s", "off"),
     [
-        (DUE, "100%/day", 46 * 3600.0, 10.0),  # nobody has less than nothing
-        # in the night to 25 October Berlin has the hour from 2 to 3 twice
+        (DUE, "100%/day", 46 * 3600.0, 10.0),  # points are never negative
+        # end of summer time: on 25 October the hour from 2 to 3 occurs twice
         (due_time("2026-10-24 23:00:00 Europe/Berlin"), "1%/hour", 683 * 3600.0 + 3600.0, 10.0),
     ],
 )
-def test_what_is_taken_off(due, rule, late_s, off) -> None:
-    (ada, _), _ = laid_out(THREE, Course(RUBRIC, due=due, late=late_rule(rule)))
+def test_class_entries_deduction_ends_at_zero_points(due, rule, late_s, off) -> None:
+    (ada, _), _ = make_entries(THREE, Course(RUBRIC, due=due, late=late_rule(rule)))
     assert (ada.late_s, ada.deduction) == (late_s, off)
     assert ada.total == 0.0
 
 
-def test_a_zip_files_time_orders_attempts_and_costs_nothing() -> None:
+def test_class_entries_zip_time_orders_without_deduction() -> None:
     first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
-    files = {second: graded("", 7.0), first: graded("", 9.0)}
+    files = {second: graded_report("", 7.0), first: graded_report("", 9.0)}
     term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
-    (_, grace), _ = laid_out(files, term, packed=packed)
+    (_, grace), _ = make_entries(files, term, packed=packed)
     assert (grace.total, grace.late_s, grace.handed_in) == (7.0, None, "")
     assert "no points" in grace.flags[0]
-    # nor does a mark without a time
-    (_, grace), _ = laid_out({"hoppergrace_LATE_7_8_r.pdf": graded("", 7.0)}, term)
+    # a late mark without a time has no deduction either
+    (_, grace), _ = make_entries({"hoppergrace_LATE_7_8_r.pdf": graded_report("", 7.0)}, term)
     assert (grace.late_s, grace.total) == (None, 7.0)
     assert "Canvas marks the file as late" in grace.flags[0]
 
 
-def test_what_is_no_report_counts_only_where_nothing_else_is_there() -> None:
-    essay = replace(graded("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False))
-    files = {blackboard("ada", "19-10-00-00"): graded("", 4.0),
+def test_class_entries_other_pdf_counts_only_without_report() -> None:
+    essay = replace(
+        graded_report("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False)
+    )
+    files = {blackboard("ada", "19-10-00-00"): graded_report("", 4.0),
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
-    (ada, _), _ = laid_out(files)
+    (ada, _), _ = make_entries(files)
     assert ada.total == 4.0
     assert "is not a report" in ada.flags[0]
-    (ada, _), _ = laid_out({blackboard("ada", "20-10-00-00"): essay})
+    (ada, _), _ = make_entries({blackboard("ada", "20-10-00-00"): essay})
     assert ada.total == 0.0
 
 
 def of_form(points: float, kind: str, **more):
-    form = Answers(log_sha256="a" * 64, mistakes=(ClaimedMistake(kind),))
-    return replace(graded("", points, student_id="1"), form=form, **more)
+    form = Answers(log_sha256="a" * 64, mistakes=(StudentMistake(kind),))
+    return replace(graded_report("", points, student_id="1"), form=form, **more)
 
 
-def test_a_guess_in_each_of_several_files_does_not_pay() -> None:
-    """None of those that came together counts until the instructor says which is meant."""
+def test_class_entries_differing_forms_are_pending() -> None:
+    """None of the files submitted together counts until the instructor selects one."""
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
-    (ada, _), _ = laid_out(files)
+    (ada, _), _ = make_entries(files)
     assert ada.total is None
     assert ada.counting.pending == "Ask which of 2 reports counts: their forms differ."
     assert len(ada.others) == 1
-    assert laid_out(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
-    # the same form twice is no guess
-    (ada, _), _ = laid_out({name: of_form(4.0, "yaw") for name in files})
+    assert make_entries(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
+    # equal forms are not pending
+    (ada, _), _ = make_entries({name: of_form(4.0, "yaw") for name in files})
     assert ada.total == 4.0
 
 
-def test_what_is_pending_displaces_no_report_that_counts() -> None:
-    """As another's report under this student's id, handed in later."""
+def test_class_entries_pending_report_keeps_counting_report() -> None:
+    """For example a later report of another student with this student's id."""
     files = {"a.pdf": of_form(9.0, "yaw"), "z.pdf": of_form(2.0, "nlos", pending="Ask whose.")}
     packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
     for times in (None, packed):
-        (ada, _), _ = laid_out(files, packed=times)
+        (ada, _), _ = make_entries(files, packed=times)
         assert ada.total == 9.0
         assert [one.submission for one in ada.others] == ["z.pdf"]
         assert ada.flags == ("z.pdf is pending, so another file counts.",)
-    waiting = replace(files["a.pdf"].items[0], awaits_points=True)  # for the points of the text
+    waiting = replace(
+        files["a.pdf"].items[0], awaits_points=True
+    )  # waits for the points of the notes
     files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
-    (ada, _), _ = laid_out(files)
+    (ada, _), _ = make_entries(files)
     assert ada.counting.submission == "a.pdf"
 
 
-def test_a_name_that_imitates_a_platforms_is_flagged() -> None:
+def test_class_entries_imitated_platform_name_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
-    (ada, _), _ = laid_out({name: graded("", 4.0)})
+    (ada, _), _ = make_entries({name: graded_report("", 4.0)})
     assert ada.handed_in == "2026-11-20 10:00"
     assert ada.flags == ("The file name imitates the names of a platform (found: Blackboard).",)
 
 
-def test_of_two_files_of_one_submission_the_better_one_counts() -> None:
-    files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded("", 8.0),
-             blackboard("ada", "19-10-00-00", "b.pdf"): graded("", 2.0)}  # fmt: skip
+def test_class_entries_better_file_of_submission_counts() -> None:
+    files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
+             blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
-        (ada, _), _ = laid_out(files, Course(RUBRIC, attempt=attempt))
+        (ada, _), _ = make_entries(files, Course(RUBRIC, attempt=attempt))
         assert ada.total == 8.0, attempt
 
 
-def test_who_handed_in_is_the_platforms_word_and_a_false_id_is_said() -> None:
-    files = {blackboard("grace", "19-10-00-00"): graded("", 8.0, student="Ada", student_id="1")}
-    (ada, grace), _ = laid_out(files)
+def test_class_entries_platform_id_overrides_report_id() -> None:
+    files = {
+        blackboard("grace", "19-10-00-00"): graded_report("", 8.0, student="Ada", student_id="1")
+    }
+    (ada, grace), _ = make_entries(files)
     assert ada.counting is None
     assert grace.total == 8.0
     assert "is that of 1 (Ada Lovelace)" in grace.flags[0]
 
 
-def test_who_is_not_in_the_roster_has_a_row_that_says_so() -> None:
+def test_class_entries_unlisted_student_has_flagged_row() -> None:
     files = {
-        "report.pdf": graded("", 8.0, student="Mallory", student_id="9"),
-        "other.pdf": graded("", 3.0, student="lovelace ADA"),
+        "report.pdf": graded_report("", 8.0, student="Mallory", student_id="9"),
+        "other.pdf": graded_report("", 3.0, student="lovelace ADA"),
     }
-    (ada, grace, stranger), _ = laid_out(files)
+    (ada, grace, stranger), _ = make_entries(files)
     assert (ada.total, grace.total) == (3.0, None)
     assert (stranger.student, stranger.student_id, stranger.total) == ("Mallory", "9", 8.0)
     assert stranger.flags[0] == "Not in the class list."
 
 
-def test_without_a_roster_everyone_who_is_named_has_one_row() -> None:
+def test_class_entries_without_roster_one_row_per_student() -> None:
     files = {
-        "Doe Jane_5_assignsubmission_file_/a.pdf": graded("", 1.0, student="Jane", student_id="42"),
-        "Roe Max_6_assignsubmission_file_/a.pdf": graded("", 2.0, student="Jane", student_id="42"),
-        "b.pdf": graded("", 3.0, student="Kim", student_id="44"),
-        "c.pdf": graded("", 4.0, student="Kim", student_id="44"),
-        "d.pdf": graded("", 5.0),
+        "Doe Jane_5_assignsubmission_file_/a.pdf": graded_report(
+            "", 1.0, student="Jane", student_id="42"
+        ),
+        "Roe Max_6_assignsubmission_file_/a.pdf": graded_report(
+            "", 2.0, student="Jane", student_id="42"
+        ),
+        "b.pdf": graded_report("", 3.0, student="Kim", student_id="44"),
+        "c.pdf": graded_report("", 4.0, student="Kim", student_id="44"),
+        "d.pdf": graded_report("", 5.0),
     }
-    entries, _ = laid_out(files, people=())
+    entries, _ = make_entries(files, people=())
     assert [(one.student, one.student_id, one.total) for one in entries] == [
         ("Jane", "42", 1.0), ("Roe Max", "6", 2.0), ("Kim", "44", 4.0), ("", "", 5.0)
     ]  # fmt: skip
@@ -198,22 +208,25 @@ def test_without_a_roster_everyone_who_is_named_has_one_row() -> None:
 # ------------------------------------------------------------------ overrides
 
 
-def said(tmp_path: Path, *rows: str, head: str = "id,item,points,comment"):
+def write_overrides(tmp_path: Path, *rows: str, head: str = "id,item,points,comment"):
     path = tmp_path / "overrides.csv"
     path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
     return read_overrides(path)
 
 
-TWO_OF_ONE = {"1.pdf": graded("", 4.0, 6.0, student_id="1")}
-TWO = {"1.pdf": graded("", 4.0, 6.0, student_id="1"), "2.pdf": graded("", 1.0, student_id="2")}
+TWO_OF_ONE = {"1.pdf": graded_report("", 4.0, 6.0, student_id="1")}
+TWO = {
+    "1.pdf": graded_report("", 4.0, 6.0, student_id="1"),
+    "2.pdf": graded_report("", 1.0, student_id="2"),
+}
 
 
-def test_the_instructors_word_is_the_last(tmp_path) -> None:
-    rows = said(
+def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
+    rows = write_overrides(
         tmp_path, "1,a,9.5,A good idea.", '01,,,"Come and', 'see me."', "1,total,8,Agreed.",
         "2,total,3,", "3,total,1,", "1,C,1,", '2,B,2,"x"',
     )  # fmt: skip
-    (ada, grace), notes = laid_out(TWO, overrides=rows)
+    (ada, grace), notes = make_entries(TWO, overrides=rows)
     assert ada.overrides == {
         "A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed."),
         "": Override(None, "Come and\nsee me."),
@@ -237,18 +250,20 @@ def test_the_instructors_word_is_the_last(tmp_path) -> None:
         (("1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,"), (15.0, 3.0), (
             "1 has two rows for 'A'", "01 has two rows for 'total'",
         )),
-    ], ids=["more points than there are", "a second row on the same"],
+    ], ids=["points above the maximum", "duplicate row"],
 )  # fmt: skip
-def test_a_row_that_is_not_taken_is_told(rows, points, told, tmp_path) -> None:
-    (ada, _), notes = laid_out(TWO, overrides=said(tmp_path, *rows))
+def test_overrides_excess_or_duplicate_row_is_noted(rows, points, told, tmp_path) -> None:
+    (ada, _), notes = make_entries(TWO, overrides=write_overrides(tmp_path, *rows))
     assert (ada.counting.points, ada.total) == points
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
-def test_what_was_said_comes_back_from_the_class_page(tmp_path) -> None:
-    """Also of who handed in nothing: the download replaces the file."""
-    rows = said(tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown.")
-    entries, notes = laid_out({"1.pdf": TWO["1.pdf"]}, overrides=rows)
+def test_overrides_class_page_download_is_complete(tmp_path) -> None:
+    """Includes students without a submission, because the download replaces the file."""
+    rows = write_overrides(
+        tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."
+    )
+    entries, notes = make_entries({"1.pdf": TWO["1.pdf"]}, overrides=rows)
     again: dict[str, dict[str, Override]] = {}
     for _, _, owner, boxes, kept in map(_point_boxes, entries):
         for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
@@ -257,24 +272,26 @@ def test_what_was_said_comes_back_from_the_class_page(tmp_path) -> None:
     assert (again, notes) == (rows, ())
 
 
-def test_pending_points_do_not_count_until_the_instructor_says_so(tmp_path) -> None:
-    files = {"1.pdf": graded("", 4.0, student_id="1", pending="Run 0.1.1.")}
-    (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,A,9,"))
+def test_overrides_total_makes_pending_points_count(tmp_path) -> None:
+    files = {"1.pdf": graded_report("", 4.0, student_id="1", pending="Run 0.1.1.")}
+    (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
-    (ada, _), _ = laid_out(files, overrides=said(tmp_path, "1,total,9,"))
+    (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,total,9,"))
     assert ada.total == 9.0
 
 
-def test_who_handed_in_nothing_can_be_given_points(tmp_path) -> None:
-    (_, grace), notes = laid_out({}, overrides=said(tmp_path, "2,Total,5,Shown in class."))
+def test_overrides_without_submission_give_points(tmp_path) -> None:
+    (_, grace), notes = make_entries(
+        {}, overrides=write_overrides(tmp_path, "2,Total,5,Shown in class.")
+    )
     assert (grace.total, notes) == (5.0, ())
     assert "Shown in class." in feedback_text(grace)
-    (_, grace), notes = laid_out(TWO_OF_ONE, overrides=said(tmp_path, "2,total,50,"))
+    (_, grace), notes = make_entries(TWO_OF_ONE, overrides=write_overrides(tmp_path, "2,total,50,"))
     assert (grace.total, len(notes)) == (None, 1)
 
 
-def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
-    rows = said(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
+def test_read_overrides_semicolons_and_decimal_commas_are_read(tmp_path) -> None:
+    rows = write_overrides(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
     assert rows == {"1": {"A": Override(7.5)}}
 
 
@@ -289,11 +306,11 @@ def test_a_semicolon_table_with_decimal_commas_is_read(tmp_path) -> None:
         ("1,A,5,\n1,A,6,", "is given twice"),
     ],
 )
-def test_what_the_instructor_cannot_have_meant_stops_the_run(tmp_path, row, says) -> None:
+def test_read_overrides_invalid_row_raises_error(tmp_path, row, says) -> None:
     with pytest.raises(SettingsError, match=says):
-        said(tmp_path, row)
+        write_overrides(tmp_path, row)
     with pytest.raises(SettingsError, match="no column comment"):
-        said(tmp_path, row, head="id,item,points")
+        write_overrides(tmp_path, row, head="id,item,points")
 
 
 # ------------------------------------------------------------------ due times and late rules
@@ -309,15 +326,15 @@ BERLIN = "2026-11-20T23:59:59+01:00"
         ("2026-11-20 23:59 Europe/Berlin", BERLIN),
         ("2026-11-20 22:59:59 +0000", BERLIN),
         ("2026-11-20T22:59Z", BERLIN),
-        ("2026-07-20 23:59 Europe/Berlin", "2026-07-20T23:59:59+02:00"),  # summer
+        ("2026-07-20 23:59 Europe/Berlin", "2026-07-20T23:59:59+02:00"),  # summer time
         ("2026-11-20 Europe/Berlin", BERLIN),
     ],
 )
-def test_a_due_time_has_its_zone(text, is_) -> None:
+def test_due_time_with_zone_is_parsed(text, is_) -> None:
     assert due_time(text) == datetime.fromisoformat(is_)
 
 
-def test_without_a_zone_it_is_this_computers(monkeypatch) -> None:
+def test_due_time_without_zone_uses_local_zone(monkeypatch) -> None:
     monkeypatch.setenv("TZ", "America/New_York")
     time.tzset()
     try:
@@ -332,22 +349,22 @@ def test_without_a_zone_it_is_this_computers(monkeypatch) -> None:
     [(due_time, "--due", ("", "tomorrow", "20.11.2026", "2026-11-20 23:59 Mars/Base", "Z")),
      (late_rule, "--late", ("", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day"))],
 )  # fmt: skip
-def test_what_is_no_time_and_no_rule_is_one_line(read, said, texts) -> None:
+def test_due_time_and_late_rule_invalid_text_is_one_line(read, said, texts) -> None:
     for text in texts:
         with pytest.raises(SettingsError, match=said) as caught:
             read(text)
         assert "\n" not in str(caught.value)
 
 
-def test_every_started_day_costs_and_never_more_than_all() -> None:
+def test_late_rule_counts_started_days_up_to_limit() -> None:
     for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
         assert late_rule("10%/day").deduction(late_s, 120.0) == off
-    # a rule may name its limit and hours
+    # a rule may state a limit, and hours
     assert late_rule("1 % / hour up to 5%").deduction(3600.0 * 3.5, 100.0) == 4.0
     assert late_rule("1%/hour up to 5%").deduction(1e6, 100.0) == 5.0
 
 
-def test_platforms_times_without_a_zone_are_in_that_of_the_due_time() -> None:
+def test_in_zone_of_naive_time_uses_zone_of_due_time() -> None:
     due = due_time("2026-11-20 23:59:00 +05:30")
     bare = datetime(2026, 11, 21, 0, 59)
     assert (in_zone_of(bare, due) - due).total_seconds() == 3600.0
@@ -355,7 +372,7 @@ def test_platforms_times_without_a_zone_are_in_that_of_the_due_time() -> None:
     assert in_zone_of(told, due) == due
 
 
-def test_moodles_words_for_a_time() -> None:
+def test_moodle_time_parses_english_dates_only() -> None:
     assert moodle_time("Friday, 20 November 2026, 23:58") == datetime(2026, 11, 20, 23, 58)
     assert moodle_time("Friday, 20 November 2026, 11:58 PM") == datetime(2026, 11, 20, 23, 58)
     assert moodle_time("Freitag, 20. November 2026, 23:58") is None

@@ -81,7 +81,7 @@ def test_small_memory_limit_is_named(tmp_path) -> None:
     assert contents(tmp_path) == {}
 
 
-def test_exhausted_memory_is_one_line(monkeypatch, capsys, tmp_path) -> None:
+def test_exhausted_memory_prints_one_line(monkeypatch, capsys, tmp_path) -> None:
     from px4fuse import analysis
 
     def exhausted(*_: object) -> None:

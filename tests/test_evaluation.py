@@ -1,4 +1,4 @@
-"""ATE, RPE, alignment and clocks: against evo, closed forms and what was put in."""
+"""ATE, RPE, alignment and clocks against evo, closed forms and simulated values."""
 
 import copy
 from functools import cache
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
-from trajectory_tools import NAMES, PUBLISHED, SHIFT, TURN, flight, moved, published
+from trajectory_tools import NAMES, PUBLISHED, SHIFT, TURN, flight, read_public, transformed
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight import Unavailable
@@ -58,12 +58,12 @@ def evo_aligned(estimate: str, reference: str, kind: AlignmentKind) -> tuple[Any
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
-def test_ate_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+def test_ate_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     pytest.importorskip("evo")
     from evo.core.metrics import APE, PoseRelation
 
     true, made = evo_aligned(*pair, kind)
-    got = evaluate(*map(published, pair), alignment=kind, association="nearest", rpe_deltas=())
+    got = evaluate(*map(read_public, pair), alignment=kind, association="nearest", rpe_deltas=())
     np.testing.assert_array_equal(got.reference_m, true.positions_xyz)
     np.testing.assert_allclose(got.estimate_m, made.positions_xyz, rtol=0, atol=1e-9)
     for relation, errors, ours in (
@@ -84,7 +84,7 @@ DELTAS = (Delta(1, "frames"), Delta(10, "frames"), Delta(0.5, "m"), Delta(5.0, "
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
-def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+def test_rpe_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     pytest.importorskip("evo")
     from evo.core.filters import FilterException
     from evo.core.metrics import RPE, PoseRelation
@@ -93,10 +93,10 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
     true, made = evo_aligned(*pair, kind)
     for all_pairs in (True, False):
         how = {"rpe_deltas": DELTAS, "all_pairs": all_pairs}
-        got = evaluate(*map(published, pair), alignment=kind, association="nearest", **how)
+        got = evaluate(*map(read_public, pair), alignment=kind, association="nearest", **how)
         for ours in got.rpe:
             if kind != "se3" and ours.unit == "frames":
-                continue  # scale and turn do not change these pairs; evo takes its time
+                continue  # scale and rotation do not change these pairs, and evo is slow
             unit = Unit.frames if ours.unit == "frames" else Unit.meters
             metric = RPE(
                 PoseRelation.translation_part, ours.delta, unit, all_pairs=all_pairs,
@@ -117,7 +117,7 @@ def test_rpe_is_that_of_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
 
 
 @pytest.mark.parametrize(("kind", "unknowns"), [("yaw", 4), ("se3", 6), ("sim3", 7)])
-def test_closed_forms_are_the_minimum(kind: AlignmentKind, unknowns: int) -> None:
+def test_fit_alignment_minimises_squared_distances(kind: AlignmentKind, unknowns: int) -> None:
     random = np.random.default_rng(5)
     x = random.normal(0.0, 2.0, (40, 3))
     y = 1.2 * TURN.apply(x) + SHIFT + random.normal(0.0, 0.5, (40, 3))
@@ -143,7 +143,7 @@ def line(noise_m: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 1e-9, 1e-3, 0.1])
-def test_a_turn_about_the_line_of_motion_is_refused(noise_m: float) -> None:
+def test_fit_alignment_straight_line_allows_yaw_only(noise_m: float) -> None:
     x, y = line(noise_m)
     for kind in ("se3", "sim3"):
         with pytest.raises(TrajectoryError, match=r"along a line.*`alignment` yaw"):
@@ -151,7 +151,7 @@ def test_a_turn_about_the_line_of_motion_is_refused(noise_m: float) -> None:
     assert fit_alignment(x, y, "yaw").rotation.magnitude() < 0.02
 
 
-def test_alignments_without_motion_are_refused() -> None:
+def test_fit_alignment_without_motion_is_refused() -> None:
     random = np.random.default_rng(3)
     still = random.normal(0.0, 0.01, (200, 3))
     up = np.linspace(0.0, 3.0, 200)[:, None] * [0.0, 0.0, 1.0]
@@ -170,7 +170,7 @@ def test_alignments_without_motion_are_refused() -> None:
 # -- association -----------------------------------------------------------------------------------
 
 
-def test_interpolation_is_exact_where_the_motion_is_uniform_and_stops_at_a_gap() -> None:
+def test_associate_interpolates_uniform_motion_not_gaps() -> None:
     time = np.arange(0.0, 10.0, 0.1)
     turns = Rotation.from_rotvec(time[:, None] * [0.1, 0.5, 0.2])
     reference = Trajectory("r", "truth", time, time[:, None] * [1.0, 2.0, 3.0], turns)
@@ -190,14 +190,14 @@ def test_interpolation_is_exact_where_the_motion_is_uniform_and_stops_at_a_gap()
     assert got.max_gap_s == pytest.approx(0.15)
     assert (got.poses, got.in_gaps, got.outside) == (300, 100, 0)
     assert associate(whole, torn, max_gap_s=6.0)[2].poses == 400
-    *_, lost = associate(torn, whole)  # the other way round: its time is not covered
+    *_, lost = associate(torn, whole)  # exchanged: the reference is not covered
     assert lost.coverage_estimate == 1.0
     assert lost.coverage_reference == pytest.approx(0.75, abs=0.01)
 
 
 @pytest.mark.parametrize("denser", [False, True], ids=["estimate sparser", "estimate denser"])
-def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: bool) -> None:
-    """Every pair by trying all, with poses before, after and in a gap of the reference."""
+def test_associate_nearest_equals_exhaustive_search(denser: bool) -> None:
+    """Poses before, after and in a gap of the reference."""
     reference = flight(20.0, 10.0)
     reference = reference[(reference.time_s < 8.0) | (reference.time_s > 12.0)]
     rate_hz = 33.0 if denser else 4.0
@@ -227,7 +227,7 @@ def test_nearest_pairs_and_what_is_left_out_are_those_of_the_definition(denser: 
 
 
 @pytest.mark.parametrize("method", ["interpolate", "nearest"])
-def test_no_overlap_names_both_spans_and_the_remedy(method: Method) -> None:
+def test_evaluate_no_overlap_names_spans_and_remedy(method: Method) -> None:
     reference = flight()
     estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
     said = r"no poses match.*500.000 to 559.950 s.*0.000 to 59.950 s.*`time_offset_s` auto"
@@ -240,23 +240,23 @@ def test_no_overlap_names_both_spans_and_the_remedy(method: Method) -> None:
 
 
 @pytest.mark.parametrize("kind", ["yaw", "se3", "sim3"])
-def test_a_transformed_copy_has_no_error(kind: AlignmentKind) -> None:
+def test_evaluate_transformed_copy_has_zero_error(kind: AlignmentKind) -> None:
     reference = flight()
     turn = Rotation.from_euler("z", 2.0) if kind == "yaw" else TURN
-    copied = moved(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
+    copied = transformed(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
     got = evaluate(copied, reference, alignment=kind)
     assert got.ate.translation_m.max < 1e-9
     assert got.ate.rotation_deg.max < 1e-9
-    assert [one.delta_words for one in got.rpe] == ["1 m", "5 m", "10 m", "1 s", "10 s"]
+    assert [one.delta_text for one in got.rpe] == ["1 m", "5 m", "10 m", "1 s", "10 s"]
     for one in got.rpe:
         assert one.translation_m.max < 1e-9
         assert one.rotation_deg.max < 1e-9
     assert not got.warnings
 
 
-def test_a_tilt_shows_after_yaw_and_hides_after_se3() -> None:
+def test_ate_tilt_remains_after_yaw_alignment_only() -> None:
     reference = flight()
-    tilted = moved(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
+    tilted = transformed(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
     got = evaluate(tilted, reference)
     assert got.alignment == "yaw"
     assert got.ate.rotation_deg.rmse == pytest.approx(5.0, abs=0.1)
@@ -264,9 +264,11 @@ def test_a_tilt_shows_after_yaw_and_hides_after_se3() -> None:
     assert evaluate(tilted, reference, alignment="se3").ate.translation_m.rmse < 1e-9
 
 
-def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
+def test_rpe_scale_error_is_proportional_to_distance() -> None:
     reference = flight(200.0, 50.0)
-    got = evaluate(moved(reference, TURN, SHIFT, 1.02, kind="vio"), reference, alignment="se3")
+    got = evaluate(
+        transformed(reference, TURN, SHIFT, 1.02, kind="vio"), reference, alignment="se3"
+    )
     for one in got.rpe:
         chord = np.linalg.norm(got.reference_m[one.end] - got.reference_m[one.start], axis=1)
         np.testing.assert_allclose(one.translation_error_m, 0.02 * chord, atol=1e-9)
@@ -277,7 +279,7 @@ def test_a_drift_in_scale_is_the_rpe_over_distance() -> None:
     steps=st.lists(st.sampled_from([0.0, 0.1, 0.25, 1.0, 3.0]), min_size=3, max_size=40),
     value=st.sampled_from([0.1, 0.3, 0.5, 1.0, 2.0]),
 )
-def test_pairs_are_those_of_the_definition(steps: list[float], value: float) -> None:
+def test_pairs_equal_their_definition(steps: list[float], value: float) -> None:
     along = np.concatenate(([0.0], np.cumsum(steps)))
     position, time = along[:, None] * [1.0, 0.0, 0.0], np.arange(len(along), dtype=float)
     expected = []
@@ -293,16 +295,16 @@ def test_pairs_are_those_of_the_definition(steps: list[float], value: float) -> 
     np.testing.assert_array_equal(end, start + 2)
 
 
-def test_pairs_are_measured_along_the_reference() -> None:
-    """Also where the estimate's path is twice as long."""
+def test_relative_error_pairs_follow_reference_distance() -> None:
+    """Also if the path of the estimate is twice as long."""
     reference = flight(30.0)
-    double = moved(reference, TURN, SHIFT, 2.0, kind="vio")
+    double = transformed(reference, TURN, SHIFT, 2.0, kind="vio")
     same, other = (relative_error(one, reference, Delta(1.0, "m")) for one in (reference, double))
     assert other.pairs_from == "reference"
     np.testing.assert_array_equal((other.start, other.end), (same.start, same.end))
 
 
-def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
+def test_evaluate_missing_orientation_or_pairs_give_reason() -> None:
     reference = flight()
     got = evaluate(replace(reference, rotation=None, kind="vio"), reference)
     assert isinstance(got.ate.rotation_deg, Unavailable)
@@ -318,7 +320,7 @@ def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
             evaluate(reference, reference, rpe_deltas=[delta])
 
 
-# -- which alignment, and doubts -------------------------------------------------------------------
+# -- choice of alignment, warnings -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("estimate", "reference", "name", "scale", "expected", "why"), [
@@ -333,17 +335,17 @@ def test_what_cannot_be_had_is_absent_with_the_reason() -> None:
     (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "unknown system"),
     (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
 ])  # fmt: skip
-def test_the_alignment_follows_from_what_the_two_are(
+def test_choose_alignment_depends_on_kinds_and_frames(
     estimate, reference, name, scale, expected, why
 ):
     y = replace(flight(), kind=reference[0], frame=reference[1])
-    x = moved(y, TURN, SHIFT, scale, kind=estimate[0], frame=estimate[1], name=name)
+    x = transformed(y, TURN, SHIFT, scale, kind=estimate[0], frame=estimate[1], name=name)
     kind, reason = choose_alignment(x, y)
     assert kind == expected
     assert why in reason
 
 
-def test_an_aisle_is_aligned_by_yaw_where_z_is_vertical() -> None:
+def test_evaluate_aisle_with_vertical_z_is_aligned_by_yaw() -> None:
     x, y = line(0.02)
     aisle = Trajectory("aisle", "truth", np.arange(len(x)) * 0.1, y, None, "NED")
     got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)
@@ -353,10 +355,10 @@ def test_an_aisle_is_aligned_by_yaw_where_z_is_vertical() -> None:
         evaluate(replace(aisle, kind="slam", frame="camera", position_m=x), aisle)
 
 
-def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> None:
+def test_evaluate_camera_removes_mounting_rotation() -> None:
     reference = flight()
     mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
-    camera = moved(reference, TURN, SHIFT, kind="slam", frame="camera")
+    camera = transformed(reference, TURN, SHIFT, kind="slam", frame="camera")
     noise = Rotation.from_rotvec(np.random.default_rng(1).normal(0.0, 0.01, (len(camera), 3)))
     camera = replace(camera, rotation=camera.rotation * mounted * noise)
     got = evaluate(camera, reference)
@@ -371,13 +373,13 @@ def test_a_camera_is_compared_around_its_constant_rotation_in_the_vehicle() -> N
         assert evaluate(same, reference, alignment="se3").body_rotation is None
 
 
-def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
+def test_evaluate_doubtful_arguments_give_warnings() -> None:
     truth = flight()
-    vio = moved(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
+    vio = transformed(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
     slam = replace(vio, kind="slam", name="slam")
-    large = moved(truth, TURN, SHIFT, 1.5, kind="vio")
+    large = transformed(truth, TURN, SHIFT, 1.5, kind="vio")
     assert not evaluate(vio, truth).warnings
-    # clocks that fit better apart; less may be the filter's own lag
+    # an offset below 0.1 s may be the lag of the filter
     lag, late = (replace(slam, time_s=slam.time_s - offset_s) for offset_s in (0.08, 0.12))
     flown = replace(truth, name="log:truth")
     assert not evaluate(lag, flown).warnings
@@ -397,22 +399,22 @@ def test_interchanged_and_doubtful_arguments_are_warned_about() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.0371, -2.5, 17.0, 1_795_253_724.3])
 @pytest.mark.parametrize("rate_hz", [7.0, 50.0])
-def test_an_offset_between_clocks_is_recovered(offset_s: float, rate_hz: float) -> None:
+def test_time_offset_is_recovered_at_each_rate(offset_s: float, rate_hz: float) -> None:
     reference = flight()
     random = np.random.default_rng(4)
-    estimate = moved(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")
+    estimate = transformed(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")
     noise = random.normal(0.0, 0.02, (len(estimate), 3))
     position_m = estimate.position_m + noise
     estimate = replace(estimate, time_s=estimate.time_s - offset_s, position_m=position_m)
     got = estimate_time_offset(estimate, reference)
-    assert got.determinable
+    assert got.is_determinable
     assert got.offset_s == pytest.approx(offset_s, abs=2e-3)
     assert got.interval_s[0] - 1e-3 < offset_s < got.interval_s[1] + 1e-3
     back = estimate_time_offset(reference, estimate)
     assert back.offset_s == pytest.approx(-offset_s, abs=2e-3)
 
 
-def test_the_interval_of_an_offset_holds_it() -> None:
+def test_time_offset_interval_contains_true_offset() -> None:
     reference, held = flight(40.0, 100.0), 0
     random = np.random.default_rng(8)
     for _ in range(25):
@@ -424,7 +426,7 @@ def test_the_interval_of_an_offset_holds_it() -> None:
     assert held >= 22
 
 
-def test_clocks_that_are_set_are_the_start() -> None:
+def test_time_offset_unix_clocks_start_at_their_difference() -> None:
     reference = replace(flight(), unix_offset_s=1.5e9)
     estimate = replace(flight(), unix_offset_s=0.0, time_s=flight().time_s + 1.5e9 - 0.2)
     assert clock_difference(estimate, reference) == -1.5e9
@@ -441,7 +443,7 @@ def test_clocks_that_are_set_are_the_start() -> None:
 
 @pytest.mark.parametrize("kind", ["still", "line", "circle"])
 @pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.05])
-def test_an_offset_without_excitation_is_not_determinable(kind: str, noise_m: float) -> None:
+def test_time_offset_without_excitation_is_undetermined(kind: str, noise_m: float) -> None:
     time = np.arange(0.0, 60.0, 0.05)
     position = {
         "still": np.zeros((len(time), 3)),
@@ -451,31 +453,31 @@ def test_an_offset_without_excitation_is_not_determinable(kind: str, noise_m: fl
     noise = np.random.default_rng(6).normal(0.0, noise_m, (2, *position.shape))
     estimate, reference = (Trajectory(kind, "kf", time, position + e, None, "NED") for e in noise)
     got = estimate_time_offset(estimate, reference)
-    assert (got.determinable, got.offset_s, got.interval_s) == (False, None, None)
+    assert (got.is_determinable, got.offset_s, got.interval_s) == (False, None, None)
     assert "cannot be estimated" in got.reason
     used = evaluate(estimate, reference, alignment="none", time_offset_s="auto")
     assert used.time_offset.offset_s == 0.0
     assert "Unchanged timestamps used instead." in used.warnings[0]
 
 
-def test_a_motion_that_repeats_is_ambiguous() -> None:
+def test_time_offset_periodic_motion_is_undetermined() -> None:
     one = flight(20.0)
     lap = np.tile(np.arange(len(one)), 4)
     time = np.arange(len(lap)) * 0.05
-    # laps that close: the same 20 s four times, out and back
+    # four equal laps of 20 s
     closed = one.position_m * np.sin(np.pi * one.time_s / 20.0)[:, None] ** 2
     laps = Trajectory("laps", "vio", time, closed[lap], None)
     got = estimate_time_offset(replace(laps[:800], unix_offset_s=None), laps)
-    assert not got.determinable
+    assert not got.is_determinable
     assert "is periodic" in got.reason
 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
-def test_published_trajectories_that_were_shifted_are_shifted_back(pair: tuple[str, str]) -> None:
-    estimate, reference = map(published, pair)
+def test_time_offset_shifted_public_data_is_recovered(pair: tuple[str, str]) -> None:
+    estimate, reference = map(read_public, pair)
     base = estimate_time_offset(estimate, reference).offset_s
-    assert abs(base) < 0.06  # their own clocks are not perfect
+    assert abs(base) < 0.06  # the published clocks have small offsets
     for shift_s in (0.137, 30.0, 12.5 - estimate.time_s[0]):
         shifted = replace(estimate, time_s=estimate.time_s + shift_s, unix_offset_s=None)
         got = estimate_time_offset(shifted, reference)
@@ -486,7 +488,7 @@ def test_published_trajectories_that_were_shifted_are_shifted_back(pair: tuple[s
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.9, 0.97])
-def test_intervals_hold_the_true_rmse(phi: float) -> None:
+def test_rmse_interval_contains_true_rmse(phi: float) -> None:
     random = np.random.default_rng(9)
     flights, n = 200, 2000
     white = random.normal(size=(n + 500, flights, 3)) * np.sqrt(1.0 - phi**2)
@@ -499,7 +501,7 @@ def test_intervals_hold_the_true_rmse(phi: float) -> None:
     assert 0.85 < held <= 1.0
 
 
-def test_the_autocorrelation_time_is_that_of_the_process() -> None:
+def test_autocorrelation_time_equals_ar1_value() -> None:
     white = np.random.default_rng(10).normal(size=200_000)
     for phi in (0.0, 0.5, 0.9):
         values = lfilter([1.0], [1.0, -phi], white)
@@ -507,7 +509,7 @@ def test_the_autocorrelation_time_is_that_of_the_process() -> None:
     assert autocorrelation_time(np.ones(50)) == 1.0
 
 
-def test_too_few_blocks_give_no_interval() -> None:
+def test_rmse_interval_too_few_blocks_is_unavailable() -> None:
     drift = np.linspace(0.0, 1.0, 500)
     got = rmse_interval(drift, "ATE")
     assert isinstance(got, Unavailable)

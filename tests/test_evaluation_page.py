@@ -11,7 +11,7 @@ from exchange import replace
 from matplotlib.axes import Axes
 from page_tools import every, words
 from scipy.spatial.transform import Rotation
-from trajectory_tools import flight, moved
+from trajectory_tools import flight, transformed
 
 from px4fuse.loop.tracks import read_source
 from px4fuse.report.evaluation import (
@@ -83,7 +83,7 @@ def test_unaligned_sentence_has_rmse_of_evo_and_transform() -> None:
     from evo.core.trajectory import PoseTrajectory3D
 
     true = flight()
-    estimate = moved(true, Rotation.from_euler("z", 0.5), np.array([3.0, -1.0, 0.2]))
+    estimate = transformed(true, Rotation.from_euler("z", 0.5), np.array([3.0, -1.0, 0.2]))
     score = evaluate(replace(estimate, kind="vio"), true)
 
     def of_evo(one: Trajectory) -> Any:
@@ -99,7 +99,7 @@ def test_unaligned_sentence_has_rmse_of_evo_and_transform() -> None:
     assert "scale" not in sentence
     centre = true.position_m.mean(axis=0) - estimate.position_m.mean(axis=0)
     assert f"translation {np.linalg.norm(centre):.3f} m" in sentence
-    half = moved(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
+    half = transformed(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
     assert ", scale 2 (" in unaligned_sentence(evaluate(half, true, alignment="sim3"))
 
 

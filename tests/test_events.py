@@ -75,7 +75,7 @@ def test_collect_events_lists_all_within_the_segment() -> None:
 
 
 def test_collect_events_rejections_are_per_axis() -> None:
-    comparison = compare(aisle_flight(ekf2=Estimator(rejected_share=0.2)))
+    comparison = compare(aisle_flight(ekf2=Estimator(rejected_fraction=0.2)))
     found = collect_events(comparison)
     for result in comparison.axes.values():
         frame = result.ekf2_innovations

@@ -15,7 +15,7 @@ import click
 import numpy as np
 import pytest
 from browser import Browser, Elements
-from cli_tools import done, refused
+from cli_tools import error_line, run_checked
 from exchange import replace
 from explore_tools import ask, box, mouse, open_view, settle, show
 from flights import Imu, aisle_flight, unexplained
@@ -30,7 +30,7 @@ from px4fuse.explore.page import html_text
 from px4fuse.flight import Flight
 from px4fuse.request import ComparisonRequest
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 MARKUP = '<img src=x onerror="window.alive=1"></script><script>window.alive=2</script>\u202e'
 TABLE = """Object.fromEntries([...document.querySelectorAll('#table tbody tr')].map((row) =>
@@ -119,7 +119,7 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
         low, high = found.nis_band
         return [
             f"{found.nis_mean:.2f}", f"{low:.2f}–{high:.2f}",
-            f"{100 * found.outside_two_sigma:.1f} %", f"{found.lag1_autocorrelation:.2f}",
+            f"{100 * found.fraction_outside_two_sigma:.1f} %", f"{found.lag1_autocorrelation:.2f}",
             str(found.count),
         ]  # fmt: skip
 
@@ -129,8 +129,8 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     expected = {name: list(pair) for name, pair in zip(names, both, strict=True)}
     difference: Any = result.difference
     errors = [result.filters[name].truth for name in FILTERS]
-    expected["Position: KF - EKF2, RMS"] = [f"{difference.position_rmse_m:.3f} m", "–"]
-    expected["Velocity: KF - EKF2, RMS"] = [f"{difference.velocity_rmse_m_s:.3f} m/s", "–"]
+    expected["Position: KF - EKF2, RMS"] = [f"{difference.position_rms_m:.3f} m", "–"]
+    expected["Velocity: KF - EKF2, RMS"] = [f"{difference.velocity_rms_m_s:.3f} m/s", "–"]
     for name, unit in (("Position", "m"), ("Velocity", "m/s")):
         field = "position_rmse_m" if unit == "m" else "velocity_rmse_m_s"
         expected[f"{name} RMSE"] = [f"{getattr(one, field):.3f} {unit}" for one in errors]
@@ -180,7 +180,7 @@ def test_buttons_set_estimated_ekf2_and_lesson_values(
     settle(page)
     a, z = (float(page.ask(f"document.getElementById('{name}-value').value"))
             for name in ("sigma-a", "sigma-z"))  # fmt: skip
-    assert a == pytest.approx(tuned.filter_sigma_a.value, rel=5e-3)
+    assert a == pytest.approx(tuned.sigma_a_two_state.value, rel=5e-3)
     assert z == pytest.approx(tuned.sigma_z.value, rel=5e-3)
     page.click("#ekf2-r")
     settle(page)
@@ -341,12 +341,12 @@ def test_explore_without_log_uses_sample_flight(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
-    assert "no log was given" in refused("explore").lower()
+    assert "no log was given" in error_line("explore").lower()
     assert list(tmp_path.iterdir()) == []
     here = tmp_path / "sample_logs"
     here.mkdir()
     (here / sample_log.name).write_bytes(sample_log.read_bytes())
-    output = done("explore", "--start", "20", "--end", "40").stderr
+    output = run_checked("explore", "--start", "20", "--end", "40").stderr
     assert "No log was given: the sample log aisle_uwb.ulg is used." in output
     assert (tmp_path / "reports" / "aisle_uwb_start-20_end-40.html").is_file()
 
@@ -365,6 +365,6 @@ def test_open_option_opens_written_file(
         (["evaluate", f"{log}:ekf2", f"{log}:truth", "-o", "a.pdf", "--open"], "a.pdf"),
         (["compare", log, *part, "--json", "only.json", "-o", "other.pdf"], None),
     ):
-        done(*words)
+        run_checked(*words)
         assert opened == ([] if name is None else [str(tmp_path / name)])
         opened.clear()

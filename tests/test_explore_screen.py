@@ -21,7 +21,7 @@ from px4fuse.findings import find
 from px4fuse.request import ComparisonRequest
 from px4fuse.text import format_number
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 IN_VIEW = """(...names) => names.filter((name) => {
   const node = document.querySelector(name), box = node.getBoundingClientRect();
@@ -153,7 +153,7 @@ def test_changed_settings_mark_dependent_findings(
     browser: Browser, sample_log: Path, tmp_path: Path
 ) -> None:
     analysis = run(ComparisonRequest(log=str(sample_log), sigma_z_m=1.0))
-    assert any(one.id == "sigma_z_large" for one in find(analysis))
+    assert any(one.id == "sigma_z_too_large" for one in find(analysis))
     file = tmp_path / "large.html"
     file.write_bytes(html_text(analysis).encode())
     show(browser, file)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from cli_tools import done, run_main
+from cli_tools import run_checked, run_main
 from conftest import REPOSITORY
 from exchange import replace
 from flights import Estimator, aisle_flight
@@ -35,7 +35,7 @@ UNITS = {"_m": "m", "_m2": "m^2", "_s": "s", "_m_s": "m/s", "_m_s2": "m/s^2",
 
 
 def extract(*arguments: object) -> str:
-    return done("extract", *arguments).output
+    return run_checked("extract", *arguments).output
 
 
 @pytest.fixture(scope="module")

@@ -107,8 +107,8 @@ def test_fraction_on_first_value_extends_backwards() -> None:
 
 
 def test_by_root_groups_consequences_behind_cause() -> None:
-    first, other = make_finding("kf_variance_overstated"), make_finding("no_motion", "info")
-    follows = make_finding("kf_variance_overstated", caused_by="kf_variance_overstated")
+    first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
+    follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
     assert group_by_root([first, follows, other]) == [[first, follows], [other]]
 
 
@@ -344,7 +344,7 @@ def test_source_as_sent_logger_limit_is_reported(
         found = list(
             missing.detect_source_not_logged(analysis(source=of, missing=lacks, log=profile))
         )
-        assert [one.id for one in found] == ["source_not_logged", "source_decimated"][
+        assert [one.id for one in found] == ["source_not_logged", "source_rate_limited_by_logger"][
             : 1 + decimated
         ]
         assert "lacks vehicle_visual_odometry (it was disabled)" in found[0].message
@@ -392,20 +392,20 @@ def test_placement_conflict_is_error_and_doubt_is_warning() -> None:
     assert frame.message == "uwb: As good as ned: give --position-frame ned."
 
 
-@pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "info")])
+@pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
 def test_frame_not_north_severity_depends_on_fused_yaw(until_s: float, expected: str) -> None:
     frd = source(frame="FRD")
     one = analysis(source=frd, ekf2=with_fusion((0.0, 1.0), (until_s, 0.0), column="yaw"))
     finding = only(source_frame.detect, one)
     assert finding.severity == expected
-    assert ("EKF2 fused its yaw" in finding.message) is (expected == "info")
+    assert ("EKF2 fused its yaw" in finding.message) is (expected == "note")
     assert ("Send the position in NED" in finding.remedy) is (expected == "warning")
     assert severity(source_frame.detect, analysis(source=frd)) == "warning"
     assert severity(source_frame.detect, analysis()) is None
     for has_ulog in (True, False):
         one = analysis(source=frd, ekf2={"fusing": NONE}, log=log(has_ulog=has_ulog))
         finding = only(source_frame.detect, one)
-        assert finding.severity == "info"
+        assert finding.severity == "note"
         assert ("The ULog shows" in finding.remedy) is has_ulog
 
 
@@ -416,19 +416,19 @@ def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> He
 
 def test_misalignment_reports_interval_and_opposite_rotation() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
-    assert finding.id == "source_frame_turned"
+    assert finding.id == "source_frame_misaligned"
     assert "rotated by +20° ± 4° (clockwise" in finding.message
     assert "Rotate the positions by -20°" in finding.remedy
     aligned = source(name="estimator_visual_odometry_aligned")
     for has_ulog in (True, False):
         one = analysis(heading=heading_error(20.0), source=aligned, log=log(has_ulog=has_ulog))
-        assert only(source_frame.detect, one).id == "ekf2_heading_wrong"
+        assert only(source_frame.detect, one).id == "ekf2_heading_error"
         assert ("EKF2_EV_CTRL bit 3" in only(source_frame.detect, one).remedy) is has_ulog
 
 
 def test_misalignment_heading_drift_reports_both_ends() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(2.0, 30.0, p=0.0)))
-    assert finding.id == "ekf2_heading_wrong"
+    assert finding.id == "ekf2_heading_error"
     assert "+2° from 0 to 10 s, +30° from 10 to 20 s" in finding.message
     assert "by the positions and the IMU" in finding.message
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
@@ -456,7 +456,7 @@ def with_extent(extent_m: float) -> Any:
 FUSED, FRAME = ekf2_not_fusing.detect, source_frame.detect
 EDGES = [
     (missing.detect_missing_innovations, with_innovations(75), None),
-    (missing.detect_missing_innovations, with_innovations(74), "info"),
+    (missing.detect_missing_innovations, with_innovations(74), "note"),
     # motion capture is an independent reference if EKF2 fuses external vision
     (FUSED, motion_capture_flight("vehicle_mocap_odometry", 0.0), "warning"),
     (FUSED, motion_capture_flight("vehicle_mocap_odometry", 1.0), None),
@@ -637,7 +637,7 @@ SOURCE_EDGES = [
     *((source_intervals.detect_lost_samples, at_multiples([1] * singles + [3], 0.25, **parts),
        expected)
       for singles, parts, expected in (
-          (96, {"clock_map": clock_map()}, "info"), (97, {"clock_map": clock_map()}, None),
+          (96, {"clock_map": clock_map()}, "note"), (97, {"clock_map": clock_map()}, None),
           (47, {"clock_map": None}, None), (47, {"clock_map": clock_map("arrival time")}, None),
           (47, {"clock_map": clock_map(distinct=2)}, None))),
     *((source_positions.detect_low_pass, low_pass(gain, lag_s), expected)
@@ -677,7 +677,7 @@ SOURCE_EDGES = [
     *((which, of(clock=clock), expected)
       for which, of in ((SCALE, partial(scaled, 0.5)),
                         (source_positions.detect_low_pass, partial(low_pass, 99.0, 1.0)))
-      for clock, expected in ((NONE, None), (late(0.0, determinable=False), "error"))),
+      for clock, expected in ((NONE, None), (late(0.0, is_determinable=False), "error"))),
     (SCALE, scaled(0.5, smoothing=SourceLowPass(0.5, 1.0, 99.0, 0.1)), None),
     *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, REBUILT)),
     *((source_positions.detect_outliers,
@@ -702,13 +702,13 @@ SOURCE_EDGES = [
           (0.03, 0.001, None), (0.031, 0.001, "warning"), (0.1, 0.001, "warning"),
           (0.101, 0.001, "error"), (0.0625, 0.0208, "warning"), (0.0625, 0.0209, None))),
     *((CLOCK, analysis(**{"clock": late(0.2), **parts}), None) for parts in (
-        {"clock": late(0.2, determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
+        {"clock": late(0.2, is_determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
         {"smoothing": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
     *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
           (30.0, 0.001, "warning"), (29.0, 0.001, None), (40.0, 0.01, "warning"),
           (39.0, 0.01, None), (None, 0.001, None))),
-    (CLOCK, delayed(90.0, late(0.0, determinable=False)), None),
+    (CLOCK, delayed(90.0, late(0.0, is_determinable=False)), None),
     (CLOCK, delayed(90.0, late(0.0), **REBUILT), None),
 ]  # fmt: skip
 
@@ -727,8 +727,9 @@ def test_bias_reports_interval_tilt_and_ekf2_estimate() -> None:
 
 @pytest.mark.parametrize(
     ("clock", "expected"),
-    [(clock_map(distinct=2, jitter_s=0.010), ["source_stamps_constant"]),
-     (clock_map("receive time", 2, 0.011), ["source_stamps_constant", "source_receipt_jitter"]),
+    [(clock_map(distinct=2, jitter_s=0.010), ["source_timestamps_constant"]),
+     (clock_map("receive time", 2, 0.011),
+      ["source_timestamps_constant", "source_timestamp_jitter"]),
      (clock_map(jitter_s=0.5), []), (clock_map("arrival time"), ["companion_not_synchronised"])],
 )  # fmt: skip
 def test_source_stamps_recording_reports_clock_faults(clock: Any, expected: list[str]) -> None:
@@ -831,11 +832,11 @@ def test_clock_offset_action_includes_offset_in_use() -> None:
 
 @pytest.mark.parametrize(("p", "there"), [(0.005, False), (0.0049, True), (None, False)])
 def test_clock_offset_change_below_p_limit_is_reported(p: float | None, there: bool) -> None:
-    found = only(source_clock.detect, analysis(clock=late(0.1, change_p=p)))
-    assert found.id == ("source_clock_changes" if there else "source_clock_offset")
+    found = only(source_clock.detect, analysis(clock=late(0.1, change_p_value=p)))
+    assert found.id == ("source_time_offset_changes" if there else "source_time_offset")
     if there:
         assert "from -0.10 s at the beginning to +0.30 s at the end" in found.message
-        assert found.evidence["change_p"] == p
+        assert found.evidence["change_p_value"] == p
 
 
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])

@@ -24,7 +24,7 @@ BREAKOUT = "</script ></noscript\n><script>window.alive=2</script><!-- \u2028 & 
 HOSTILE = (MARKUP, BREAKOUT, "\0\x1b\u202e", "$title", "javascript:alert(1)", "//a.b/c", "; ;")
 TEXTS = (
     "name", "log_sha256", "px4fuse", "settings", "reason", "remedy", "vehicle", "firmware",
-    "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "story", "results", "report",
+    "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "summary", "results", "report",
 )  # fmt: skip
 
 
@@ -47,26 +47,25 @@ def test_page_compared_log_lists_its_missing_results() -> None:
 
 
 def test_logs_of_uses_horizontal_axes() -> None:
-    def kf_factor(rows: pd.DataFrame) -> float:
-        return float(logs_of(rows)[0]["factors"]["kf"])
+    def kf_sigma_ratio(rows: pd.DataFrame) -> float:
+        return float(logs_of(rows)[0]["sigma_ratios"]["kf"])
 
     first = made_up(3).iloc[:3].copy()
     north, east, _ = first["kf_nis_mean"]
-    assert kf_factor(first) == pytest.approx(
-        (2.0 / (north + east)) ** 0.5
-    )  # equal numbers of updates
+    # equal numbers of updates
+    assert kf_sigma_ratio(first) == pytest.approx(((north + east) / 2.0) ** 0.5)
     # weighted by the number of updates
     first["updates"] *= pd.Series((3, 1, 1))
-    assert kf_factor(first) == pytest.approx((4.0 / (3.0 * north + east)) ** 0.5)
-    aisle = first.iloc[:1].assign(axis="aisle", kf_nis_mean=4.0, position_rmse_m=9.0)
+    assert kf_sigma_ratio(first) == pytest.approx(((3.0 * north + east) / 4.0) ** 0.5)
+    aisle = first.iloc[:1].assign(axis="aisle", kf_nis_mean=4.0, position_rms_m=9.0)
     both = pd.concat([aisle, first])
-    assert kf_factor(both) == pytest.approx(0.5)
-    assert logs_of(both)[0]["position_rmse_m"] == 9.0
+    assert kf_sigma_ratio(both) == pytest.approx(2.0)
+    assert logs_of(both)[0]["position_rms_m"] == 9.0
 
 
 def test_logs_of_column_without_numbers_is_absent() -> None:
     table = made_up(4)
-    for name in ("clock_offset_s", "sigma_z_m", "ekf2_nis_mean", "position_rmse_m"):
+    for name in ("clock_offset_s", "sigma_z_m", "ekf2_nis_mean", "position_rms_m"):
         table[name] = np.nan
     table["updates"] = table["updates"].astype("Int64")
     text = html_text(table, "Bench", "px4fuse 1")
@@ -141,7 +140,9 @@ def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     # the column shows "3 × too small" and is sorted by the factor
     page.click(head("KF"))
     page.click("tbody tr:first-child .name")
-    factors = {log["name"]: log["factors"]["kf"] for log in logs_of(made_up(240)) if log["factors"]}
+    factors = {
+        log["name"]: log["sigma_ratios"]["kf"] for log in logs_of(made_up(240)) if log["factors"]
+    }
     assert page.names()[:3] == sorted(factors, key=lambda name: factors[name])[:3]
     assert STORY.splitlines()[0] in page.ask("document.querySelector('.more').innerText")
     assert "flight%20" in page.ask("document.querySelector('.more a').href")
@@ -157,8 +158,8 @@ def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
 
 def test_filters_of_fleet_page_combine(page: Browser) -> None:
     table = made_up(240).drop_duplicates("log")
-    page.choose("#filter-3", "finding:ekf2_rejecting")
-    rejecting = table["findings"].fillna("").str.contains("ekf2_rejecting")
+    page.choose("#filter-3", "finding:ekf2_rejects_positions")
+    rejecting = table["findings"].fillna("").str.contains("ekf2_rejects_positions")
     assert page.ask(COUNT) == f"Showing {rejecting.sum()} of 240"
     page.choose("#filter-1", f"vehicle:{VEHICLES[1]}")
     both = rejecting & (table["vehicle"] == VEHICLES[1])

@@ -35,7 +35,7 @@ class Flown(NamedTuple):
 
 FLIGHTS = {
     "v1.16.1_aisle_overconfident": Flown(
-        (("ekf2_variance_understated", "error",
+        (("ekf2_overconfident", "error",
           {"nis_mean": about(22.0, 0.2), "sigma_z_asked_m": about(0.10, 0.2)},
           ("EKF2_EVP_NOISE to 0.098 m", "22 → 1.0", "0.31 → 0.11 m")),),
         ("gate", "54.9"),
@@ -43,13 +43,13 @@ FLIGHTS = {
     # outliers are rejected by the gate; EKF2 did not fuse for 15 s
     "v1.16.1_aisle_nlos": Flown(
         (("source_gap", "warning", {"longest_s": about(8.0, 0.04)}, ()),
-         ("kf_variance_understated", None, {}, ("outliers",)),
-         ("ekf2_variance_understated", None, {}, ("outliers",))),
+         ("kf_overconfident", None, {}, ("outliers",)),
+         ("ekf2_overconfident", None, {}, ("outliers",))),
         elsewhere=("gate, missed samples and resets", "4.0 m", "64 s"),
     ),
     "v1.16.1_aisle_clock_late": Flown(
         (("ekf2_ev_delay_wrong", None, {}, ("0.34 → 0.11 m",)),
-         ("source_clock_offset", None, {}, ("EKF2_EV_DELAY to 264 ms",))),
+         ("source_time_offset", None, {}, ("EKF2_EV_DELAY to 264 ms",))),
         offset_s=-0.25,
     ),
     "v1.13.3_aisle_evdelay175": Flown(
@@ -59,12 +59,12 @@ FLIGHTS = {
     ),
     "v1.16.1_aisle_hwlog": Flown(
         (("source_not_logged", "warning", {}, ("SDLOG_PROFILE to 129",)),
-         ("source_decimated", "warning", {"logger_limit_hz": 2.0}, ())),
+         ("source_rate_limited_by_logger", "warning", {"logger_limit_hz": 2.0}, ())),
         offset_s=0.0,
     ),
     "v1.16.1_aisle_2hz_stock": Flown(
         (("ekf2_not_fusing", "error",
-          {"fusing_share": 0.0, "source_interval_s": about(0.5, 0.05)}, ("10 Hz",)),),
+          {"fused_fraction": 0.0, "source_interval_s": about(0.5, 0.05)}, ("10 Hz",)),),
     ),
     "v1.14.4_aisle_nominal": Flown(),
     "v1.16.1_aisle_nominal": Flown(),
@@ -85,25 +85,25 @@ def test_findings_known_fault_has_id_numbers_and_remedy(shared_logs, name):
         assert severity in (None, first.severity)
         assert {key: first.evidence[key] for key in evidence} == evidence
     if name.endswith("nominal"):
-        assert {item.severity for item in found} <= {"info"}
+        assert {item.severity for item in found} <= {"note"}
     if flown.first or flown.elsewhere or name.endswith("clock_late"):
-        why = analysis.why["aisle"]
-        assert all(words in why.sentences[0] for words in flown.first)
-        assert all(words in " ".join(why.sentences) for words in flown.elsewhere)
-        assert why.position_left_share < 0.03
+        explanation = analysis.difference_steps["aisle"]
+        assert all(words in explanation.sentences[0] for words in flown.first)
+        assert all(words in " ".join(explanation.sentences) for words in flown.elsewhere)
+        assert explanation.unexplained_fraction < 0.03
     # with late timestamps the delay parameter is not the largest step
     if name.endswith("clock_late"):
-        by_name = {step.name: step for step in why.steps}
+        by_name = {step.name: step for step in explanation.steps}
         stamps = by_name["timestamps and delay"].position_mean_square_m2
-        assert abs(stamps) < 0.05 * why.position_mean_square_m2
+        assert abs(stamps) < 0.05 * explanation.position_mean_square_m2
         assert by_name["measurement noise"].position_moved_m < 1e-6
     if flown.offset_s is not None:
         clock = analysis.clock
-        assert clock.determinable
+        assert clock.is_determinable
         assert clock.offset_s == pytest.approx(flown.offset_s, abs=0.05)
         low, high = clock.interval_s
         assert low <= flown.offset_s <= high
-        assert clock.change_p > MAX_CHANGE_P
+        assert clock.change_p_value > MAX_CHANGE_P
         assert abs(clock.drift_ppm) < 4.0 * clock.drift_sigma_ppm
     if name.endswith("evdelay175"):
         assert not low <= -0.175 <= high
@@ -139,13 +139,13 @@ def test_findings_motion_capture_flights_are_underconfident(shared_logs, name, f
     """Sent with an orientation, as odometry is; all noises are defaults."""
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     whole = compare(flight, start_s=0.0, end_s=flight.log.duration_s)
-    assert whole.horizontal["ekf2"].sigma_factor == pytest.approx(factor**0.5, rel=0.05)
+    assert whole.horizontal["ekf2"].sigma_ratio == pytest.approx(factor**-0.5, rel=0.05)
     comparison = compare(flight)
-    assert comparison.horizontal["ekf2"].verdict == "variance overstated"
+    assert comparison.horizontal["ekf2"].verdict == "underconfident"
     findings = find(with_noises(comparison))
     drift = next(at for at, finding in enumerate(findings) if finding.id == "source_may_drift")
     behind = findings[drift + 1 : drift + 5]
-    behind_it = ["kf_variance_overstated"] * 2 + ["ekf2_variance_overstated"] * 2
+    behind_it = ["kf_underconfident"] * 2 + ["ekf2_underconfident"] * 2
     assert [finding.id for finding in behind] == behind_it
-    assert behind[2].evidence["sigma_factor"] > 2.0
+    assert behind[2].evidence["sigma_ratio"] < 0.5
     assert not [f for f in findings if f.severity == "error" and f.caused_by is None]

@@ -1,4 +1,4 @@
-"""Points for forms: against those given by hand, and what a guess is worth."""
+"""Points of answer forms, compared with points given by hand; points of guesses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.answer_form import CURES, MISTAKES, PANELS, Answers, ClaimedMistake, update_values
+from px4fuse.answer_form import CURES, MISTAKES, PANELS, Answers, StudentMistake, update_values
 from px4fuse.assignment.random_assignment import draw
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
@@ -36,7 +36,7 @@ TRUTH = FormTruth(
 RIGHT = Answers(
     log_sha256=SHA256,
     mistakes=(
-        ClaimedMistake(
+        StudentMistake(
             "clock-offset",
             190.0,
             "ms",
@@ -48,9 +48,9 @@ RIGHT = Answers(
             "s",
             "clock",
         ),
-        ClaimedMistake("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
+        StudentMistake("dropout", 3.1, "s", "", 50.5, 53.0, "--start", 54.0, "s", "innovations"),
     ),
-    verdict_ours="overconfident",
+    verdict_kf="overconfident",
     verdict_ekf2="underconfident",
     ekf2_did=("followed wrong positions", "dead-reckoned, then reset"),
     quantities=(0.505, (3.0, 7.0), -0.2),
@@ -62,14 +62,14 @@ CLEAN = FormTruth(
 
 
 def with_claim(**values: Any) -> Answers:
-    """The right form with another first claim."""
+    """Return the correct form with another first mistake."""
     first, second = RIGHT.mistakes
     return replace(RIGHT, mistakes=(replace(first, **values), second))
 
 
 def with_false(*kinds: str) -> Answers:
-    """The right form with more claims."""
-    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(ClaimedMistake, kinds)))
+    """Return the correct form with additional mistakes."""
+    return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(StudentMistake, kinds)))
 
 
 def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
@@ -77,7 +77,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
     return [round(found[name], 2) for name in PART_NAMES]
 
 
-def test_every_mistake_that_a_flight_can_have_can_be_named_seen_and_cured() -> None:
+def test_each_simulated_mistake_has_kind_panel_and_cure() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
@@ -87,7 +87,7 @@ def test_every_mistake_that_a_flight_can_have_can_be_named_seen_and_cured() -> N
         assert set(panels(name)) > {"cover"}
 
 
-def test_all_right_is_everything_and_a_blank_form_nothing() -> None:
+def test_form_points_correct_is_full_and_empty_is_zero() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).named == {"clock-offset": True, "dropout": True}
@@ -97,9 +97,9 @@ FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
 DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
 GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
 NO_MISTAKES = {"kinds": 0.0, "sizes": 0.0, "when": 0.0, "cure": 0.0}
-# A form, and the parts of which it does not get all points
+# A form, and its parts with reduced points
 HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
-    # wrong sign: a third of its size and of its cure
+    # wrong sign: a third of the points for size and cure of this mistake
     (with_claim(size=-190.0, value=0.2), {"sizes": 10.0, "cure": 10.0}),
     (with_claim(size=140.0), {"sizes": 11.25}),
     (with_claim(size=900.0, value=-0.9), {"sizes": 7.5, "cure": 11.25}),
@@ -107,13 +107,13 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     (with_claim(when=""), {"when": 7.5}),
     (with_claim(**DELAY), {}),
     (with_claim(**GATE), {"cure": 7.5}),
-    # a neighbour earns 0.4 of the kind, a third of the size, half of when
+    # similar mistake: 0.4 of the kind, a third of the size, half of the time
     (with_claim(kind="ekf2-delay"), {"kinds": 21.0, "sizes": 10.0, "when": 7.5}),
-    # each false claim costs ten; three take all
+    # each wrong mistake costs 10 points
     (with_false("yaw"), {"kinds": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
-    (replace(RIGHT, mistakes=(ClaimedMistake("none"),)), NO_MISTAKES),
-    (replace(RIGHT, verdict_ours="consistent"), {"verdicts": 10.0}),
+    (replace(RIGHT, mistakes=(StudentMistake("none"),)), NO_MISTAKES),
+    (replace(RIGHT, verdict_kf="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 12.5}),
     (replace(RIGHT, ekf2_did=("dead-reckoned, then reset",)), {"verdicts": 12.5}),
     (replace(RIGHT, quantities=(0.53, (3.0,), None)), {"quantities": 5.0}),
@@ -122,36 +122,38 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
 
 
 @pytest.mark.parametrize(("answers", "less"), HALF_RIGHT)
-def test_what_is_half_right(answers: Answers, less: dict[str, float]) -> None:
+def test_form_points_partly_correct_has_partial_points(
+    answers: Answers, less: dict[str, float]
+) -> None:
     assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
 
 
-def test_a_clean_flight() -> None:
-    none = Answers(log_sha256=SHA256, mistakes=(ClaimedMistake("none"),))
+def test_form_points_flight_without_mistake_expects_none() -> None:
+    none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).share == 0.4
     whole = replace(
-        none, verdict_ours="consistent", verdict_ekf2="consistent", quantities=(0.5, 0.1, 0.2),
+        none, verdict_kf="consistent", verdict_ekf2="consistent", quantities=(0.5, 0.1, 0.2),
         ekf2_did=("followed the positions",),
     )  # fmt: skip
     assert form_points(whole, CLEAN).share == 1.0
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_a_cure_that_needs_no_measurement_counts_with_the_size_alone() -> None:
+def test_form_points_open_end_cure_counts_only_with_size() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
-    claim = ClaimedMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
+    claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
     guess = Answers(log_sha256=SHA256, mistakes=(claim,))
     assert parts(guess, truth) == [30.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     measured = replace(guess, mistakes=(replace(claim, size=5.1, unit="m"),))
     assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
 
 
-def test_a_constant_form_does_not_pay_on_loops() -> None:
-    """Of 300 that are drawn, with the closure errors and verdicts that they have.
+def test_form_points_constant_form_on_loops_is_low() -> None:
+    """300 drawn loops with their closure errors and verdicts.
 
-    No update lies outside a gate on most of them: an empty list shows nothing.
+    Most have no update outside the gate, so an empty list is not counted as an answer.
     """
     rng = np.random.default_rng(7)
     truths = []
@@ -168,8 +170,8 @@ def test_a_constant_form_does_not_pay_on_loops() -> None:
             assert np.mean([form_points(form, one).share for one in truths]) <= 0.35
 
 
-def test_the_size_of_an_open_end_is_what_the_odometry_measures() -> None:
-    """The drift in it is nothing that a student could know of."""
+def test_form_truth_open_end_size_includes_odometry_drift() -> None:
+    """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
     assert wrong.size is not None
@@ -182,7 +184,7 @@ def test_the_size_of_an_open_end_is_what_the_odometry_measures() -> None:
 
 
 def simulation_of(typed: str) -> flights.Simulation:
-    """The flight that a px4fuse simulate line makes."""
+    """Simulate the flight of a px4fuse simulate command."""
     given = simulate.make_context("simulate", shlex.split(typed)[2:]).params
     names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
     chosen = {name: given[name] for name in names if given.get(name) is not None}
@@ -191,14 +193,14 @@ def simulation_of(typed: str) -> flights.Simulation:
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
-    form = update_values(form)  # the forms were filled in before schema 4
+    form = update_values(form)  # the forms use the values before schema 4
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]
         parameter = one["parameter"] if one["parameter"] in CURES else ""
         unit = one["value_unit"] if one["value_unit"] in CURES.get(parameter, {}) else ""
         claims.append(
-            ClaimedMistake(
+            StudentMistake(
                 one["kind"], one["size"],
                 "" if one["unit"] == next(iter(MISTAKES[one["kind"]].units), "") else one["unit"],
                 "whole flight" if when["text"] == "whole flight" else "", when["from_s"],
@@ -206,25 +208,25 @@ def answers_of(form: dict[str, Any]) -> Answers:
             )
         )  # fmt: skip
     return Answers(
-        log_sha256=SHA256, mistakes=tuple(claims), verdict_ours=form["verdict_ours"],
+        log_sha256=SHA256, mistakes=tuple(claims), verdict_kf=form["verdict_kf"],
         verdict_ekf2=form["verdict_ekf2"], ekf2_did=tuple(form["ekf2_did"]),
-        quantities=tuple(given(one["given"]) for one in form["quantities"]),
+        quantities=tuple(to_tuple(one["given"]) for one in form["quantities"]),
     )  # fmt: skip
 
 
 def distance(value: Any) -> Any:
-    """Forward and right as one number."""
+    """Convert forward and right to a distance."""
     if isinstance(value, str):
         value = [float(part) for part in value.split(",")]
     return float(np.linalg.norm(value)) if isinstance(value, list) else value
 
 
-def given(value: Any) -> Any:
+def to_tuple(value: Any) -> Any:
     return tuple(map(float, value)) if isinstance(value, list) else value
 
 
 @pytest.mark.reallogs
-def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
+def test_form_points_agree_with_points_given_by_hand(shared_logs: Path) -> None:
     bank = json.loads((shared_logs.parent / "grading" / "bank.json").read_text(encoding="utf-8"))
     truths = {
         flight["flight"]: form_truth(simulation_of(flight["simulate"]), SHA256)
@@ -232,7 +234,7 @@ def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
     }
     ours, theirs = [], []
     for form in bank["forms"]:
-        known = tuple(given(one["truth"]) for one in form["quantities"])
+        known = tuple(to_tuple(one["truth"]) for one in form["quantities"])
         truth = truths[form["flight"]]
         made = form_points(answers_of(form), replace(truth, quantities=known))
         ours.append(sum(made.points_by_part.values()))
@@ -242,8 +244,8 @@ def test_points_are_those_given_by_hand(shared_logs: Path) -> None:
     assert spearmanr(ours, theirs).statistic >= 0.95
 
 
-def test_random_forms_earn_little() -> None:
-    """Of 500 forms filled in at random, on flights with two mistakes, one and none."""
+def test_form_points_random_forms_are_at_most_20_percent() -> None:
+    """500 random forms on flights with two mistakes, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
     earned = [form_points(at_random(rng), truths[n % 3]).share for n in range(500)]

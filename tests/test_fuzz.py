@@ -19,7 +19,9 @@ def test_readers_damaged_input_gives_result_or_one_line(target: Target, tmp_path
     assert min(outcome.read, outcome.rejected) > 0 or target.name == "MAVLink"
 
 
-@pytest.mark.usefixtures("analysed_once", "drawn_once")  # analysis and drawing are not tested here
+@pytest.mark.usefixtures(
+    "cached_analyses", "cached_pages"
+)  # analysis and drawing are not tested here
 @pytest.mark.parametrize(
     "target", [one for one in COMMANDS if one.in_suite], ids=lambda one: one.name
 )

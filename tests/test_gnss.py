@@ -335,22 +335,22 @@ def test_noise_remedy_needs_parameter_above_accuracy(
 # First finding above a note, if any; verdicts of some aids; reason why EKF2 is not replayed
 FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
     "main202603_gps_outage_flow":
-        ("source_gap", {"gnss_pos": "starved", "gnss_vel": "starved"}, ""),
+        ("source_gap", {"gnss_pos": "not_fused", "gnss_vel": "not_fused"}, ""),
     "v1.13.3_gps_profile1":
         (None, {"gnss_pos": "consistent", "gnss_vel": "consistent"},
          "GNSS is logged at 3.0 Hz"),
     "v1.14.4_gps_magdist":
-        ("aid_changed", {"gnss_pos": "consistent", "mag": "biased"},
+        ("aid_innovation_shift", {"gnss_pos": "consistent", "mag": "biased"},
          "GNSS is logged at 3.4 Hz"),
     "v1.16.1_gps_delay0":
-        ("source_clock_offset", {"gnss_pos": "consistent", "gnss_vel": "consistent"}, ""),
+        ("source_time_offset", {"gnss_pos": "consistent", "gnss_vel": "consistent"}, ""),
     "v1.16.1_gps_fullrate": (None, {"gnss_pos": "consistent", "gnss_hgt": "consistent"}, ""),
-    "v1.16.1_gps_nominal": (None, {"gnss_pos": "consistent", "gravity": "idle"}, ""),
+    "v1.16.1_gps_nominal": (None, {"gnss_pos": "consistent", "gravity": "disabled"}, ""),
     "v1.16.1_gps_overconfident":
-        ("ekf2_variance_understated",
-         {"gnss_pos": "variance understated", "gnss_vel": "consistent"}, ""),
+        ("ekf2_overconfident",
+         {"gnss_pos": "overconfident", "gnss_vel": "consistent"}, ""),
     "v1.16.1_gps_stock_flow":
-        (None, {"gnss_pos": "variance overstated", "rng_hgt": "variance overstated"}, ""),
+        (None, {"gnss_pos": "underconfident", "rng_hgt": "underconfident"}, ""),
 }  # fmt: skip
 # Minimum number of fixes reconstructed from innovations in flights logged at 2 Hz
 FROM_INNOVATIONS = {"v1.13.3_gps_profile1": 100, "v1.14.4_gps_magdist": 200}
@@ -378,7 +378,7 @@ def test_compare_real_gnss_flights_match_known_numbers(name, shared_logs):
     assert low_s - STAMP_S <= left_s <= high_s + STAMP_S
     findings = find(analysis)
     first, verdicts, reason = FLIGHTS[name]
-    loud = [one.id for one in findings if one.severity != "info"]
+    loud = [one.id for one in findings if one.severity != "note"]
     assert loud[:1] == [first] if first else not loud
     texts = " ".join(f"{item.message} {item.remedy}" for item in findings)
     assert not [word for word in OF_OTHERS if word in texts]
@@ -399,7 +399,7 @@ def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
     """Compare the NIS of aids with numbers computed without px4fuse; return their count."""
     stated = {
         # the stated number excludes rejected samples otherwise
-        aid: one["mean_nis" if one["rejected_share"] > 0.0 else "mean_nis_fused"]
+        aid: one["mean_nis" if one["rejected_fraction"] > 0.0 else "mean_nis_fused"]
         for aid, one in truth["aid_sources"].items()
         if aid in found and found[aid].axes
     }
@@ -442,15 +442,15 @@ def test_model_real_gnss_flights_agree_with_log(models):
                 # the logger omits 1 of 24 fixes
                 assert axis.s_ratio_median == pytest.approx(1.0, abs=0.002)
         assert all(axis.position_rms_difference_m < 0.03 for axis in agreement.gnss_pos.values())
-        assert agreement.rejected_share_replayed == agreement.rejected_share_logged == 0.0
+        assert agreement.rejected_fraction_replayed == agreement.rejected_fraction_logged == 0.0
     for axis in models["fullrate"].agreement.gnss_pos.values():
         assert axis.innovation_correlation > 0.9999
         assert axis.innovation_rms_difference < 0.004
         assert axis.position_rms_difference_m < 0.004
     rejecting = models["overconfident"].agreement
     assert rejecting.good
-    assert rejecting.rejected_share_replayed == pytest.approx(
-        rejecting.rejected_share_logged, abs=0.01
+    assert rejecting.rejected_fraction_replayed == pytest.approx(
+        rejecting.rejected_fraction_logged, abs=0.01
     )
     for axis in (*rejecting.gnss_pos.values(), *rejecting.gnss_vel.values()):
         assert axis.innovation_correlation > 0.999
@@ -467,7 +467,7 @@ def test_what_if_gnss_settings_match_independent_replay(models):
         found = what_if(models[name], [settings])
         (after,) = found.whatif
         error = after.position_rmse_to_truth_m
-        return error, after.nis_mean, after.rejected_share
+        return error, after.nis_mean, after.rejected_fraction
 
     assert error_m("delay0")[0] == pytest.approx(0.688, rel=0.03)
     assert error_m("delay0", EKF2_GPS_DELAY=200.0)[0] == pytest.approx(0.233, rel=0.06)
@@ -491,7 +491,7 @@ def test_what_if_gnss_delay_changes_heading(models):
         assert model.agreement.heading_rms_difference_deg < 0.5
         # height follows the logged EKF2 height
         state, replayed = model.flight.ekf2.state["down_m"], model.flown.published["down_m"]
-        state = state[inside_spans(state.index, model.flown.judged_s)]
+        state = state[inside_spans(state.index, model.flown.evaluated_s)]
         assert rms(np.interp(state.index, replayed.index, replayed) - state.to_numpy()) < 0.05
     assert heading_deg("delay0", EKF2_GPS_DELAY=200.0) == pytest.approx((4.7, 1.5), abs=0.3)
     # 110 ms of delay error rotate the heading in proportion to 4.7° for 200 ms
@@ -530,7 +530,7 @@ def test_what_if_without_aid_predicts_error(models):
 def test_what_if_unused_parameter_raises_settings_error(models):
     with pytest.raises(SettingsError, match="EKF2 fused GNSS position in this log"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
-    own = replace(models["nominal"].inputs.received, has_measurement_times=True)
+    own = replace(models["nominal"].inputs.received, uses_sender_times=True)
     model = replace(models["nominal"], inputs=replace(models["nominal"].inputs, received=own))
     with pytest.raises(SettingsError, match="EKF2_GPS_DELAY has no effect in this log"):
         what_if(model, [{"EKF2_GPS_DELAY": 50.0}])
@@ -604,7 +604,7 @@ def test_read_gnss_noise_is_limited_as_in_ekf2(parameters, fused, tmp_path):
     np.testing.assert_allclose(found.stamp_s, samples.index + 0.11)
     np.testing.assert_allclose(found.arrival_s, found.stamp_s)
     np.testing.assert_allclose(found.variance_m2[:, :2], 100.0)
-    assert not found.has_measurement_times
+    assert not found.uses_sender_times
     assert (found.velocity_m_s is not None) is fused
     if found.velocity_m_s is not None and found.velocity_variance_m2_s2 is not None:
         np.testing.assert_allclose(found.velocity_m_s[0], [1.0, 2.0, 3.0])
@@ -628,7 +628,7 @@ def test_read_gnss_driver_time_replaces_delay(tmp_path):
     record = made(FusionRecord, parameters={"EKF2_GPS_DELAY": 110.0, "EKF2_GPS_MODE": 0.0})
     flight = flight_of(outdoors(own_s=0.09, EKF2_GPS_MODE=0.0), tmp_path)
     found = read_gnss(flight, flight.ekf2, record)
-    assert found.has_measurement_times
+    assert found.uses_sender_times
     assert found.velocity_m_s is None
     # the timestamp is chosen so that the delay leads to the driver's time
     np.testing.assert_allclose(found.stamp_s - 0.11, track_of(flight).samples.index)
@@ -675,7 +675,7 @@ def test_read_gnss_damaged_fix_is_dropped_with_velocity(tmp_path):
     "recorded", [False, pytest.param(True, marks=pytest.mark.reallogs)], ids=["model", "real EKF2"]
 )
 def test_reconstruct_fixes_recovers_missing_fixes(recorded, request):
-    """Of a flight with all fixes every fourth to sixth is kept, and two innovations per second."""
+    """Keep every fourth to sixth fix of a complete flight, and two innovations per second."""
     if recorded:
         folder = request.getfixturevalue("shared_logs")
         flight = read_log(folder / "gps" / "v1.16.1_gps_fullrate.ulg")

@@ -20,8 +20,8 @@ import pytest
 from browser import content
 from class_tools import in_this_process
 from cli_tools import run
-from conftest import REPOSITORY, page_of
-from golden_tools import agrees, numbers, of_blocks, of_values, rounded, written
+from conftest import REPOSITORY, blank_page
+from golden_tools import assert_matches_golden, numbers, of_blocks, of_values, rounded, written
 from made_up_fleet import made_up
 from scipy.spatial.transform import Rotation
 from ulog_tools import gnss_log
@@ -107,7 +107,7 @@ COMMANDS = {
 EXIT_CODES = {"verify_other": 1, "diff": 1}
 
 
-def shifted(path: Path) -> str:
+def shift_trajectory(path: Path) -> str:
     """Return a SLAM trajectory 0.35 s early, rotated, translated and with errors of 3 cm."""
     poses = np.array([line.split() for line in path.read_text().splitlines() if line[0] != "#"])
     poses = poses.astype(float)[40:-25:2]
@@ -125,7 +125,7 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     blocks: list[Any] = []
     if "verify" in request.node.name:  # verify needs the PDF
         in_this_process(monkeypatch)
-        request.getfixturevalue("drawn_once")
+        request.getfixturevalue("cached_pages")
         return blocks
 
     def keep(page_blocks: list[Any]) -> list[Any]:
@@ -133,18 +133,20 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
         return []
 
     monkeypatch.setattr(pdf, "data", keep)
-    monkeypatch.setattr(pdf, "compile_pdf", lambda report: page_of(None, report["results"]))
+    monkeypatch.setattr(pdf, "compile_pdf", lambda report: blank_page(None, report["results"]))
     return blocks
 
 
-@pytest.mark.usefixtures("analysed_once")
+@pytest.mark.usefixtures("cached_analyses")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_command_output_matches_golden_file(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept_pages: list[Any]
 ) -> None:
     shutil.copytree(REPOSITORY / "sample_logs", tmp_path / "sample_logs")
     (tmp_path / "notes.md").write_text(NOTES)
-    (tmp_path / "shifted.tum").write_text(shifted(REPOSITORY / "sample_logs" / "loop_slam.tum"))
+    (tmp_path / "shifted.tum").write_text(
+        shift_trajectory(REPOSITORY / "sample_logs" / "loop_slam.tum")
+    )
     shutil.copy(REPOSITORY / "reports" / "example" / "aisle_uwb.pdf", tmp_path / "report.pdf")
     monkeypatch.chdir(tmp_path)
     for command in COMMANDS[name]:
@@ -160,7 +162,7 @@ def test_command_output_matches_golden_file(
             lines += [path.name, *written(path)]
     # the file is identical only if the processor rounds as the one that made it
     again = r"the log gives (the same file again, byte for byte|all \d+ values again \(.*?\))"
-    agrees(name, [re.sub(again, "the log gives it again", line) for line in lines])
+    assert_matches_golden(name, [re.sub(again, "the log gives it again", line) for line in lines])
 
 
 def spread(kind: str, *mistakes: str) -> list[str]:
@@ -184,7 +186,7 @@ def test_simulated_flight_matches_golden_file(kind: str) -> None:
             # EKF2 ignores a GNSS noise below the receiver's accuracy
             typed = f"{name}=2" if (kind, name) == ("outdoor", "ekf2-noise") else name
             lines += ["", name, *(line for line in spread(kind, typed) if line not in clean)]
-    agrees(f"simulated_{kind}", lines)
+    assert_matches_golden(f"simulated_{kind}", lines)
 
 
 def test_help_matches_golden_file() -> None:
@@ -194,7 +196,7 @@ def test_help_matches_golden_file() -> None:
             f"$ px4fuse {command} --help",
             *run(*command.split(), "--help").output.splitlines(),
         ]
-    agrees("help", lines)
+    assert_matches_golden("help", lines)
 
 
 def test_gnss_flight_report_contains_aids(tmp_path: Path, kept_pages: list[Any]) -> None:
@@ -202,28 +204,34 @@ def test_gnss_flight_report_contains_aids(tmp_path: Path, kept_pages: list[Any])
     result = run("compare", log, "-o", tmp_path / "a.pdf")
     assert result.exit_code == 0, result.output
     output = result.output.replace(str(tmp_path), "").splitlines()
-    agrees("aids", [*output, "", *of_blocks(kept_pages), *written(tmp_path / "a.json")])
+    assert_matches_golden(
+        "aids", [*output, "", *of_blocks(kept_pages), *written(tmp_path / "a.json")]
+    )
 
 
 def test_batch_page_matches_golden_file() -> None:
     text = html_text(made_up(12), "Bench", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
     drawn = [rounded(line) for line in above.splitlines() if line.strip()]
-    agrees("fleet_page", [*drawn, *of_values(content(text))])
+    assert_matches_golden("fleet_page", [*drawn, *of_values(content(text))])
 
 
-@pytest.mark.usefixtures("analysed_once")
+@pytest.mark.usefixtures("cached_analyses")
 def test_explore_plots_match_golden_file(sample_log: Path) -> None:
     analysis = px4fuse.compare(str(sample_log))
     data = flight_data(analysis, Packer())
     document, _ = document_json(data, analysis.tuning)
     ids: dict[str, str] = {}
 
-    def named(found: re.Match[str]) -> str:
+    def number_bokeh_ids(found: re.Match[str]) -> str:
         """Number Bokeh's ids, which count the models of the process, from 0."""
         return ids.setdefault(found[0], f"id{len(ids)}")
 
-    lines = [re.sub(r"\bp\d{4,}\b", named, line) for line in of_values(document["roots"])]
+    lines = [
+        re.sub(r"\bp\d{4,}\b", number_bokeh_ids, line) for line in of_values(document["roots"])
+    ]
     drawn = [rounded(line[:200]) for line in lines if " id" not in line]
     drawn = [re.sub(r"data: H4s.*", "data: packed", line) for line in drawn]
-    agrees("explore", [*drawn, *(line[:200] for line in of_values(to_json_types(data)))])
+    assert_matches_golden(
+        "explore", [*drawn, *(line[:200] for line in of_values(to_json_types(data)))]
+    )

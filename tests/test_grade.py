@@ -1,4 +1,4 @@
-"""A class graded: outputs, resuming, and hostile files among the others."""
+"""Grading of a class: outputs, repeated runs, and malicious files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 from class_tools import in_this_process
-from cli_tools import done, refused, run
+from cli_tools import error_line, run, run_checked
 from conftest import LOG, REPORT
 from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
@@ -29,19 +29,19 @@ from px4fuse.verification import pages
 from px4fuse.verification.model import Verdict
 from px4fuse.workers import JobFailure
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 UNKNOWN = Verdict("cannot verify", (), with_log=False)
 
 
 @pytest.fixture
-def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def jobs_in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     in_this_process(monkeypatch)
 
 
 @pytest.fixture
-def handed_in(tmp_path: Path) -> Path:
-    """A folder as a learning platform exports it: one report, and what goes wrong."""
+def submitted(tmp_path: Path) -> Path:
+    """Export folder of a learning platform: a report twice, and invalid files."""
     folder = tmp_path / "handed in"
     for name in ("Lovelace Ada_1_assignsubmission_file_", "Hopper Grace_2_assignsubmission_file_"):
         (folder / name).mkdir(parents=True)
@@ -57,11 +57,11 @@ def handed_in(tmp_path: Path) -> Path:
     return folder
 
 
-def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) -> None:
+def test_grade_table_lists_every_submitted_file(submitted, tmp_path) -> None:
     output = tmp_path / "class"
     before = {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)}
     outcome = grade(
-        [handed_in, tmp_path / "more.zip"], Course(read_rubric(None)), output, processes=1
+        [submitted, tmp_path / "more.zip"], Course(read_rubric(None)), output, processes=1
     )
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)} == before
     assert len(outcome.graded) == 6
@@ -73,19 +73,19 @@ def test_everything_that_was_handed_in_stands_in_the_table(handed_in, tmp_path) 
     assert len(scored) == 3
     assert all(row["points"] == row["total"] == "" and "--logs" in row["pending"] for row in scored)
     assert all("the same" in row["flags"].lower() for row in scored)
-    refused = {row["file"]: row["reasons"] for row in table if row["points"] == "0"}
-    assert len(refused) == 3
-    assert any("encrypted" in reason for reason in refused.values())
+    refused_files = {row["file"]: row["reasons"] for row in table if row["points"] == "0"}
+    assert len(refused_files) == 3
+    assert any("encrypted" in reason for reason in refused_files.values())
     assert not any(row["file"].startswith(("=", "+", "-", "@")) for row in table)
     page = (output / "class.html").read_text(encoding="utf-8")
     assert "<img src=x" not in page
-    assert "<title>Lab: fusion and loop closure</title>" in page  # the rubric's
+    assert "<title>Lab: fusion and loop closure</title>" in page  # title of the rubric
     assert len(list((output / "feedback").glob("*.txt"))) == 6
 
 
-@pytest.mark.usefixtures("at_once", "drawn_once")
+@pytest.mark.usefixtures("jobs_in_process", "cached_pages")
 def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> None:
-    """As where they take more time or memory than there is for them."""
+    """The comparison of pages exceeds its time limit."""
     folder = tmp_path / "in"
     folder.mkdir()
     (folder / "a.pdf").write_bytes(
@@ -102,8 +102,8 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
     assert any("not compared within the limits" in flag for flag in only.flags)
 
 
-@pytest.mark.usefixtures("at_once", "drawn_once")
-def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) -> None:
+@pytest.mark.usefixtures("jobs_in_process", "cached_pages")
+def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     shutil.copy(REPORT, folder / "a.pdf")
@@ -121,55 +121,55 @@ def test_a_report_with_its_log_is_verified_and_a_changed_one_is_not(tmp_path) ->
     assert second.verdict.status == "numbers differ"
     assert second.points == 0.0
     assert any("nis_mean" in difference.path for difference in second.verdict.differences)
-    # what is read is drawn again from the log, for both
+    # each report is redrawn from the log
     redrawn = [path.read_bytes() for path in (output / "reports").glob("*.pdf")]
     assert len(redrawn) == 3
     assert len(set(redrawn)) == 1
     assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 8
     page = (output / "class.html").read_text(encoding="utf-8")
     assert all(f"reports/{name}.pdf" in page for name in ("a", "b", "c"))
-    # a page away is a flag, and costs nothing
+    # a missing page is flagged and costs no points
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
     assert any("Page 8: missing." in flag for flag in third.flags)
     assert first.flags == ()
-    # a second run does nothing again, and says the same
+    # a second run reuses all results
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
     assert again.reused == 3
     assert again.graded == outcome.graded
 
 
-@pytest.mark.usefixtures("at_once")
-def test_only_what_changed_is_done_again(handed_in, tmp_path) -> None:
+@pytest.mark.usefixtures("jobs_in_process")
+def test_grade_again_processes_changed_files_only(submitted, tmp_path) -> None:
     output = tmp_path / "class"
 
     def reused(title: str = "") -> int:
         return grade(
-            [handed_in, tmp_path / "more.zip"],
+            [submitted, tmp_path / "more.zip"],
             Course(read_rubric(None), title=title),
             output,
             processes=2,
         ).reused
 
-    assert reused() == 2  # of one report there are three copies
-    assert reused("Lab 4") == 3  # what is no report is read again
+    assert reused() == 2  # there are three copies of one report
+    assert reused("Lab 4") == 3  # other files are read again
     assert b"<title>Lab 4</title>" in (output / "class.html").read_bytes()
-    # what is known is known by its content, under any name
-    (handed_in / "essay.pdf").write_bytes(REPORT.read_bytes())
+    # cached results are found by content, not by name
+    (submitted / "essay.pdf").write_bytes(REPORT.read_bytes())
     assert reused() == 4
-    (handed_in / "essay.pdf").write_bytes(b"%PDF-1.7\nanother one")
+    (submitted / "essay.pdf").write_bytes(b"%PDF-1.7\nanother one")
     assert reused() == 3
     for record in (output / "records").glob("*.json"):
         record.write_text('{"rests_on": {"verdict": 3}}')
     assert reused() == 2
     (output / "overrides (1).csv").write_text("id,item,points,comment\n")
-    again = grade([handed_in, tmp_path / "more.zip"], Course(read_rubric(None)), output)
+    again = grade([submitted, tmp_path / "more.zip"], Course(read_rubric(None)), output)
     assert "overrides (1).csv was not read; only overrides.csv is read." in again.notes
 
 
-@pytest.mark.usefixtures("at_once", "drawn_once")
-def test_another_log_at_hand_verifies_again(tmp_path) -> None:
+@pytest.mark.usefixtures("jobs_in_process", "cached_pages")
+def test_grade_with_other_logs_verifies_again(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")
     said = []
@@ -178,15 +178,15 @@ def test_another_log_at_hand_verifies_again(tmp_path) -> None:
             [tmp_path / "in"], Course(read_rubric(None), logs=logs), tmp_path / "out", processes=1
         )
         said.append((outcome.graded[0].verdict.status, outcome.reused))
-        # the redrawn report, and nothing of the run before
+        # only the redrawn report of this run
         assert len([*(tmp_path / "out" / "records").glob("*.p*")]) == len(logs)
     assert said == [
         ("cannot verify", 0), ("verified", 0), ("verified", 1), ("cannot verify", 0)
     ]  # fmt: skip
 
 
-@pytest.mark.usefixtures("at_once")
-def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tmp_path) -> None:
+@pytest.mark.usefixtures("jobs_in_process")
+def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in")
     (tmp_path / "logs").mkdir()
@@ -203,9 +203,9 @@ def test_a_log_that_was_handed_out_and_is_not_at_hand_costs_nobody_everything(tm
         assert "aisle_uwb.ulg" in one.pending
 
 
-@pytest.mark.usefixtures("at_once")
-def test_what_the_command_says(tmp_path, monkeypatch) -> None:
-    """Names on one line each, and of an interrupted run that it can go on."""
+@pytest.mark.usefixtures("jobs_in_process")
+def test_grade_command_shortens_names_and_can_be_continued(tmp_path, monkeypatch) -> None:
+    """Each name is one line; an interrupted run prints how to continue."""
     import px4fuse.grading.grade as module
 
     one = GradedReport("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
@@ -213,7 +213,7 @@ def test_what_the_command_says(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")
     monkeypatch.setattr(module, "grade", lambda *_, **__: GradeOutcome((entry,), (), 0, ()))
-    said = done("grade", "a.pdf", "-o", "out").output
+    said = run_checked("grade", "a.pdf", "-o", "out").output
     assert len(said) < 3000
     assert not any(line.lstrip().startswith("Points 120") for line in said.splitlines())
     monkeypatch.setattr(module, "grade", Mock(side_effect=KeyboardInterrupt))
@@ -224,13 +224,13 @@ def test_what_the_command_says(tmp_path, monkeypatch) -> None:
     assert "Run the same command to continue." in str(result.exception)
 
 
-def test_names_of_files_are_safe_and_unique() -> None:
+def test_file_names_are_safe_and_unique() -> None:
     assert file_names(["12345", "12345", "../../etc/passwd", "CON", "", "日本"]) == [
         "12345", "12345-2", "_.._etc_passwd", "_CON", "report", "日本"
     ]  # fmt: skip
 
 
-def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
+def test_grade_command_passes_course_options(tmp_path, monkeypatch) -> None:
     import px4fuse.grading.grade as module
 
     noted = Mock(return_value=GradeOutcome((), (), 0, ()))
@@ -242,7 +242,7 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
         "grade a.pdf -o out --roster sheet.csv --worksheet sheet.csv --column Grade --attempt best "
         "--late 5%/hour --anonymous --title Lab --jobs 3 --due"
     )
-    done(*words.split(), "2026-11-20 23:59 +01:00")
+    run_checked(*words.split(), "2026-11-20 23:59 +01:00")
     course, processes = noted.call_args.args[1], noted.call_args.kwargs["processes"]
     assert (course.title, processes) == ("Lab", 3)
     assert [person.student_id for person in course.roster] == ["0042"]
@@ -252,8 +252,8 @@ def test_the_options_of_a_term_reach_it(tmp_path, monkeypatch) -> None:
     assert (course.late.text, course.include_pending) == ("5%/hour", False)
 
 
-def test_the_default_rubric_is_written_to_be_edited(tmp_path, monkeypatch) -> None:
+def test_grade_write_rubric_writes_default_once(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    done("grade", "--write-rubric", "lab.toml")
+    run_checked("grade", "--write-rubric", "lab.toml")
     assert read_rubric(Path("lab.toml")) == read_rubric(None)
-    assert "not overwritten" in refused("grade", "--write-rubric", "lab.toml")
+    assert "not overwritten" in error_line("grade", "--write-rubric", "lab.toml")

@@ -42,10 +42,10 @@ def estimate(flight: Flight, sigma_z_m: float = SIGMA_UWB_M) -> HeadingError | U
     )
 
 
-def rotated(quaternions: pd.DataFrame, turn_deg: np.ndarray) -> pd.DataFrame:
+def rotated(quaternions: pd.DataFrame, misalignment_deg: np.ndarray) -> pd.DataFrame:
     """Return the orientations with a heading error."""
     values = quaternions[Columns.QUATERNION].to_numpy(copy=True)
-    wrong = Rotation.from_euler("Z", turn_deg[:, None], degrees=True)
+    wrong = Rotation.from_euler("Z", misalignment_deg[:, None], degrees=True)
     made = (wrong * Rotation.from_quat(values, scalar_first=True)).as_quat(scalar_first=True)
     return pd.DataFrame(made, index=quaternions.index, columns=Columns.QUATERNION)
 
@@ -56,11 +56,11 @@ def with_heading_drift(flight: Flight) -> tuple[Flight, np.ndarray]:
     return replace(flight, attitude=rotated(flight.attitude, turn)), turn
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 20.0, -40.0])
-def test_heading_constant_misalignment_is_recovered(turn_deg):
-    found = estimate(simulated(*([f"yaw={turn_deg:g}"] if turn_deg else [])))
+@pytest.mark.parametrize("misalignment_deg", [0.0, 20.0, -40.0])
+def test_heading_constant_misalignment_is_recovered(misalignment_deg):
+    found = estimate(simulated(*([f"yaw={misalignment_deg:g}"] if misalignment_deg else [])))
     assert not found.drifts
-    assert found.turn_deg == pytest.approx(turn_deg, abs=3.0 * found.sigma_deg)
+    assert found.misalignment_deg == pytest.approx(misalignment_deg, abs=3.0 * found.sigma_deg)
     assert found.sigma_deg < 3.0
 
 
@@ -147,4 +147,4 @@ def test_heading_drifts_needs_range_and_significance() -> None:
         turns = (0.0, spread * frame_rotation.MIN_DRIFT_DEG)
         parts = tuple(HeadingPart(float(n), n + 1.0, turn, 0.1) for n, turn in enumerate(turns))
         found = frame_rotation.combine_heading_parts(parts, drift_p, "positions")
-        assert (found.drifts, found.turn_deg) == (drifts, pytest.approx(np.mean(turns)))
+        assert (found.drifts, found.misalignment_deg) == (drifts, pytest.approx(np.mean(turns)))

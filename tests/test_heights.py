@@ -235,7 +235,7 @@ def test_what_if_long_height_rejection_is_unpredictable() -> None:
     segments = add_heights(other, ekf2, ekf2.record, model.inputs.segments)
     jumping = replace(model, inputs=replace(model.inputs, segments=segments))
     found = what_if(jumping, [{"EKF2_BARO_GATE": gate} for gate in (3.0, 50.0)])
-    assert [one.steady for one in found.whatif] == [False, True]
+    assert [one.is_predictable for one in found.whatif] == [False, True]
     assert found.whatif[0].heights["baro_hgt"].longest_without_fusion_s > 5.0
 
 
@@ -348,7 +348,7 @@ def test_model_real_heights_agree_with_log(models: dict[str, Model], name: str) 
         assert axis.position_rms_difference_m < published_m
         assert axis.velocity_rms_difference_m_s < 0.02
     for summary in (found := what_if(models[name], [])).logged, found.replayed:  # type: ignore[union-attr]
-        assert {one.rejected_share for one in summary.heights.values()} == {0.0}
+        assert {one.rejected_fraction for one in summary.heights.values()} == {0.0}
     error_m = found.logged.height_rmse_to_truth_m
     assert found.replayed.height_rmse_to_truth_m == pytest.approx(error_m, abs=0.02)
 
@@ -370,8 +370,8 @@ def test_what_if_height_settings_change_statistics(models: dict[str, Model]) -> 
     assert 8.0 < wide.innovation_std_m**2 / wide.nis_mean < 9.6  # plus the square of the mean
     narrow, _ = heights(EKF2_BARO_GATE=1.0)
     # share outside 1 √S of a normal distribution with this NIS
-    assert narrow.heights["baro_hgt"].rejected_share == pytest.approx(0.17, abs=0.03)
-    assert narrow.heights["gnss_hgt"].rejected_share == 0.0
+    assert narrow.heights["baro_hgt"].rejected_fraction == pytest.approx(0.17, abs=0.03)
+    assert narrow.heights["gnss_hgt"].rejected_fraction == 0.0
     # GNSS only: 0.6 m noise at 10 Hz, stabilised by its velocity
     alone, flown = heights({"baro_hgt": 60.0})
     assert alone.heights.keys() == {"gnss_hgt"}
@@ -396,7 +396,9 @@ def test_what_if_results_contain_each_height_sensor(models: dict[str, Model]) ->
     model, changes, without = models["nominal"], {"EKF2_BARO_GATE": 1.5}, {"gnss_hgt": 100.0}
     request = WhatIfRequest(log=model.flight.log.name, changes=changes, without=without)
     asked = what_if(model, [changes], without)
-    found = WhatIfAnalysis(model.flight, asked, changes, asked=False, why={}, without=without)
+    found = WhatIfAnalysis(
+        model.flight, asked, changes, asked=False, difference_steps={}, without=without
+    )
     results = json.loads(to_json(whatif_results(request, found)))
     jsonschema.validate(results, schema())
     assert results["whatif"]["heights"].keys() == {"baro_hgt"}

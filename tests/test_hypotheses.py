@@ -15,7 +15,7 @@ from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import estimate_frame_rotation, noises_and_clock
+from px4fuse.comparison.estimates import estimate_frame_rotation, estimate_noises_and_clock
 from px4fuse.filter.hypotheses import DesignMatrix, bias_scale_jump_fit, make_design_matrix
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
@@ -43,7 +43,7 @@ DETECTORS = (*OF_CAUSES, source_clock.detect, source_frame.detect, noises.detect
 def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analysis:
     """Analyse a flight for the detectors: noises, time offset and frame misalignment."""
     comparison = compare(flight, settings, axes=("north", "east"), **span)
-    tuning, clock = noises_and_clock(comparison)
+    tuning, clock = estimate_noises_and_clock(comparison)
     heading = estimate_frame_rotation(comparison, tuning, clock)
     return replace(unexplained(comparison), tuning=tuning, clock=clock, heading=heading)
 
@@ -154,19 +154,29 @@ def test_fit_clean_flight_has_no_bias_scale_or_jump() -> None:
     ("mistake", "name", "severity", "evidence"),
     [
         ("accel-bias=0.4", "accelerometer_bias", "error", {"bias_m_s2": (0.4, 0.1)}),
-        ("scale=25%", "source_scale_wrong", "error", {"scale": (1.25, 0.1)}),
+        ("scale=25%", "source_scale_error", "error", {"scale": (1.25, 0.1)}),
         # the lag is the time constant minus half an interval
-        ("smoothed=0.5", "source_smoothed", "error", {"lag_s": (0.41, 0.1)}),
-        ("jump=1,40s", "source_jumps", "error", {"size_m": (1.0, 0.3), "count": (1.0, 0.0)}),
-        ("decimate=2Hz", "source_thinned", "error", {"source_rate_hz": (5.0, 0.1)}),
-        ("r-scale=0.25", "source_variance_wrong", "error", {"variance_factor": (0.25, 0.05)}),
-        ("r-scale=4", "source_variance_wrong", "error", {"variance_factor": (4.0, 0.8)}),
+        ("smoothed=0.5", "source_low_pass_filtered", "error", {"lag_s": (0.41, 0.1)}),
+        (
+            "jump=1,40s",
+            "source_position_jump",
+            "error",
+            {"size_m": (1.0, 0.3), "count": (1.0, 0.0)},
+        ),
+        ("decimate=2Hz", "source_downsampled", "error", {"source_rate_hz": (5.0, 0.1)}),
+        (
+            "r-scale=0.25",
+            "source_reported_variance_wrong",
+            "error",
+            {"variance_factor": (0.25, 0.05)},
+        ),
+        ("r-scale=4", "source_reported_variance_wrong", "error", {"variance_factor": (4.0, 0.8)}),
     ],
 )
 def test_find_simulated_mistake_is_first_with_size(mistake, name, severity, evidence) -> None:
     named = found(flown(mistake))
     assert next(iter(named)) == name
-    assert ("source_smoothed" in named) == (name == "source_smoothed")
+    assert ("source_low_pass_filtered" in named) == (name == "source_low_pass_filtered")
     assert named[name].severity == severity
     for key, (value, within) in evidence.items():
         assert named[name].evidence[key] == pytest.approx(value, abs=within)
@@ -175,12 +185,12 @@ def test_find_simulated_mistake_is_first_with_size(mistake, name, severity, evid
 @pytest.mark.parametrize(
     ("name", "mistake", "settings", "severity", "remedy"),
     [
-        ("source_clock_offset", "clock-offset=250ms", {}, "error", "--clock-offset -0."),
-        ("source_clock_changes", "clock-jump=400ms", {}, "error", "--start"),
-        ("source_frame_turned", "yaw=30", {}, "error", "Rotate the positions by -2|by -3"),
+        ("source_time_offset", "clock-offset=250ms", {}, "error", "--clock-offset -0."),
+        ("source_time_offset_changes", "clock-jump=400ms", {}, "error", "--start"),
+        ("source_frame_misaligned", "yaw=30", {}, "error", "Rotate the positions by -2|by -3"),
         ("source_outliers", "nlos=5%", {}, "error", "line of sight"),
-        ("sigma_z_large", "", {"sigma_z_m": 0.3}, "warning", "--sigma-z 0.09|--sigma-z 0.1"),
-        ("sigma_a_large", "", {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
+        ("sigma_z_too_large", "", {"sigma_z_m": 0.3}, "warning", "--sigma-z 0.09|--sigma-z 0.1"),
+        ("sigma_a_too_large", "", {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
     ],
 )
 def test_find_simulated_mistake_has_command(name, mistake, settings, severity, remedy) -> None:

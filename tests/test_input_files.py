@@ -7,22 +7,22 @@ import shutil
 from pathlib import Path
 
 import pytest
-from aimed import RUNS, Aim, aims, cleared, hashed, made_desk
-from class_tools import in_this_process, report_of
-from cli_tools import done, refused, run
+from aimed import RUNS, Aim, aims, file_hashes, make_desk, make_empty_folder
+from class_tools import in_this_process, make_report
+from cli_tools import error_line, run, run_checked
 from conftest import REPORT, SAMPLES
 
 from px4fuse.errors import OutputError
 
 pytestmark = [
-    pytest.mark.usefixtures("analysed_once", "no_drawing"),
+    pytest.mark.usefixtures("cached_analyses", "no_drawing"),
     pytest.mark.skipif(os.name == "nt", reason="links need rights there"),
 ]
 
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_desk(tmp_path_factory.mktemp("desk") / "desk")
+    return make_desk(tmp_path_factory.mktemp("desk") / "desk")
 
 
 def group(aim: Aim) -> tuple[str, str, str | None]:
@@ -32,15 +32,15 @@ def group(aim: Aim) -> tuple[str, str, str | None]:
 @pytest.mark.parametrize("command", [command for command, *_ in RUNS])
 def test_output_at_input_is_refused_by_every_path(desk, tmp_path, monkeypatch, command) -> None:
     monkeypatch.chdir(desk)
-    before, tried = hashed(desk), 0
+    before, tried = file_hashes(desk), 0
     for aim in (aim for aim in aims() if aim.command == command):
-        arguments = aim.arguments(desk, cleared(tmp_path / "place"))
+        arguments = aim.arguments(desk, make_empty_folder(tmp_path / "place"))
         if arguments is None:
             continue
         result = run(*arguments)
         assert isinstance(result.exception, OutputError), (aim, result.output)
         assert result.stdout == ""
-        assert hashed(desk) == before, aim
+        assert file_hashes(desk) == before, aim
         tried += 1
     assert tried >= 4
 
@@ -53,7 +53,7 @@ def class_desk(tmp_path, monkeypatch) -> Path:
     """Submitted reports in a folder with the same name as an output folder of grade."""
     folder = tmp_path / "h" / "reports"
     folder.mkdir(parents=True)
-    (folder / "1001.pdf").write_bytes(report_of("Ada", "1001"))
+    (folder / "1001.pdf").write_bytes(make_report("Ada", "1001"))
     (tmp_path / "gg").mkdir()
     (tmp_path / "gg" / "class.csv").write_text("id,name\n1001,Ada\n")
     (tmp_path / "g3" / "grades").mkdir(parents=True)
@@ -69,36 +69,36 @@ def class_desk(tmp_path, monkeypatch) -> Path:
      "grade h/reports --worksheet g3/grades/ws.csv -o g3"],
 )  # fmt: skip
 def test_grade_into_folder_of_inputs_is_refused(class_desk, command) -> None:
-    before = hashed(class_desk)
-    assert "contains an input of this command" in refused(*command.split())
-    assert hashed(class_desk) == before
+    before = file_hashes(class_desk)
+    assert "contains an input of this command" in error_line(*command.split())
+    assert file_hashes(class_desk) == before
 
 
 def test_grade_keeps_pdf_behind_linked_reports_folder(class_desk) -> None:
     (class_desk / "out").mkdir()
     (class_desk / "out" / "reports").symlink_to(class_desk / "h" / "reports")
-    before = hashed(class_desk)
-    assert "contains an input" in refused("grade", "h/reports", "-o", "out")
-    assert hashed(class_desk) == before
+    before = file_hashes(class_desk)
+    assert "contains an input" in error_line("grade", "h/reports", "-o", "out")
+    assert file_hashes(class_desk) == before
 
 
 def test_grade_twice_into_one_folder_keeps_names(class_desk) -> None:
     command = ["grade", "h/reports", "--roster", "gg/class.csv", "--anonymous", "-o", "out"]
-    done(*command)
+    run_checked(*command)
     (class_desk / "out" / "overrides.csv").write_text("id,item,points,comment\n1001,,,Good\n")
     before = (class_desk / "out" / "names.csv").read_bytes()
-    done(*command)
+    run_checked(*command)
     assert (class_desk / "out" / "names.csv").read_bytes() == before
 
 
 def test_compare_keeps_its_answer_form(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(SAMPLES / "aisle_uwb.ulg", "l.ulg")
-    done("answers", "l.ulg", "-o", "form.toml")
-    before = hashed(tmp_path)
+    run_checked("answers", "l.ulg", "-o", "form.toml")
+    before = file_hashes(tmp_path)
     command = "compare l.ulg --answers form.toml --json form.toml"
-    assert refused(*command.split()).startswith("form.toml is an input of this command")
-    assert hashed(tmp_path) == before
+    assert error_line(*command.split()).startswith("form.toml is an input of this command")
+    assert file_hashes(tmp_path) == before
 
 
 def test_verify_keeps_a_log_of_a_folder(tmp_path, monkeypatch) -> None:
@@ -107,10 +107,10 @@ def test_verify_keeps_a_log_of_a_folder(tmp_path, monkeypatch) -> None:
     (tmp_path / "d").mkdir()
     shutil.copy(SAMPLES / "aisle_uwb.ulg", "d/aisle.ulg")
     shutil.copy(REPORT, "a.pdf")
-    before = hashed(tmp_path)
-    said = refused("verify", "a.pdf", "d", "--json", "d/aisle.ulg")
+    before = file_hashes(tmp_path)
+    said = error_line("verify", "a.pdf", "d", "--json", "d/aisle.ulg")
     assert said.startswith("d/aisle.ulg is an input of this command")
-    assert hashed(tmp_path) == before
+    assert file_hashes(tmp_path) == before
 
 
 def test_batch_into_folder_of_logs_is_refused(tmp_path, monkeypatch) -> None:
@@ -118,7 +118,7 @@ def test_batch_into_folder_of_logs_is_refused(tmp_path, monkeypatch) -> None:
     (tmp_path / "d" / "in").mkdir(parents=True)
     shutil.copy(SAMPLES / "aisle_uwb.ulg", "d/in/fleet.ulg")
     for logs in ("d", "d/in/fleet.ulg", "d/*/*.ulg"):
-        assert "-o d contains an input" in refused("batch", logs, "-o", "d")
+        assert "-o d contains an input" in error_line("batch", logs, "-o", "d")
 
 
 # --- the register ---

@@ -1,4 +1,4 @@
-"""Hostile input: whatever is handed in is a report or one sentence, in bounded memory."""
+"""Malicious PDFs: each is read as a report or rejected with one sentence, in bounded memory."""
 
 import io
 import json
@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from forgery import saved
+from forgery import pdf_bytes
 from pypdf import PdfWriter
 from pypdf.generic import (
     ArrayObject,
@@ -18,7 +18,7 @@ from pypdf.generic import (
     NumberObject,
     TextStringObject,
 )
-from results_tools import LOOP, decoded
+from results_tools import LOOP, decode_results
 
 from px4fuse.errors import ResultsError
 from px4fuse.results.contract import Reported, to_json
@@ -32,18 +32,20 @@ JSON = (ROOT / "reports" / "example" / "aisle_uwb.json").read_bytes()
 DAMAGED = "the PDF is damaged"
 
 
-def small(attached: bytes | None = JSON, edit=lambda writer: None, name="results.json") -> bytes:
-    """A PDF of one page with results attached, changed by ``edit``."""
+def small_report(
+    attached: bytes | None = JSON, edit=lambda writer: None, name="results.json"
+) -> bytes:
+    """Make a PDF of one page with attached results, changed by ``edit``."""
     writer = PdfWriter()
     writer.add_blank_page(100, 100)
     if attached is not None:
         writer.add_attachment(name, attached)
     edit(writer)
-    return saved(writer)
+    return pdf_bytes(writer)
 
 
-def raw(*objects: bytes, trailer: bytes = b"/Root 1 0 R") -> bytes:
-    """A PDF of objects as they stand, numbered from 1."""
+def raw_pdf(*objects: bytes, trailer: bytes = b"/Root 1 0 R") -> bytes:
+    """Make a PDF of raw objects, numbered from 1."""
     out, places = bytearray(b"%PDF-1.4\n"), []
     for number, content in enumerate(objects, start=1):
         places.append(len(out))
@@ -69,7 +71,7 @@ def with_attachment(embedded: bytes, file=b"/F (results.json) /EF << /F 5 0 R >>
     names = b"/Names << /EmbeddedFiles << /Names [(x) 6 0 R] >> >>"
     catalog = CATALOG.replace(b">>", names + b" >>")
     filespec = b"<< /Type /Filespec %b >>" % file
-    return raw(catalog, PAGES, PAGE, stream(b""), embedded, filespec)
+    return raw_pdf(catalog, PAGES, PAGE, stream(b""), embedded, filespec)
 
 
 def reason(pdf: bytes) -> str:
@@ -89,7 +91,7 @@ def dictionary(**entries: object) -> DictionaryObject:
 # ------------------------------------------------------------------ reports
 
 
-def test_the_real_report():
+def test_read_report_example_returns_its_results():
     report = read_report(REAL, "aisle_uwb.pdf")
     assert to_json(report).encode() == JSON
 
@@ -97,16 +99,16 @@ def test_the_real_report():
 @pytest.mark.parametrize(("pdf", "results"), [
     (lambda: with_attachment(stream(zlib.compress(JSON), b"/Type /EmbeddedFile " + FLATE)),
      json.loads(JSON)),
-    (lambda: small(json.dumps(LOOP).encode()), LOOP),
+    (lambda: small_report(json.dumps(LOOP).encode()), LOOP),
 ])  # fmt: skip
-def test_other_reports(pdf, results):
+def test_read_report_compressed_or_loop_returns_results(pdf, results):
     report = read_report(pdf(), "a\nb\u202e\x1b" * 10_000)
-    assert report == decoded(results)
+    assert report == decode_results(results)
 
 
-def test_a_report_that_was_saved_again():
+def test_read_report_resaved_returns_same_results():
     writer = PdfWriter(clone_from=io.BytesIO(REAL))
-    again = read_report(saved(writer), "r.pdf")
+    again = read_report(pdf_bytes(writer), "r.pdf")
     assert to_json(again).encode() == JSON
     changed = read_report(REAL.replace(b"/Title", b"/Titlf"), "r.pdf")
     assert to_json(changed).encode() == JSON
@@ -122,21 +124,21 @@ def test_a_report_that_was_saved_again():
     (REAL[:300_000] + b"\n%%EOF\n", DAMAGED),
     (b"%PDF-1.4\nstartxref\n5\n%%EOF", DAMAGED),
     (b"%PDF-1.4\n" + bytes(pdf_input.MAX_BYTES), "larger than 25 MB"),
-    (small(None), "printed to PDF, which removes attachments. Hand in the original"),
+    (small_report(None), "printed to PDF, which removes attachments. Hand in the original"),
     (
-        small(name="../../results.json"),
+        small_report(name="../../results.json"),
         "name of the attached file is '../../results.json', not 'results.json'",
     ),
-    (small(name="C:\\results.json"), "the name of the attached file is"),
-    (small(name="\u202ex\x1b[2J" * 50), "the name of the attached file is"),
-    (small(edit=lambda w: w.add_attachment("results.json", b"{}")), "several attachments"),
-    (raw(CATALOG, b"<< /Type /Pages /Kids [] /Count 0 >>"), "the PDF has no pages"),
+    (small_report(name="C:\\results.json"), "the name of the attached file is"),
+    (small_report(name="\u202ex\x1b[2J" * 50), "the name of the attached file is"),
+    (small_report(edit=lambda w: w.add_attachment("results.json", b"{}")), "several attachments"),
+    (raw_pdf(CATALOG, b"<< /Type /Pages /Kids [] /Count 0 >>"), "the PDF has no pages"),
 ], ids=range(12))  # fmt: skip
-def test_what_is_no_report(pdf, said):
+def test_read_report_unsuitable_file_states_reason(pdf, said):
     assert said in reason(pdf)
 
 
-def test_two_streams_under_one_name():
+def test_read_report_ambiguous_attachment_is_rejected():
     embedded = stream(JSON, b"/Type /EmbeddedFile")
     two = with_attachment(embedded, b"/F (results.json) /EF << /F 5 0 R /UF 4 0 R >>")
     assert "several attachments" in reason(two)
@@ -145,28 +147,30 @@ def test_two_streams_under_one_name():
 
 
 @pytest.mark.parametrize("algorithm", ["RC4-128", "RC4-40"])
-def test_encrypted(algorithm):
+def test_read_report_encrypted_is_rejected(algorithm):
     for password in ("", "secret"):
-        encrypted = small(edit=lambda writer, p=password: writer.encrypt(p, algorithm=algorithm))
+        encrypted = small_report(
+            edit=lambda writer, p=password: writer.encrypt(p, algorithm=algorithm)
+        )
         assert "encrypted" in reason(encrypted)
-    for key in (b"/Encrypt", b"/#45ncrypt"):  # the second is damaged: nobody would write it so
+    for key in (b"/Encrypt", b"/#45ncrypt"):  # the second one is a damaged key
         trailer = b"/Root 1 0 R %b << /Filter /X >>" % key
-        said = reason(raw(CATALOG, PAGES, PAGE, stream(b""), trailer=trailer))
+        said = reason(raw_pdf(CATALOG, PAGES, PAGE, stream(b""), trailer=trailer))
         assert "encrypted" in said or DAMAGED in said
 
 
 @pytest.mark.parametrize("count", [101, 3000])
-def test_too_many_pages(count):
+def test_read_report_too_many_pages_are_rejected(count):
     kids = b"<< /Type /Pages /Kids [%b] /Count 1 >>" % (b"3 0 R " * 30 * count)
-    assert reason(raw(CATALOG, kids, PAGE))
+    assert reason(raw_pdf(CATALOG, kids, PAGE))
 
     writer = PdfWriter()
     for _ in range(count):
         writer.add_blank_page(9, 9)
-    assert reason(saved(writer))
+    assert reason(pdf_bytes(writer))
 
 
-# ------------------------------------------------------------------ what acts
+# ------------------------------------------------------------------ actions
 
 
 def on_root(key: str, value: object):
@@ -188,8 +192,8 @@ TEXT = TextStringObject("x")
 OPENS = dictionary(S=NameObject("/URI"), URI=TextStringObject("http://x"))
 
 
-def by_itself_and_by_a_click(writer: PdfWriter) -> None:
-    """One action, of a link and of a page that is opened."""
+def link_and_page_action(writer: PdfWriter) -> None:
+    """Use one action for a link and for opening a page."""
     opens = writer._add_object(OPENS)
     annotation(Subtype=NameObject("/Link"), A=opens)(writer)
     turned = dictionary(O=opens)
@@ -202,7 +206,7 @@ ACTS = {
     "an action that opens": on_root(
         "/OpenAction", dictionary(S=NameObject("/GoTo"), Next=ArrayObject([OPENS]))
     ),
-    "an action that": by_itself_and_by_a_click,
+    "an action that": link_and_page_action,
     "JavaScript": on_root("/Open#41ction", action("JavaScript", JS=TEXT)),
     "contains JavaScript": on_root("/Names", dictionary(JavaScript=dictionary())),
     "contains JS, JavaScript": on_root("/AA", dictionary(WC=action("JavaScript", JS=TEXT))),
@@ -220,9 +224,9 @@ ACTS = {
 
 
 @pytest.mark.parametrize(("said", "edit"), ACTS.items(), ids=ACTS)
-def test_what_acts_is_named(edit, said):
-    assert said in reason(small(edit=edit))
-    assert "the PDF contains" in reason(small(edit=edit))
+def test_read_report_with_action_is_rejected(edit, said):
+    assert said in reason(small_report(edit=edit))
+    assert "the PDF contains" in reason(small_report(edit=edit))
 
 
 @pytest.mark.parametrize("edit", [
@@ -232,9 +236,9 @@ def test_what_acts_is_named(edit, said):
     annotation(Subtype=NameObject("/Link"), A=action("URI", URI=TEXT)),
     annotation(Subtype=NameObject("/FreeText")),
 ], ids=range(5))  # fmt: skip
-def test_what_programs_add_that_save_a_report_is_read(edit):
-    """Nothing of it is followed, and the pages are drawn again."""
-    report = read_report(small(edit=edit), "r.pdf")
+def test_read_report_harmless_additions_are_ignored(edit):
+    """Other programs add these entries when they save a report."""
+    report = read_report(small_report(edit=edit), "r.pdf")
     assert to_json(report).encode() == JSON
 
 
@@ -242,7 +246,7 @@ def test_what_programs_add_that_save_a_report_is_read(edit):
 
 
 def bomb(size: int, entries: bytes = b"/Type /EmbeddedFile ") -> bytes:
-    """Zeros, of which a million is packed once: to pack a gigabyte takes seconds."""
+    """Make a compressed stream of zeros by repeating one compressed megabyte."""
     count = size // 1_000_000
     squeeze = zlib.compressobj(9, wbits=-zlib.MAX_WBITS)
     million = squeeze.compress(bytes(1_000_000)) + squeeze.flush(zlib.Z_FULL_FLUSH)
@@ -252,11 +256,11 @@ def bomb(size: int, entries: bytes = b"/Type /EmbeddedFile ") -> bytes:
 
 
 def content_bomb(size: int) -> bytes:
-    return raw(CATALOG, PAGES, PAGE, bomb(size, b""))
+    return raw_pdf(CATALOG, PAGES, PAGE, bomb(size, b""))
 
 
 def stream_bomb(kind: bytes) -> bytes:
-    """A bomb in a stream that pypdf inflates before anybody asks."""
+    """Make a bomb in a stream that pypdf decompresses when it opens the file."""
     body = b"%PDF-1.5\n1 0 obj\n" + bomb(
         1_000_000_000, b"/Type /%b /Size 9 /W [1 2 1] /N 9 /First 9 /Root 2 0 R " % kind
     )
@@ -269,11 +273,11 @@ def stream_bomb(kind: bytes) -> bytes:
     (with_attachment(stream(bytes(6_000_000), b"/Type /EmbeddedFile")), "larger than 5 MB"),
     (content_bomb(1_000_000_000), "expands to more"),
     (content_bomb(30_000_000), "expands to more"),
-    (raw(CATALOG, *[bomb(15_000_000, b"")] * 8), "expands to more"),
+    (raw_pdf(CATALOG, *[bomb(15_000_000, b"")] * 8), "expands to more"),
     (stream_bomb(b"XRef"), "expands to more"),
     (stream_bomb(b"ObjStm"), "expands to more"),
 ], ids=range(8))  # fmt: skip
-def test_bombs_take_little_memory(pdf, said):
+def test_read_report_compression_bomb_takes_little_memory(pdf, said):
     tracemalloc.start()
     found, peak = reason(pdf), tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -285,15 +289,15 @@ def test_bombs_take_little_memory(pdf, said):
     b"/Filter [" + b"/FlateDecode " * 20 + b"]", b"/Filter [/FlateDecode /FlateDecode]",
     b"/Filter /LZWDecode", b"/Filter /Invented", b"/Filter [/DCTDecode /DCTDecode]", b"/Filter 7",
 ])  # fmt: skip
-def test_other_filters(filters):
+def test_read_report_other_compression_is_rejected(filters):
     attached = with_attachment(stream(zlib.compress(JSON), b"/Type /EmbeddedFile " + filters))
     assert "a stream with other compression" in reason(attached)
-    content = raw(CATALOG, PAGES, PAGE, stream(b"x", filters))
+    content = raw_pdf(CATALOG, PAGES, PAGE, stream(b"x", filters))
     assert "a stream with other compression" in reason(content)
 
 
-def test_stream_words_that_make_us_try_again_and_again():
-    # each try inflates what follows; all of them pay from one purse
+def test_read_report_many_stream_keywords_are_rejected():
+    # each keyword starts a decompression; all share one limit
     stored = b"".join(b"stream\x78\x01\x00" + b"\x00\x00\xff\xff\x00" * 3 for _ in range(200_000))
     assert reason(b"%PDF-1.4\n" + stored + b"%%EOF")
 
@@ -302,24 +306,24 @@ def test_stream_words_that_make_us_try_again_and_again():
 
 
 @pytest.mark.parametrize("pdf", [
-    raw(CATALOG, b"<< /Type /Pages /Kids [3 0 R] >>", b"<< /Type /Pages /Kids [2 0 R] >>"),
-    raw(CATALOG, b"3 0 R", b"2 0 R"),
-    raw(CATALOG, PAGES, PAGE, trailer=b""),
-    raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev -5"),
-    raw(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev " + b"9" * 6000),
-    raw(CATALOG, b"<</A" * 100_000),
-    raw(CATALOG, PAGES, PAGE, b"<< /Length 4 0 R >>\nstream\nx\nendstream"),
-    raw(CATALOG, PAGES, b"<< /Type /Page /Contents [%b] >>" % (b"4 0 R " * 9000), stream(b"q")),
-    raw(CATALOG, PAGES, PAGE, stream(b"(" * 5000 + b"[" * 5000 + b"<<" * 5000)),
+    raw_pdf(CATALOG, b"<< /Type /Pages /Kids [3 0 R] >>", b"<< /Type /Pages /Kids [2 0 R] >>"),
+    raw_pdf(CATALOG, b"3 0 R", b"2 0 R"),
+    raw_pdf(CATALOG, PAGES, PAGE, trailer=b""),
+    raw_pdf(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev -5"),
+    raw_pdf(CATALOG, PAGES, PAGE, trailer=b"/Root 1 0 R /Prev " + b"9" * 6000),
+    raw_pdf(CATALOG, b"<</A" * 100_000),
+    raw_pdf(CATALOG, PAGES, PAGE, b"<< /Length 4 0 R >>\nstream\nx\nendstream"),
+    raw_pdf(CATALOG, PAGES, b"<< /Type /Page /Contents [%b] >>" % (b"4 0 R " * 9000), stream(b"q")),
+    raw_pdf(CATALOG, PAGES, PAGE, stream(b"(" * 5000 + b"[" * 5000 + b"<<" * 5000)),
     b"%PDF-1.4\nxref\n0 99999999\ntrailer\n<< >>\nstartxref\n9\n%%EOF",
     b"%PDF-1.4\n" + b"startxref\n9\n%%EOF\n" * 20_000,
 ], ids=range(11))  # fmt: skip
-def test_broken_structure(pdf):
+def test_read_report_broken_structure_is_rejected(pdf):
     assert reason(pdf)
 
 
-def test_object_streams():
-    """An object stream that holds itself, or what it does not say."""
+def test_read_report_invalid_object_stream_is_rejected():
+    """Object streams that contain themselves or have wrong offsets."""
     for offsets in (b"1 0 2 9 ", b"5 0 5 3 ", b"1 99 ", b"x y "):
         packed = stream(offsets + CATALOG + PAGES, b"/Type /ObjStm /N 2 /First 8")
         body = b"%PDF-1.5\n5 0 obj\n" + packed + b"\nendobj\n"
@@ -329,16 +333,16 @@ def test_object_streams():
         assert reason(pdf)
 
 
-def test_references_to_nothing_are_not_searched_for():
+def test_read_report_many_undefined_references_are_rejected():
     refer = b"".join(b"%d 0 R " % number for number in range(100, 20_000))
-    pdf = raw(b"<< /Type /Catalog /Pages 2 0 R /X [%b] >>" % refer, PAGES, PAGE, stream(b""))
+    pdf = raw_pdf(b"<< /Type /Catalog /Pages 2 0 R /X [%b] >>" % refer, PAGES, PAGE, stream(b""))
     assert "more memory or time" in reason(pdf)
 
 
-def test_too_many_objects():
+def test_read_report_too_many_objects_are_rejected():
     catalog = b"<< /Type /Catalog /Pages 2 0 R /X 5 0 R >>"
     listed = b"[%b]" % b"".join(b"%d 0 R " % number for number in range(6, 25_000))
-    many = raw(catalog, PAGES, PAGE, stream(b""), listed, *[b"null"] * 24_995)
+    many = raw_pdf(catalog, PAGES, PAGE, stream(b""), listed, *[b"null"] * 24_995)
     assert "more memory or time" in reason(many)
 
 
@@ -349,19 +353,21 @@ def changed(**entries: object) -> bytes:
     return json.dumps(json.loads(JSON) | entries).encode()
 
 
-def test_texts_are_cleaned():
+def test_read_report_removes_control_characters():
     student = {"name": "Zoë \u202eevil\u2066 李\x1b[31m", "id": "=1+1", "notes": "a\n\tb\x07"}
-    report = read_report(small(changed(student=student)), "r.pdf")
+    report = read_report(small_report(changed(student=student)), "r.pdf")
     assert report.student == Student("Zoë evil 李[31m", "=1+1", "a\n\tb")
 
 
-# ------------------------------------------------------------------ anything at all
+# ------------------------------------------------------------------ other types
 
 
-def test_other_objects_that_pypdf_may_meet():
-    """Values of a kind that no reader expects, at every key that intake looks at."""
+def test_read_report_unexpected_types_are_read_or_rejected():
+    """Values of unexpected types at each key that read_report uses."""
     odd = [NumberObject(7), TEXT, ArrayObject(), dictionary(), DecodedStreamObject()]
     for key in ("/Names", "/Pages", "/Outlines", "/Metadata", "/S", "/Filter", "/EF", "/Annots"):
         for value in odd:
             with suppress(ResultsError):
-                assert isinstance(read_report(small(edit=on_root(key, value)), "r.pdf"), Reported)
+                assert isinstance(
+                    read_report(small_report(edit=on_root(key, value)), "r.pdf"), Reported
+                )

@@ -13,14 +13,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from class_tools import in_this_process
-from cli_tools import done, refused
+from cli_tools import error_line, run_checked
 from conftest import LOG
 
 import px4fuse
 from px4fuse.api import COLUMNS
 from px4fuse.results.reading import read_results
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_import_loads_no_library() -> None:
 @pytest.mark.usefixtures("no_drawing")
 def test_find_equals_findings_of_command_line(sample_log, analysis, tmp_path):
     command = "compare", sample_log, "--sigma-z", "0.2", "--json", "-", "-o", tmp_path / "r.pdf"
-    told = json.loads(done(*command).stdout)["findings"]
+    told = json.loads(run_checked(*command).stdout)["findings"]
     typed = [(f["id"], f["message"], f["remedy"]) for f in told]
     found = px4fuse.find(analysis)
     assert [(f.id, f.message, f.remedy) for f in found] == typed
@@ -115,7 +115,7 @@ def test_compare_invalid_arguments_are_rejected(analysis, arguments, said):
 def test_errors_name_arguments_or_options(sample_log):
     with pytest.raises(px4fuse.Px4FuseError, match=r"^`clock_offset_s` 99 is out of range"):
         px4fuse.Settings(clock_offset_s=99.0)
-    said = refused("tune", sample_log, "--clock-offset", 99.0)
+    said = error_line("tune", sample_log, "--clock-offset", 99.0)
     assert said.startswith("--clock-offset 99 is out of range")
 
 
@@ -136,7 +136,7 @@ def test_table_has_the_numbers_of_the_results(analysis) -> None:
 
 def test_table_filter_without_innovations_is_nan(analysis) -> None:
     row = px4fuse.table(analysis).loc[("down", "ekf2")]
-    assert row[["count", "nis_mean", "nis_low", "nis_high", "sigma_factor"]].isna().all()
+    assert row[["count", "nis_mean", "nis_low", "nis_high", "sigma_ratio"]].isna().all()
     assert row["verdict"] == ""
     assert row["position_rmse_m"] == analysis["down"].filters["ekf2"].truth.position_rmse_m
 
@@ -183,7 +183,7 @@ def test_what_if_noise_changes_the_mean_nis(analysis) -> None:
 # -- files -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("drawn_once")
+@pytest.mark.usefixtures("cached_pages")
 def test_report_and_page_are_written_as_by_the_commands(
     analysis: px4fuse.Analysis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -197,7 +197,7 @@ def test_report_and_page_are_written_as_by_the_commands(
     results = read_results((tmp_path / "x.json").read_bytes())
     assert results.request.sigma_z_m == 0.2
     assert results.provenance.command == "px4fuse compare aisle_uwb.ulg --sigma-z 0.2"
-    done("verify", report, LOG)
+    run_checked("verify", report, LOG)
 
 
 def test_write_wrong_suffix_or_no_request_is_rejected(

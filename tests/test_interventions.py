@@ -29,7 +29,7 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.summary import summarise_flight
+from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
@@ -82,9 +82,9 @@ def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of
     assert found.change.keys() == change.keys()
     for name, (value, within) in change.items():
         assert found.change[name] == pytest.approx(value, abs=within)
-    assert found.is_enough
+    assert found.needs_no_other
     # the summary names the re-run of this filter
-    told = summarise_flight(analysis, find(analysis))[0]
+    told = summarise(analysis, find(analysis))[0]
     ekf2, kf_case = told.split("Along the aisle KF ")
     assert "Re-run with " in (kf_case if owner == "kf" else ekf2)
 
@@ -102,9 +102,9 @@ def test_ekf2_changes_vibration_raises_noise_to_px4_limit() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
-    assert found.explains > 0.5
+    assert found.explained_fraction > 0.5
     told = "Re-run with EKF2_ACC_NOISE 1 m/s² instead of 0.35 m/s²: mean NIS "
-    assert told in summarise_flight(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
+    assert told in summarise(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
 
 
@@ -117,7 +117,7 @@ def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
     assert again.change == pytest.approx(before.change, abs=0.01)
     assert again.after == pytest.approx(before.after, rel=0.05)
     told = f"EKF2 has .* Re-run with timestamps corrected \\({offset_s:.2g} s early\\)"
-    ekf2 = summarise_flight(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
+    ekf2 = summarise(analysis, find(analysis))[0].split("Along the aisle KF ")[0]
     assert re.search(told, ekf2)
 
 
@@ -136,7 +136,9 @@ def test_kf_rerun_equals_comparison_with_the_change(analysis, of) -> None:
     assert found.before == statistic(analysis)
     # the re-run's NEES is at KF's steps, that of the comparison at EKF2's sample times
     assert found.after == pytest.approx(statistic(again), rel=1e-6 if of == "nis" else 0.1)
-    assert found.explains == pytest.approx(1.0 - np.log(found.after) / np.log(found.before))
+    assert found.explained_fraction == pytest.approx(
+        1.0 - np.log(found.after) / np.log(found.before)
+    )
 
 
 def test_ekf2_rerun_equals_what_if() -> None:
@@ -156,30 +158,32 @@ def test_ekf2_rerun_equals_what_if() -> None:
     assert not once.updates.equals(other.updates)
 
 
-rms_difference = attrgetter("main.difference.position_rmse_m")
+rms_difference = attrgetter("main.difference.position_rms_m")
 
 
 def test_cause_has_difference_before_and_after() -> None:
     kf_case = flown(sigma_a=0.02)
     right = compare(kf_case.flight, replace(kf_case.settings, **cause(kf_case, "kf").change))
-    (row,) = [one for one in kf_case.causes if (one.of, one.axis) == ("apart", "aisle")]
+    (row,) = [one for one in kf_case.causes if (one.statistic, one.axis) == ("difference", "aisle")]
     assert (row.before, row.after) == pytest.approx(
         (rms_difference(kf_case), rms_difference(right))
     )
     assert row.change == cause(kf_case, "kf").change
-    assert row.explains == pytest.approx(1.0 - (row.after / row.before) ** 2)
-    assert row.explains > 0.8
+    assert row.explained_fraction == pytest.approx(1.0 - (row.after / row.before) ** 2)
+    assert row.explained_fraction > 0.8
     reduction = "Re-run of KF with this correction: difference KF - EKF2 0.24 → "
-    assert reduction in summarise_flight(kf_case, find(kf_case))[1]
+    assert reduction in summarise(kf_case, find(kf_case))[1]
     # corrected EKF2 differs from KF as much as EKF2 in the same flight without the mistake
     ekf2_case = flown("ekf2-gate=1", passes=6)
     right = compare(simulate_flight(Scenario(seed=5)), RIGHT)
-    (row,) = [one for one in ekf2_case.causes if (one.of, one.axis) == ("apart", "aisle")]
+    (row,) = [
+        one for one in ekf2_case.causes if (one.statistic, one.axis) == ("difference", "aisle")
+    ]
     assert (row.before, row.after) == pytest.approx(
         (rms_difference(ekf2_case), rms_difference(right)), rel=0.1
     )
     reduction = "Re-run of EKF2 with this correction: difference KF - EKF2 "
-    assert reduction in summarise_flight(ekf2_case, find(ekf2_case))[1]
+    assert reduction in summarise(ekf2_case, find(ekf2_case))[1]
 
 
 def test_outliers_are_excluded_at_shifted_timestamps() -> None:
@@ -187,8 +191,8 @@ def test_outliers_are_excluded_at_shifted_timestamps() -> None:
     count = cause(analysis, "ekf2").change[OUTLIERS]
     rows = [one for one in analysis.causes if one.filter == "ekf2" and one.axis == "aisle"]
     alone = next(one for one in rows if one.change == {OUTLIERS: count})
-    assert alone.of == "nis"
-    assert alone.brings_into_band
+    assert alone.statistic == "nis"
+    assert alone.is_sufficient
     model, out = analysis.ekf2_model, analysis.tuning["horizontal"]
     (bare,) = replay_settings(model, [{}], out.outlier_time_s)
     (late,) = replay_settings(
@@ -208,15 +212,15 @@ def test_ekf2_changes_include_non_default_parameter() -> None:
     model = replace(analysis.ekf2_model, inputs=inputs)
     rows = interventions(analysis, analysis.tuning, analysis.clock, analysis.heading,
                          analysis.bias_scale_jump_fit, model)  # fmt: skip
-    tried = [one.change for one in rows if (one.axis, one.of) == ("aisle", "nis")]
+    tried = [one.change for one in rows if (one.axis, one.statistic) == ("aisle", "nis")]
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
 def test_is_cause_requires_half_to_one_and_a_half() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
         return Intervention(
-            of="nis", filter="kf", axis="aisle", change=change, before=9.0,
-            after=9.0 ** (1.0 - explains), explains=explains, brings_into_band=into,
+            statistic="nis", filter="kf", axis="aisle", change=change, before=9.0,
+            after=9.0 ** (1.0 - explains), explained_fraction=explains, is_sufficient=into,
         )  # fmt: skip
 
     for explains in (MIN_EXPLAINED_SHARE - 0.01, 1.51, -1.0):
@@ -251,8 +255,8 @@ def test_candidate_without_required_data_is_skipped() -> None:
     assert tried(model=missing) == {("kf", "sigma_z_m"), ("kf", OUTLIERS)}
     assert tried(tuning={}) == set()
     turned = HeadingError(
-        turn_deg=2.9, sigma_deg=1.0, drifts=False, parts=(), drift_p=1.0, by="positions"
+        misalignment_deg=2.9, sigma_deg=1.0, drifts=False, parts=(), drift_p=1.0, by="positions"
     )
     assert tried(heading=turned, tuning={}) == set()
-    turned = replace(turned, turn_deg=3.1)
+    turned = replace(turned, misalignment_deg=3.1)
     assert tried(heading=turned, tuning={}) == {("kf", TURN), ("ekf2", TURN)}

@@ -1,4 +1,4 @@
-"""Two recordings of one flight become one; recordings of two flights do not."""
+"""Joining of two recordings of one flight; recordings of two flights are refused."""
 
 import numpy as np
 import pandas as pd
@@ -23,7 +23,7 @@ def tlog_flight(sample_log) -> Flight:
 
 @pytest.fixture(scope="module")
 def stripped(sample_log, tmp_path_factory) -> Flight:
-    """The sample ULog as SDLOG_PROFILE 1 on v1.15 would have left it: no position topics."""
+    """Sample ULog without position topics, as with SDLOG_PROFILE 1 on v1.15."""
     log = load(sample_log)
     log.drop(*(name for name in log.names() if name.startswith(POSITION_TOPICS)))
     path = tmp_path_factory.mktemp("stripped") / "stripped.ulg"
@@ -45,9 +45,7 @@ def record(tmp_path):
 # ---- the sample -------------------------------------------------------------------------------
 
 
-def test_a_ulog_without_positions_gets_them_back_and_keeps_what_it_has(
-    stripped, tlog_flight, sample_flight
-):
+def test_join_ulog_without_positions_gets_tlog_positions(stripped, tlog_flight, sample_flight):
     assert "vehicle_visual_odometry" not in [t.name for t in stripped.positions]
     joined = join(stripped, tlog_flight)
     assert joined.positions[0].name == "VISION_POSITION_ESTIMATE"
@@ -68,14 +66,14 @@ def test_a_ulog_without_positions_gets_them_back_and_keeps_what_it_has(
     assert joined.ekf2.state is stripped.ekf2.state
     assert joined.streams["imu"].log == "stripped.ulg"
     assert joined.log.senders == tlog_flight.log.senders
-    set_back = replace(tlog_flight, log=replace(tlog_flight.log, receipt_went_back=3))
-    assert join(stripped, set_back).log.receipt_went_back == 3
+    set_back = replace(tlog_flight, log=replace(tlog_flight.log, receive_time_reversals=3))
+    assert join(stripped, set_back).log.receive_time_reversals == 3
     [given] = joined.inputs
     assert (given.name, given.role) == ("aisle_uwb.tlog", "mavlink")
     assert given.sha256 == tlog_flight.log.sha256
 
 
-def test_either_way_round_says_the_same_on_the_boot_clock(sample_flight, tlog_flight):
+def test_join_in_either_order_gives_equal_boot_times(sample_flight, tlog_flight):
     one, other = join(sample_flight, tlog_flight), join(tlog_flight, sample_flight)
     note = one.log.notes[-1]
     for said in ("joined with aisle_uwb.tlog", "129.7 s in common", "differ by 0.001 m (median)"):
@@ -86,15 +84,15 @@ def test_either_way_round_says_the_same_on_the_boot_clock(sample_flight, tlog_fl
     for name in ("vehicle_visual_odometry", "VISION_POSITION_ESTIMATE"):
         first, second = track_of(one, name).samples, track_of(other, name).samples
         np.testing.assert_allclose(boot(one, first), boot(other, second), atol=1e-6)
-    # MAVLink does not carry innovations, and only a lacking estimator is replaced
+    # MAVLink contains no innovations, and an existing EKF2 is not replaced
     assert isinstance(other.ekf2.innovations["north"], Unavailable)
 
 
 # ---- made recordings ----------------------------------------------------------------------------
 
 
-def test_every_part_that_lacks_is_taken_and_moved(record):
-    """The other recording began five seconds later."""
+def test_join_missing_parts_are_copied_with_time_shift(record):
+    """The second recording starts 5 s later."""
     left_out = "HIGHRES_IMU", "ATTITUDE_QUATERNION", "EXTENDED_SYS_STATE", "ODOMETRY"
     bare = record(Aisle(uwb=None), "bare.tlog", *left_out)
     assert bare.log.duration_s == 0.0 or isinstance(bare.imu, Unavailable)
@@ -113,7 +111,7 @@ def test_every_part_that_lacks_is_taken_and_moved(record):
     assert "not verified that both are of the same flight" in joined.log.notes[-1]
 
 
-def test_times_in_records_move_too(sample_flight):
+def test_shift_times_moves_times_inside_records(sample_flight):
     ekf2 = replace(sample_flight.ekf2, instances=((0.0, 0), (9.0, 1)), gate=5.0)
     ekf2 = replace(ekf2, resets=(Reset(3.0, "position", (1.0, 0.0, 0.0)),))
     moved = shift_times(ekf2, 2.5)
@@ -123,8 +121,8 @@ def test_times_in_records_move_too(sample_flight):
     assert shift_times((FlightMode(1.0, 2.0, "Land"),), 2.5) == (FlightMode(3.5, 4.5, "Land"),)
 
 
-def test_missing_names_what_still_lacks_and_nothing_else(record):
-    """An estimator that was taken brings what it lacks with it."""
+def test_join_missing_lists_remaining_parts_only(record):
+    """Parts that the copied EKF2 lacks are listed."""
     bare = record(Aisle(uwb=None), "bare.tlog", "ODOMETRY", "HIGHRES_IMU")
     full = record(Aisle(), "full.tlog")
     assert {"EKF2", "IMU"} <= {part.what for part in bare.missing}
@@ -139,7 +137,7 @@ def test_missing_names_what_still_lacks_and_nothing_else(record):
 
 
 @pytest.mark.parametrize("earlier_s", [0.0, 10.0])
-def test_senders_and_unix_time_are_taken_at_the_first_recordings_zero(record, earlier_s):
+def test_join_copies_senders_and_shifts_unix_time(record, earlier_s):
     ulog = aisle_flight(duration_s=60.0, ekf2=None, attitude_hz=None)
     ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S - earlier_s))
     flight = record(Aisle(system_time=True))
@@ -152,7 +150,7 @@ def test_senders_and_unix_time_are_taken_at_the_first_recordings_zero(record, ea
 # ---- refusals -----------------------------------------------------------------------------------
 
 
-def test_recordings_that_do_not_overlap_are_refused_with_both_spans(record):
+def test_join_without_overlap_names_both_spans(record):
     first = record(Aisle(seconds=20.0), "first.tlog")
     second = record(Aisle(seconds=20.0, start_s=BOOT_S + 30.0), "second.tlog")
     said = r"first.tlog and second.tlog do not overlap.*50.0 s to 70.0 s.*80.0 s to 100.0 s"
@@ -160,7 +158,7 @@ def test_recordings_that_do_not_overlap_are_refused_with_both_spans(record):
         join(first, second)
 
 
-def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
+def test_join_other_flight_is_refused_by_positions(sample_flight, tlog_flight):
     moved = replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0)
     with pytest.raises(
         MissingDataError, match="are different flights: their EKF2 positions differ"
@@ -169,7 +167,7 @@ def test_another_flight_is_refused_by_its_positions(sample_flight, tlog_flight):
 
 
 @pytest.mark.reallogs
-def test_two_flights_whose_boot_clocks_overlap_are_told_apart(shared_logs, sample_flight):
+def test_join_other_flight_with_same_boot_time_is_refused(shared_logs, sample_flight):
     other = read_log(shared_logs / "mavlink" / "v1.16.1_aisle_clock_nosync.tlog")
     other = replace(other, log=replace(other.log, boot_time_s=sample_flight.log.boot_time_s))
     with pytest.raises(MissingDataError, match="different flights"):

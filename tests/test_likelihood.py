@@ -1,4 +1,4 @@
-"""The vectorised filter against the filterpy replay, and the noise that the data ask for."""
+"""Fast filter against the filterpy replay, and likelihoods of the noises."""
 
 import numpy as np
 import pandas as pd

@@ -1,4 +1,4 @@
-"""Loops: the sample flight against its truth, and laps with known drift and false closures."""
+"""Loops: the sample flight against ground truth, and laps with known drift and closures."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from conftest import REPOSITORY
 from exchange import replace
 from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
-from trajectory_tools import drifted, square
+from trajectory_tools import noisy_odometry, square
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop
@@ -42,16 +42,16 @@ def sample_loop(sample: LoopSource) -> Loop:
     return analyse(sample, reference=read_source(str(SLAM)).trajectory)
 
 
-def loop_of(source: LoopSource, reference: Trajectory | None = None, **how: Any) -> Loop:
+def analyse_loop(source: LoopSource, reference: Trajectory | None = None, **how: Any) -> Loop:
     return analyse(source, LoopRequest(source="", **how), reference)
 
 
 def close_loop(trajectory: Trajectory, **how: Any) -> Loop:
-    return loop_of(LoopSource(trajectory, None), **how)
+    return analyse_loop(LoopSource(trajectory, None), **how)
 
 
 def path(loop: Loop, way: Any) -> Any:
-    """The path that was corrected in this way; a pose graph's by the name of its solution."""
+    """Return the corrected path by the name of the correction or of the pose graph solution."""
     return loop.corrections.get(way) or loop.corrections[f"pose_graph_{way}"]  # type: ignore[index]
 
 
@@ -63,7 +63,7 @@ def rmse(loop: Loop, way: str, index: int = 0) -> float:
     return score(loop, way, index).ate.translation_m.rmse
 
 
-def missed(loop: Loop) -> np.ndarray:
+def closure_error_vector_m(loop: Loop) -> np.ndarray:
     return np.array(list(loop.closure_error_axes_m.values()))
 
 
@@ -71,7 +71,7 @@ def missed(loop: Loop) -> np.ndarray:
 
 
 def true_closure_error_m() -> float:
-    """How far the odometry is from the vehicle at its landing, straight from the log's topics."""
+    """Return the odometry error at landing, computed from the topics of the log."""
     topics = {topic.name: topic.data for topic in ULog(str(SAMPLE)).data_list}
     landed = topics["vehicle_land_detected"]
     changes = np.diff(landed["landed"].astype(int))
@@ -91,7 +91,7 @@ def true_closure_error_m() -> float:
     return float(np.linalg.norm(moved[0] - moved[1]))
 
 
-def test_the_samples_closure_error_is_the_true_one(sample_loop: Loop) -> None:
+def test_loop_sample_closure_error_equals_ground_truth(sample_loop: Loop) -> None:
     assert sample_loop.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.02)
     assert sample_loop.closure_error_m == pytest.approx(1.42, abs=0.05)  # sample_logs/README.md
     assert sample_loop.path_length_m == pytest.approx(87.7, abs=1.5)
@@ -100,12 +100,12 @@ def test_the_samples_closure_error_is_the_true_one(sample_loop: Loop) -> None:
     assert sample_loop.part_reason == "from take-off to landing, by the land detector"
 
 
-def test_both_corrections_bring_the_sample_closer_and_end_where_the_vehicle_did(sample_loop):
-    for reference in (0, 1):  # truth and SLAM
+def test_loop_sample_corrections_reduce_ate_and_end_error(sample_loop):
+    for reference in (0, 1):  # ground truth and SLAM
         before = rmse(sample_loop, "uncorrected", reference)
         for way in ("by_distance", "gated"):
             assert rmse(sample_loop, way, reference) < 0.8 * before
-    end = sample_loop.known_end.displacement
+    end = sample_loop.true_end.displacement
     for way, within in (("by_distance_plain", 1e-9), ("by_distance", 1e-9), ("gated", 0.02)):
         position = path(sample_loop, way).trajectory.position_m
         assert np.linalg.norm(position[-1] - position[0] - end) < within
@@ -115,10 +115,10 @@ def test_both_corrections_bring_the_sample_closer_and_end_where_the_vehicle_did(
         assert robust.reason == SINGLE_LOOP
 
 
-def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
+def test_loop_lesson_example_2_equals_lesson_output() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
-    error, total = missed(found), found.path_length_m
+    error, total = closure_error_vector_m(found), found.path_length_m
     corrected = path(found, "by_distance_plain").trajectory.position_m
     assert list(loop_lines()) == [
         f"loop closure error ({error[0]:.1f}, {error[1]:.1f}) m over {total:.1f} m = "
@@ -130,18 +130,20 @@ def test_example_2_through_the_loop_is_the_lessons_digit_for_digit() -> None:
     ]
 
 
-def test_the_plain_correction_moves_each_pose_by_its_share_and_turns_none(sample_loop) -> None:
+def test_by_distance_plain_shifts_positions_linearly(sample_loop) -> None:
     plain, odometry = path(sample_loop, "by_distance_plain"), sample_loop.odometry.trajectory
     share = sample_loop.distance_m / sample_loop.distance_m[-1]
     moved = odometry.position_m - plain.trajectory.position_m
-    np.testing.assert_allclose(moved, np.outer(share, missed(sample_loop)), atol=1e-12)
+    np.testing.assert_allclose(
+        moved, np.outer(share, closure_error_vector_m(sample_loop)), atol=1e-12
+    )
     assert plain.trajectory.rotation is odometry.rotation
 
 
-def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop) -> None:
-    """The sample's heading drifts: over 10 m only the one that turns is as good as the odometry."""
+def test_by_distance_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> None:
+    """The sample's heading drifts, so a correction of positions only increases the RPE."""
     over = [
-        next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_words == "10 m")
+        next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_text == "10 m")
         for way in ("uncorrected", "by_distance", "by_distance_plain")
     ]
     before, turned, plain = (e.rmse for e in over if isinstance(e, Statistics))
@@ -149,9 +151,9 @@ def test_headings_too_keep_the_shape_that_positions_alone_bend(sample_loop: Loop
     assert plain > 1.1 * before
 
 
-def test_without_a_known_heading_there_is_one_correction_by_distance(sample, sample_loop) -> None:
+def test_by_distance_without_heading_has_one_path(sample, sample_loop) -> None:
     assert [part.name for part in sample_loop.reported_paths[1:3]] == [POSITIONS_ONLY, BY_DISTANCE]
-    found = loop_of(sample, landed_at=Landing(0.0, 0.0))
+    found = analyse_loop(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
     names = [part.name for part in found.reported_paths]
     assert POSITIONS_ONLY in names
@@ -160,27 +162,27 @@ def test_without_a_known_heading_there_is_one_correction_by_distance(sample, sam
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 
 
-def test_a_tape_gives_what_the_truth_gives(sample: LoopSource, sample_loop: Loop) -> None:
-    forward, right, _ = sample_loop.known_end.displacement  # its nose points along x
-    heading = sample_loop.known_end.heading_change_deg
-    taped = loop_of(sample, landed_at=Landing(forward, right, heading))
-    # a tape does not see the height, which the truth has 0.16 m lower
+def test_loop_landed_at_option_equals_ground_truth(sample: LoopSource, sample_loop: Loop) -> None:
+    forward, right, _ = sample_loop.true_end.displacement  # the vehicle heads along x
+    heading = sample_loop.true_end.heading_change_deg
+    taped = analyse_loop(sample, landed_at=Landing(forward, right, heading))
+    # --landed-at has no height; ground truth is 0.16 m lower
     assert taped.closure_error_m == pytest.approx(sample_loop.closure_error_m, abs=0.03)
     assert taped.heading_error_deg == pytest.approx(sample_loop.heading_error_deg, abs=1e-6)
 
 
 @pytest.mark.reallogs
-def test_the_tlog_of_the_flight_gives_the_same_loop(shared_logs: Path) -> None:
+def test_loop_tlog_has_same_closure_error(shared_logs: Path) -> None:
     found = analyse(read_source(str(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")))
     assert found.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.05)
 
 
-def test_an_absolute_track_is_not_taken_for_odometry() -> None:
+def test_loop_absolute_track_has_finding() -> None:
     source = read_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
     assert source.trajectory.kind == "ekf2"
     found = analyse(source)
-    assert found.absolute
-    assert "loop_of_absolute_track" in {finding.id for finding in find_loop(found)}
+    assert found.is_absolute_track
+    assert "loop_on_absolute_positions" in {finding.id for finding in find_loop(found)}
     assert isinstance(analyse_flight_loop(source.flight), Unavailable)
 
 
@@ -188,7 +190,7 @@ def test_an_absolute_track_is_not_taken_for_odometry() -> None:
 
 
 def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Trajectory]:
-    """Truth and odometry of laps around a square, nose first, with drift as the noise says."""
+    """Return ground truth and odometry of laps around a square, with drift by the noise."""
     position, rotation = square(int(SIDE_M / SPEED_M_S * RATE_HZ), SIDE_M, count)
     truth = np.column_stack([position, rotation.as_quat()])
     length, duration = SPEED_M_S / RATE_HZ, 1.0 / RATE_HZ
@@ -197,7 +199,7 @@ def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Traje
     heading = np.radians(np.sqrt(turned))
     tilt = noise.tilt_share * heading
     sigma = np.array([np.sqrt(moved)] * 3 + [tilt, tilt, heading])
-    odometry = drifted(truth, sigma, np.random.default_rng(seed))
+    odometry = noisy_odometry(truth, sigma, np.random.default_rng(seed))
     time = np.arange(len(truth)) / RATE_HZ
 
     def flown(name: str, kind: Kind, poses: np.ndarray) -> Trajectory:
@@ -207,7 +209,7 @@ def laps(count: int, seed: int, noise: OdometryNoise) -> tuple[Trajectory, Traje
 
 
 LAP_S = 4 * SIDE_M / SPEED_M_S
-# on the second and third laps the vehicle passes where it was on the first
+# the second and third lap pass the positions of the first
 TRUE = tuple(
     GivenClosure(t, t + lap * LAP_S, 0.05) for lap in (1, 2) for t in (5.0, 14.0, 23.0, 32.0)
 )
@@ -215,7 +217,7 @@ TRUE = tuple(
 FALSE = GivenClosure(12.0, 2 * LAP_S + 35.0, 0.05)
 
 
-def test_one_false_closure_among_true_ones() -> None:
+def test_loop_false_closure_is_rejected_among_true_ones() -> None:
     truth, odometry = laps(3, 0, OdometryNoise())
     clean = close_loop(odometry, closures=TRUE, reference=truth)
     fooled = close_loop(odometry, closures=(*TRUE, FALSE), reference=truth)
@@ -226,7 +228,7 @@ def test_one_false_closure_among_true_ones() -> None:
     assert all(judged.accepted for judged in true)
     without = rmse(clean, "all")
     assert without < 0.6 * rmse(clean, "uncorrected")
-    # trusting it warps the path; the gate and both ways of robust solving do not
+    # used without a gate it deforms the path; gate, DCS and GNC exclude it
     assert rmse(fooled, "all") > 3.0 * without
     for name in ("gated", "dcs", "gnc"):
         assert rmse(fooled, name) == pytest.approx(without, rel=0.05), name
@@ -235,11 +237,11 @@ def test_one_false_closure_among_true_ones() -> None:
         assert min(getattr(judged, name) for judged in true) > 0.5
     named = [finding.id for finding in find_loop(fooled)]
     assert named[0] == "false_loop_closure"
-    assert "loop_closure_doubtful" not in named
+    assert "loop_closure_inconsistent" not in named
 
 
-def test_the_gate_accepts_true_landings_as_often_as_stated() -> None:
-    """With the noise that the laps have, p is uniform: a third below a third, and so on."""
+def test_gate_p_value_of_true_landings_is_uniform() -> None:
+    """The gate assumes the noise with which the laps are simulated."""
     p = []
     for seed in range(60):
         _, odometry = laps(1, 100 + seed, OdometryNoise())
@@ -249,7 +251,7 @@ def test_the_gate_accepts_true_landings_as_often_as_stated() -> None:
         assert np.mean(np.array(p) < share) == pytest.approx(share, abs=0.2)
 
 
-def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
+def test_loop_open_end_is_rejected_and_not_corrected() -> None:
     _, odometry = laps(1, 3, OdometryNoise())
     half = odometry[: len(odometry) // 2]
     found = close_loop(half)
@@ -263,16 +265,16 @@ def test_a_landing_elsewhere_is_rejected_and_nothing_is_corrected() -> None:
     finding = find_loop(found)[0]
     assert (finding.id, finding.severity) == ("false_loop_closure", "error")
     assert finding.evidence["p"] < 0.001
-    opened = close_loop(half, came_back=False)
+    opened = close_loop(half, closed_loop=False)
     assert opened.closure_error_m is None
     assert opened.closure_error_axes_m is None
     assert opened.closures == ()
     assert find_loop(opened) == ()
 
 
-def test_the_heading_at_landing_counts_only_where_it_may_be_the_same() -> None:
+def test_loop_heading_is_closed_only_if_similar() -> None:
     _, odometry = laps(1, 4, OdometryNoise())
-    turned = close_loop(odometry)  # it ends facing west
+    turned = close_loop(odometry)  # the vehicle lands with another heading
     assert isinstance(turned.heading_error_deg, Unavailable)
     assert turned.closures[0].degrees_of_freedom == 3
     quaternions = odometry.rotation.as_quat()
@@ -283,39 +285,39 @@ def test_the_heading_at_landing_counts_only_where_it_may_be_the_same() -> None:
     assert found.closures[0].degrees_of_freedom == 4
 
 
-def test_a_doubtful_closure_is_named() -> None:
-    """Off by less than the drift could explain, but the others know better."""
+def test_find_loop_contradicting_closure_is_doubtful() -> None:
+    """The error is within the drift, but contradicts the other closures."""
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
     found = close_loop(odometry, closures=(*TRUE, wrong))
     assert found.closures[-1].accepted
-    doubtful = [f for f in find_loop(found) if f.id == "loop_closure_doubtful"]
+    doubtful = [f for f in find_loop(found) if f.id == "loop_closure_inconsistent"]
     assert len(doubtful) == 1
     assert doubtful[0].evidence["time_1_s"] == 20.0
 
 
-def test_dropping_most_closures_points_to_the_drift() -> None:
-    """An odometry with a turn in every step, which is said to be almost perfect."""
+def test_find_loop_too_small_stated_drift_is_reported() -> None:
+    """The odometry has a heading error in every step; the stated drift is small."""
     _, odometry = laps(3, 7, OdometryNoise())
     turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
     steps = turn[:-1].apply(np.diff(odometry.position_m, axis=0))
     position = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     biased = replace(odometry, position_m=position, rotation=turn * odometry.rotation)
     found = close_loop(biased, closures=TRUE, heading_drift_deg=1.0)
-    assert "loop_drift_understated" in {finding.id for finding in find_loop(found)}
+    assert "loop_drift_too_small" in {finding.id for finding in find_loop(found)}
 
 
-def test_an_assumed_landing_is_said_to_be_assumed(sample: LoopSource, sample_loop: Loop) -> None:
-    assert find_loop(sample_loop) == ()  # the log has the truth
+def test_find_loop_assumed_landing_is_reported(sample: LoopSource, sample_loop: Loop) -> None:
+    assert find_loop(sample_loop) == ()  # the log contains ground truth
     blind = Unavailable("ground truth", "left out", "")
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
     (finding,) = find_loop(found)
-    assert (finding.id, finding.severity) == ("loop_end_assumed", "info")
+    assert (finding.id, finding.severity) == ("loop_landing_assumed", "note")
     assert "--landed-at" in finding.remedy
-    assert find_loop(loop_of(sample, landed_at=Landing(0.0, 0.0))) == ()
+    assert find_loop(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_reported_variances_count_where_they_grow() -> None:
+def test_odometry_variances_use_growing_reported_variances() -> None:
     _, odometry = laps(1, 6, OdometryNoise())
     nodes = np.arange(0, len(odometry), 10)
     constant = replace(odometry, position_variance_m2=np.full((len(odometry), 3), 0.0025))
@@ -330,12 +332,12 @@ def test_reported_variances_count_where_they_grow() -> None:
     assert "growth of the logged position variances" in words
 
 
-def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
+def test_pose_graph_interpolates_between_key_frames(sample_loop: Loop) -> None:
     solved, before = path(sample_loop, "gated"), sample_loop.odometry.trajectory
     after, nodes = solved.trajectory, sample_loop.nodes
     poses = solved.solution.poses
     np.testing.assert_allclose(after.position_m[nodes], poses[:, :3], atol=1e-9)
-    # and no jump between them that the odometry does not have
+    # no additional jumps between them
     jumps = [np.linalg.norm(np.diff(one.position_m, axis=0), axis=1) for one in (after, before)]
     assert np.max(np.abs(jumps[0] - jumps[1])) < 0.02
     # orientations are corrected along the geodesic of their neighbours' corrections
@@ -344,22 +346,22 @@ def test_poses_between_key_frames_move_with_them(sample_loop: Loop) -> None:
     assert np.max((turn[a:b] * expected.inv()).magnitude()) < 1e-9
 
 
-# ------------------------------------------------------------------ what is given
+# ------------------------------------------------------------------ options and files
 
 
-def test_times_of_a_file_in_unix_time_may_count_from_its_first_pose() -> None:
+def test_closure_times_are_unix_or_from_first_pose() -> None:
     source = read_source(str(SLAM))
-    relative = loop_of(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
+    relative = analyse_loop(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
     start = float(source.trajectory.time_s[0])
-    stamped = loop_of(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
+    stamped = analyse_loop(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
     assert relative.closures[1] == stamped.closures[1]
 
 
-def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None:
+def test_loop_slam_file_is_levelled_with_small_closure_error() -> None:
     source = read_source(str(SLAM))
-    found = loop_of(source, landed_at=Landing(0.0, 0.0))
+    found = analyse_loop(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"
-    assert found.closure_error_m < 0.7  # it truly ended 0.4 m away
+    assert found.closure_error_m < 0.7  # the vehicle landed 0.4 m from its start
     height = found.odometry.trajectory.position_m[:, 2]
     assert np.ptp(height) < 2.5
     assert found.path_length_m == pytest.approx(86.0, abs=5.0)
@@ -372,12 +374,12 @@ def test_the_slam_file_is_levelled_and_closes_better_than_the_odometry() -> None
     ({"start_s": 96.0, "end_s": 98.0}, "too short for a loop"),
     ({"key_frames_m": 101.0}, "`key_frames_m` 101 is out of range"),
 ])  # fmt: skip
-def test_impossible_parts_and_closures_are_refused(sample, how, says) -> None:
+def test_loop_invalid_segment_or_closure_is_refused(sample, how, says) -> None:
     with pytest.raises((TrajectoryError, SettingsError), match=says):
-        loop_of(sample, **how)
+        analyse_loop(sample, **how)
 
 
-def test_a_part_of_a_log_is_named_after_a_colon(tmp_path: Path) -> None:
+def test_split_part_separates_log_and_source_at_colon(tmp_path: Path) -> None:
     assert split_part(f"{SAMPLE}:ekf2") == (SAMPLE, "ekf2")
     assert split_part(str(SAMPLE)) == (SAMPLE, None)
     odd = tmp_path / "a:vio"

@@ -43,8 +43,8 @@ from mavlink_tools import (
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from pandas.testing import assert_frame_equal
-from patience import patience
 from scipy.spatial.transform import Rotation
+from time_limit import time_limit
 
 from px4fuse.comparison.comparison import compare
 from px4fuse.errors import LogError, MissingDataError
@@ -139,7 +139,7 @@ def test_read_mavlink_duplicates_over_two_links_are_removed(read):
     assert_frame_equal(one.ekf2.state, two.ekf2.state)
     assert len(two.positions[0].samples) == 200
     assert_allclose(one.positions[0].samples.index, two.positions[0].samples.index, atol=1e-3)
-    assert {s.lost_share for s in two.log.senders} == {0.0}
+    assert {s.lost_fraction for s in two.log.senders} == {0.0}
 
 
 # ---- IMU ----------------------------------------------------------------------------------------
@@ -611,7 +611,7 @@ def assert_same_flight(tlog: Flight, ulog: Flight) -> None:
     assert np.degrees(np.median((one.inv() * other).magnitude())) < 0.5
     truth = differences(tlog, ulog, tlog.truth.samples, ulog.truth.samples, Columns.POSITION)
     assert len(truth) > 1000
-    # the projection origins are the first samples of the two files, some millimetres apart
+    # the projection origins are the first samples of the two files, which differ by millimetres
     assert np.abs(np.median(truth, axis=0)).max() < 0.015
     assert truth.std(axis=0).max() < 0.01
 
@@ -700,7 +700,7 @@ class FuzzCases:
         """Return True if the content is read as a valid flight, False if it is rejected."""
         self.path.write_bytes(content)
         try:
-            with patience():
+            with time_limit():
                 flight = read_log(self.path)
         except LogError:
             return False

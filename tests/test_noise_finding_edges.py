@@ -31,14 +31,14 @@ from findings_tools import (
 )
 
 from px4fuse.comparison.model import Difference
-from px4fuse.ekf2.steps import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOutCheck, Noise
 from px4fuse.findings import Finding, cause_text, hidden_errors, loops, noises
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
-from px4fuse.findings.summary import summarise_flight
+from px4fuse.findings.summary import summarise
 from px4fuse.loop.model import Closure, Loop
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
@@ -81,7 +81,7 @@ def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
         (0.1, Noise(None, None, 0.5), None), (9.0, Noise(None, None, None), None),
         (0.1, Noise(1.0, None, 2.0), None), (9.0, Noise(1.0, 0.5, None), None),
         # a default setting is one level less severe
-        (0.1, Noise(0.033, 0.032, 0.034), ("info", 3.03)),
+        (0.1, Noise(0.033, 0.032, 0.034), ("note", 3.03)),
         (0.101, Noise(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
@@ -99,8 +99,8 @@ def test_deviating_settings_lists_larger_deviation_first() -> None:
     held = made(HeldOutCheck, gain_nats=0.25)
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11), held_out=held)
     worse, other = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
-    assert (worse.id, worse.caused_by) == ("sigma_a_large", None)
-    assert (other.id, other.caused_by) == ("sigma_z_large", "sigma_a_large")
+    assert (worse.id, worse.caused_by) == ("sigma_a_too_large", None)
+    assert (other.id, other.caused_by) == ("sigma_z_too_large", "sigma_a_too_large")
     assert worse.severity == "error"
     assert worse.remedy == other.remedy == "[--sigma-a 0.1 --sigma-z 0.5|0.5|0.1|0.25]."
     assert worse.evidence["factor"] == pytest.approx(10.0)
@@ -130,15 +130,15 @@ def test_deviating_settings_bound_is_typed_as_at_least_5_mm() -> None:
 @pytest.mark.parametrize(
     ("parts", "expected"),
     [
-        ({"source": MOVING}, ["sigma_a_large", "sigma_z_small"]),
-        ({"source": HOVERING}, ["sigma_z_small"]),  # SIGMA_A is not estimated without motion
-        ({"source": ODOMETRY}, ["sigma_z_small"]),  # a source that may drift
-        ({"source": MOVING, "axes": (hiding(),)}, ["sigma_z_small"]),
+        ({"source": MOVING}, ["sigma_a_too_large", "sigma_z_too_small"]),
+        ({"source": HOVERING}, ["sigma_z_too_small"]),  # SIGMA_A is not estimated without motion
+        ({"source": ODOMETRY}, ["sigma_z_too_small"]),  # a source that may drift
+        ({"source": MOVING, "axes": (hiding(),)}, ["sigma_z_too_small"]),
         ({"source": ODOMETRY, "settings": Settings(1.0, 0.1)}, []),  # drift: no finding of info
         ({"source": MOVING, "axes": (hiding(),), "settings": Settings(1.0, 0.1)},
-         ["sigma_z_small"]),
+         ["sigma_z_too_small"]),
         ({"source": MOVING, "axes": (axis(ekf2=statement(), ekf2_truth=against_truth(9.0)),)},
-         ["sigma_a_large", "sigma_z_small"]),
+         ["sigma_a_too_large", "sigma_z_too_small"]),
     ],
 )  # fmt: skip
 def test_deviating_settings_drift_or_hidden_error_keep_noise(
@@ -156,10 +156,10 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
     updates.iloc[:19] = [0.9, 9.0]
     updates["gain_position"] *= [1.0] * 20 + [0.5] * 9 + [1.0] * 2 + [2.0] * 9
     after = pd.Series(1.0 / (1.0 + growth), index=index)
-    after.iloc[20] = 1e-9  # one of them is an outlier
+    after.iloc[20] = 1e-9  # one measurement is an outlier
     both = pd.concat([after, pd.Series(7.0, index=index[:-1] + 0.1)]).sort_index()
     replay = SimpleNamespace(updates=updates, steps=both.to_frame("position_variance_m2"))
-    slow = {"verdict": "variance understated", "lag1_autocorrelation": 0.31, **parts}
+    slow = {"verdict": "overconfident", "lag1_autocorrelation": 0.31, **parts}
     return axis(kf=statement(4.0, **slow), replay=replay)
 
 
@@ -197,7 +197,7 @@ def test_near_zero_process_noise_reports_response_time() -> None:
 
 
 def kf(nis: float, name: str = "north", **parts: Any) -> Any:
-    verdict = "variance understated" if nis > 1.0 else "variance overstated"
+    verdict = "overconfident" if nis > 1.0 else "underconfident"
     return axis(name, kf=statement(nis, **{"verdict": verdict, **parts}))
 
 
@@ -221,16 +221,16 @@ def test_variances_group_axes_with_vertical_as_consequence() -> None:
     axes = (kf(2.0), kf(3.0, "east"), kf(9.0, "down"), kf(0.1, "aisle"))
     found = tuple(noises.detect_inconsistent_variances(analysis(axes=axes)))
     assert [(one.id, one.caused_by, one.evidence["axis"]) for one in found] == [
-        ("kf_variance_overstated", None, "aisle"), ("kf_variance_understated", None, "east"),
-        ("kf_variance_understated", "kf_variance_understated", "down"),
+        ("kf_underconfident", None, "aisle"), ("kf_overconfident", None, "east"),
+        ("kf_overconfident", "kf_overconfident", "down"),
     ]  # fmt: skip
-    assert found[1].headline == "KF is overconfident along east: σ is 1.73 times too small"
+    assert found[1].title == "KF is overconfident along east: σ is 1.73 times too small"
     assert "The mean NIS is 3, expected 0.80 to 1.20 (horizontal axes)" in found[1].message
     assert group_by_cause(found) == found
 
 
 def test_variances_underconfident_drift_or_error_keep_noise() -> None:
-    for nis, is_kept, level in ((0.2, True, "info"), (5.0, False, "error")):
+    for nis, is_kept, level in ((0.2, True, "note"), (5.0, False, "error")):
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
         )
@@ -256,7 +256,7 @@ def test_variances_default_settings_lower_severity() -> None:
 def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -> Any:
     """Make an axis on which EKF2 used this noise (m)."""
     frame = pd.DataFrame({"observation_variance_m2": [9.0, noise_m**2, noise_m**2, 0.0]})
-    verdict = "variance understated" if nis > 1.0 else "variance overstated"
+    verdict = "overconfident" if nis > 1.0 else "underconfident"
     ekf2 = statement(nis, **{"verdict": verdict, **parts})
     return axis(name, ekf2=ekf2, ekf2_innovations=frame)
 
@@ -327,9 +327,9 @@ def test_variances_cause_determines_action(owner, change, kind, action, monkeypa
     monkeypatch.setattr(cause_text.remedy, "format_ekf2_remedy", changes_only)
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 1.0)))
     # changes that explain less than 0.5 or more than 1.5 are not causes
-    causes = (tried(owner, {"sigma_z_m": 7.0}, explains=0.4), tried(owner, change),
-              tried(owner, {"sigma_z_m": 7.0}, explains=1.6))  # fmt: skip
-    one = axis("north", **{owner: statement(9.0, "variance understated")})
+    causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
+              tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
+    one = axis("north", **{owner: statement(9.0, "overconfident")})
     finding = only(
         noises.detect_inconsistent_variances, analysis(axes=(one,), causes=causes, ekf2_model=model)
     )
@@ -338,9 +338,9 @@ def test_variances_cause_determines_action(owner, change, kind, action, monkeypa
 
 
 def test_variances_without_cause_report_closest_rerun() -> None:
-    little = tried("kf", {"sigma_z_m": 7.0}, explains=0.4)
+    little = tried("kf", {"sigma_z_m": 7.0}, explained_fraction=0.4)
     causes = (little, tried("kf", {"sigma_z_m": 2.0}, "east"),
-              tried("kf", {"clock_offset_s": 0.2}, explains=0.1))  # fmt: skip
+              tried("kf", {"clock_offset_s": 0.2}, explained_fraction=0.1))  # fmt: skip
     finding = only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),), causes=causes))
     assert finding.evidence["cause"] == "elsewhere"
     assert finding.remedy == (
@@ -424,11 +424,11 @@ def loop(*closures: Closure, **parts: Any) -> Loop:
     ("closures", "expected"),
     [
         ((closure(0.5),), []), ((closure(None),), []),
-        ((closure(0.49), closure()), ["loop_closure_doubtful"]),
-        ((closure(0.0), closure(0.0), closure()), ["loop_drift_understated"]),
-        ((closure(0.49),), ["loop_drift_understated"]),
+        ((closure(0.49), closure()), ["loop_closure_inconsistent"]),
+        ((closure(0.0), closure(0.0), closure()), ["loop_drift_too_small"]),
+        ((closure(0.49),), ["loop_drift_too_small"]),
         ((closure(0.0, accepted=False), closure()), ["false_loop_closure"]),
-        ((closure(0.0, accepted=False),), ["loop_drift_understated", "false_loop_closure"]),
+        ((closure(0.0, accepted=False),), ["loop_drift_too_small", "false_loop_closure"]),
     ],
 )  # fmt: skip
 def test_loop_closures_gnc_weight_determines_findings(
@@ -436,7 +436,7 @@ def test_loop_closures_gnc_weight_determines_findings(
 ) -> None:
     found = list(loops.detect_inconsistent_closures(loop(*closures, is_end_assumed=False)))
     assert [finding.id for finding in found] == expected
-    if expected == ["loop_drift_understated"]:
+    if expected == ["loop_drift_too_small"]:
         dropped = sum((each.weight_gnc or 0.0) < 0.5 for each in closures)
         assert found[0].evidence == {"dropped": dropped, "closures": len(closures)}
 
@@ -494,37 +494,37 @@ KF_OVERCONFIDENT = (
 
 
 def test_summary_without_truth_compares_innovations() -> None:
-    difference = made(Difference, position_rmse_m=0.05)
-    (text,) = summarise_flight(flight_of(along(1.0, 1.0, difference=difference)), ())
+    difference = made(Difference, position_rms_m=0.05)
+    (text,) = summarise(flight_of(along(1.0, 1.0, difference=difference)), ())
     assert text == (
         "Along the aisle KF and EKF2 differ by 0.050 m RMS. The log contains no ground truth. By "
         "its innovations along the aisle EKF2 is consistent. By its innovations along the aisle KF "
         "is consistent."
     )
-    (text,) = summarise_flight(flight_of(along(0.25, 4.0, difference=difference)), ())
+    (text,) = summarise(flight_of(along(0.25, 4.0, difference=difference)), ())
     assert "EKF2 is underconfident: σ is 2 times too large." in text
     assert text.endswith("KF is overconfident: σ is 2 times too small.")
     mute = axis(
         "aisle", ekf2=NONE, kf=statement(1.0), ekf2_state=made(pd.DataFrame), difference=difference
     )
-    (text,) = summarise_flight(flight_of(mute), ())
+    (text,) = summarise(flight_of(mute), ())
     assert "EKF2 is not tested for consistency: the log has no innovations or too few." in text
-    (text,) = summarise_flight(flight_of(along(0.25, 4.0), source=ODOMETRY), ())
+    (text,) = summarise(flight_of(along(0.25, 4.0), source=ODOMETRY), ())
     assert text.endswith("Both filters follow uwb, which may drift.")
 
 
 def test_summary_names_cause_only_after_rerun() -> None:
     change = {"sigma_z_m": 3.0}
     for explains, is_cause in ((1.0, True), (0.5, True), (1.5, True), (0.49, False), (1.51, False)):
-        causes = (tried("kf", change, "aisle", explains=explains),)
-        text = summarise_flight(flight_of(with_truth(9.0), causes=causes), ())[0]
+        causes = (tried("kf", change, "aisle", explained_fraction=explains),)
+        text = summarise(flight_of(with_truth(9.0), causes=causes), ())[0]
         rerun = "too small. Re-run with SIGMA_Z 3 m instead of 1 m: mean NIS 9 → "
         assert (rerun in text) is is_cause
         assert text.endswith("too small. No tested change explains this.") is not is_cause
     # re-runs of another axis, another filter, or for another statistic
     for other in (tried("kf", change), tried("ekf2", change, "aisle"),
                   tried("kf", change, "aisle", "nees")):  # fmt: skip
-        text = summarise_flight(flight_of(with_truth(9.0), causes=(other,)), ())[0]
+        text = summarise(flight_of(with_truth(9.0), causes=(other,)), ())[0]
         assert text.endswith(KF_OVERCONFIDENT)
 
 
@@ -533,8 +533,8 @@ def test_summary_cause_of_both_filters_does_not_repeat_finding() -> None:
     causes = (tried("kf", change, "aisle"), tried("ekf2", change, "aisle", before=4.0))
     both = along(4.0, 9.0, ekf2_truth=against_truth(1.0), kf_truth=against_truth(1.0))
     one = flight_of(both, causes=causes)
-    outliers = Finding("source_outliers", "error", "So.", "Do.", headline="Outliers")
-    first, *more = summarise_flight(one, (outliers,))
+    outliers = Finding("source_outliers", "error", "So.", "Do.", title="Outliers")
+    first, *more = summarise(one, (outliers,))
     assert (
         "Re-run with 38 outliers removed: mean NIS 4 → 1 (expected 1). Along the aisle KF" in first
     )
@@ -544,18 +544,21 @@ def test_summary_cause_of_both_filters_does_not_repeat_finding() -> None:
 
 def test_summary_difference_is_explained_by_cause_or_steps() -> None:
     change = {"sigma_z_m": 3.0}
-    why = made(Why, cause="The rest is the noise.")
+    why = made(DifferenceExplanation, cause="The rest is the noise.")
     for share, owner, is_explained in (
         (0.5, "kf", True),
         (0.49, "kf", False),
         (0.9, "ekf2", False),
     ):
         difference = replace(
-            tried(owner, change, "aisle", "apart"), before=0.5, after=0.2, explains=share
+            tried(owner, change, "aisle", "difference"),
+            before=0.5,
+            after=0.2,
+            explained_fraction=share,
         )
         one = flight_of(with_truth(9.0), causes=(tried("kf", change, "aisle"), difference),
-                        why={"aisle": why})  # fmt: skip
-        _, second = summarise_flight(one, ())
+                        difference_steps={"aisle": why})  # fmt: skip
+        _, second = summarise(one, ())
         rerun = "Re-run of KF with this correction: difference KF - EKF2 0.50 → 0.20 m RMS."
         assert second == (rerun if is_explained else "The rest is the noise.")
 
@@ -563,7 +566,7 @@ def test_summary_difference_is_explained_by_cause_or_steps() -> None:
 def test_summary_hidden_error_uses_cause_of_nees() -> None:
     hides = along(1.0, 1.0, ekf2_truth=against_truth(1.0), kf_truth=against_truth(16.0))
     causes = (tried("kf", {"clock_offset_s": -0.25}, "aisle", "nees", before=16.0),)
-    text = summarise_flight(flight_of(hides, causes=causes), ())[0]
+    text = summarise(flight_of(hides, causes=causes), ())[0]
     assert "KF has a position RMSE of 0.40 m, but reports σ 0.10 m." in text
     assert text.endswith(
         "Re-run with timestamps corrected (0.25 s late): RMS of error / reported σ 4 → 1 (expected "
@@ -573,41 +576,39 @@ def test_summary_hidden_error_uses_cause_of_nees() -> None:
 
 def test_summary_lists_findings_by_weight() -> None:
     def found(name: str, level: Any = "error", **parts: Any) -> Finding:
-        return Finding(name, level, "So.", "Do.", headline=f"It is {name}", **parts)
+        return Finding(name, level, "So.", "Do.", title=f"It is {name}", **parts)
 
-    why = made(Why, cause="The rest is the noise.")
-    one = flight_of(along(1.0, 1.0), why={"aisle": why})
-    texts = summarise_flight(
-        one, (found("ekf2_resets"), found("no_motion", "info"), found("imu_gap"))
-    )
+    why = made(DifferenceExplanation, cause="The rest is the noise.")
+    one = flight_of(along(1.0, 1.0), difference_steps={"aisle": why})
+    texts = summarise(one, (found("ekf2_resets"), found("no_motion", "note"), found("imu_gap")))
     assert texts[1:] == ("It is imu_gap.", "The rest is the noise.")
     spans = ((20.0, 30.0),)
-    texts = summarise_flight(one, (found("imu_gap", spans_s=spans),))
+    texts = summarise(one, (found("imu_gap", spans_s=spans),))
     assert texts[1] == "It is imu_gap (20.0 s to 30.0 s)."
     dated = found("imu_gap", spans_s=spans, evidence={"at_s": 20.0})
-    assert summarise_flight(one, (dated,))[1] == "It is imu_gap."
+    assert summarise(one, (dated,))[1] == "It is imu_gap."
     follows = found("imu_gap", caused_by="logger_dropouts")
-    assert "imu_gap" not in "".join(summarise_flight(one, (found("logger_dropouts"), follows)))
+    assert "imu_gap" not in "".join(summarise(one, (found("logger_dropouts"), follows)))
     looped = flight_of(along(1.0, 1.0), loop=closing(1.0, 200.0))
-    assert summarise_flight(looped, ())[1] == (
+    assert summarise(looped, ())[1] == (
         "The odometry has a loop closure error of 1.00 m after 200 m (0.5 %)."
     )
-    assert len(summarise_flight(flight_of(along(1.0, 1.0), loop=closing(None)), ())) == 1
+    assert len(summarise(flight_of(along(1.0, 1.0), loop=closing(None)), ())) == 1
 
 
 def test_summary_smaller_noise_contradicted_by_truth_is_no_cause() -> None:
     contradicted = replace(
-        tried("kf", {"sigma_z_m": 0.5}, "aisle", before=0.2), denied_by_truth=True
+        tried("kf", {"sigma_z_m": 0.5}, "aisle", before=0.2), contradicts_truth=True
     )
     one = flight_of(with_truth(0.2), causes=(contradicted,))
-    assert summarise_flight(one, ())[0].endswith(
+    assert summarise(one, ())[0].endswith(
         "too large. A smaller σ would be below the errors against ground truth."
     )
     finding = only(
         noises.detect_inconsistent_variances,
         analysis(axes=(kf(0.2, "aisle"),), causes=(contradicted,)),
     )
-    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISES_TRUTH, "info")
+    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISES_TRUTH, "note")
     assert finding.evidence["cause"] == "elsewhere"
 
 
@@ -615,20 +616,21 @@ def test_summary_noise_shape_finding_replaces_setting_as_cause() -> None:
     causes = (tried("kf", {"sigma_z_m": 3.0}, "aisle"),)
     one = flight_of(with_truth(9.0), causes=causes)
     for name, level, is_named in (
-        ("source_coloured", "warning", False), ("source_coloured", "info", True),
+        ("source_noise_time_correlated", "warning", False),
+        ("source_noise_time_correlated", "note", True),
         ("source_outliers", "warning", True),
     ):  # fmt: skip
-        found = Finding(name, level, "So.", "Do.", headline="It is so")  # type: ignore[arg-type]
-        text = summarise_flight(one, (found,))[0]
+        found = Finding(name, level, "So.", "Do.", title="It is so")  # type: ignore[arg-type]
+        text = summarise(one, (found,))[0]
         assert ("Re-run with SIGMA_Z" in text) is is_named
         assert is_named or text.endswith(KF_OVERCONFIDENT)
     # a time offset stays a cause, unless a low pass delays the positions
     clock = (tried("kf", {"clock_offset_s": 0.25}, "aisle"),)
-    shaped = Finding("source_coloured", "warning", "So.", "Do.", headline="It is so")
+    shaped = Finding("source_noise_time_correlated", "warning", "So.", "Do.", title="It is so")
     with_offset = flight_of(with_truth(9.0), causes=clock)
-    assert "Re-run with timestamps" in summarise_flight(with_offset, (shaped,))[0]
-    smoothed = Finding("source_smoothed", "warning", "So.", "Do.", headline="It is so")
-    assert "Re-run" not in summarise_flight(with_offset, (smoothed,))[0]
+    assert "Re-run with timestamps" in summarise(with_offset, (shaped,))[0]
+    smoothed = Finding("source_low_pass_filtered", "warning", "So.", "Do.", title="It is so")
+    assert "Re-run" not in summarise(with_offset, (smoothed,))[0]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Outdoor flights: simulated GNSS against the truth, its EKF2, and the findings."""
+"""Outdoor flights: simulated GNSS against ground truth, EKF2, and the findings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli_tools import done, refused
+from cli_tools import error_line, run_checked
 from ekf2_tools import opened
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,7 +25,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, source_clock
-from px4fuse.findings.summary import summarise_flight
+from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_positions import project, unproject
@@ -47,7 +47,7 @@ def flown(*texts: str) -> Analysis:
 
 def roots(analysis: Analysis) -> list[str]:
     """Return the ids of findings above a note that no other finding causes."""
-    return [item.id for item in find(analysis) if item.severity != "info" and not item.caused_by]
+    return [item.id for item in find(analysis) if item.severity != "note" and not item.caused_by]
 
 
 @given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-75.0, 75.0), st.floats(-180.0, 180.0))
@@ -124,7 +124,7 @@ def test_outdoor_clean_flight_is_consistent() -> None:
             low, high = nis_band(axis.samples)
             assert low < axis.nis_mean < 1.05 * high
     height = analysis.aids["baro_hgt"]
-    assert (height.verdict, height.rejected_share) == ("consistent", 0.0)
+    assert (height.verdict, height.rejected_fraction) == ("consistent", 0.0)
     # the simulated noise is 0.02 gauss, EKF2_MAG_NOISE 0.05
     field = analysis.aids["mag"].axes
     assert [axis.nis_mean for axis in field.values()] == pytest.approx([0.16] * 3, abs=0.05)
@@ -142,14 +142,14 @@ def test_outdoor_clean_flight_is_consistent() -> None:
 @pytest.mark.parametrize(
     ("mistake", "root"),
     [
-        ("heading=-12", "ekf2_heading_wrong"),
-        ("heading=25,40", "ekf2_heading_wrong"),
-        ("clock-offset=0.25", "source_clock_offset"),
-        ("ekf2-delay=0", "source_clock_offset"),
-        ("r-scale=0.1", "ekf2_variance_understated"),
-        ("ekf2-gate=1", "ekf2_gate_small"),
-        ("mag=0.2", "aid_changed"),
-        ("slow-error=0.5,30", "source_coloured"),
+        ("heading=-12", "ekf2_heading_error"),
+        ("heading=25,40", "ekf2_heading_error"),
+        ("clock-offset=0.25", "source_time_offset"),
+        ("ekf2-delay=0", "source_time_offset"),
+        ("r-scale=0.1", "ekf2_overconfident"),
+        ("ekf2-gate=1", "ekf2_gate_too_small"),
+        ("mag=0.2", "aid_innovation_shift"),
+        ("slow-error=0.5,30", "source_noise_time_correlated"),
     ],
 )
 def test_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
@@ -172,8 +172,8 @@ def test_outdoor_mistake_is_cause_of_ekf2_error(
     analysis = flown(mistake)
     found = cause_of(analysis.causes, "ekf2", "aisle", of)
     assert found.change[name] == pytest.approx(value, abs=within)
-    assert found.brings_into_band
-    assert "EKF2" in summarise_flight(analysis, find(analysis))[0]
+    assert found.is_sufficient
+    assert "EKF2" in summarise(analysis, find(analysis))[0]
 
 
 def test_what_if_gnss_delay_matches_correct_flight() -> None:
@@ -214,8 +214,8 @@ def test_clock_remedy_receiver_delay_is_named() -> None:
 
 def test_findings_mag_change_causes_rejection_finding() -> None:
     changed, starved = [item for item in find(flown("mag=0.2")) if item.id.startswith("aid_")]
-    assert (changed.id, starved.id) == ("aid_changed", "aid_starved")
-    assert starved.caused_by == "aid_changed"
+    assert (changed.id, starved.id) == ("aid_innovation_shift", "aid_not_fused")
+    assert starved.caused_by == "aid_innovation_shift"
     assert "magnetometer" in changed.message
     # the middle of the flight
     assert changed.evidence["time_s"] == pytest.approx(67.0, abs=10.0)
@@ -250,11 +250,11 @@ def test_attitude_error_heading_mistake_follows_with_lag() -> None:
 
 def test_simulate_outdoor_command_uses_kind_defaults(tmp_path: Path) -> None:
     arguments = "simulate", "--kind", "outdoor", "-o", tmp_path / "o.ulg"
-    output = done(*arguments, "--speed", "3").output
+    output = run_checked(*arguments, "--speed", "3").output
     assert "outdoor, 3 laps of a square of 30 m at 3 m/s" in output
     assert "GNSS, 0.4 m at 5 Hz" in output
     for more, expected in (
         (["--assignment", "r.csv"], "--kind outdoor"),
         (["--mistake", "yaw=10"], "--mistake yaw requires --kind aisle or loop"),
     ):
-        assert expected in refused(*arguments, *more)
+        assert expected in error_line(*arguments, *more)

@@ -1,4 +1,4 @@
-"""Pose graphs against GTSAM, closed forms, and laps with known truth."""
+"""Pose graphs against GTSAM, closed forms, and laps with ground truth."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
-from trajectory_tools import GTSAM_ORDER, drifted, gtsam_optimiser, gtsam_problem
+from trajectory_tools import GTSAM_ORDER, gtsam_optimiser, gtsam_problem, noisy_odometry
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
@@ -30,7 +30,7 @@ from px4fuse.trajectory.graph.solver import solve
 
 TANGENT = {2: 3, 3: 6}
 SEEDS = 2
-# Seconds each on one core; torus3D from its own vertices does not converge in 100 steps
+# Some seconds each; torus3D is left out because it needs more than 100 steps
 FILES = (
     "SE-Sync_CSAIL", "SE-Sync_MIT", "SE-Sync_intel", "SE-Sync_kitti_00", "SE-Sync_manhattan",
     "SE-Sync_parking-garage", "SE-Sync_smallGrid3D", "SE-Sync_sphere2500",
@@ -39,7 +39,7 @@ FILES = (
 
 
 def random_graph(dimension: int, seed: int, poses: int = 12, edges: int = 40) -> PoseGraph:
-    """Poses and measurements that have nothing to do with each other."""
+    """Make a graph of independent random poses and measurements."""
     rng = np.random.default_rng(seed)
     free = TANGENT[dimension]
     first = rng.integers(0, poses, edges)
@@ -53,7 +53,7 @@ def random_graph(dimension: int, seed: int, poses: int = 12, edges: int = 40) ->
 
 
 def noisy_graph(dimension: int, seed: int, poses: int = 30, sigma: float = 0.05) -> PoseGraph:
-    """A walk with closures, measured with noise; starts from odometry."""
+    """Make a random walk with closures and measurement noise; poses from odometry."""
     rng = np.random.default_rng(seed)
     free = TANGENT[dimension]
     truth = lie.chain(lie.exp(rng.normal(size=(poses - 1, free)) * 0.7))
@@ -66,13 +66,13 @@ def noisy_graph(dimension: int, seed: int, poses: int = 30, sigma: float = 0.05)
     return compose_odometry(made)
 
 
-# --- where to start ------------------------------------------------------------------------------
+# --- initial poses -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", range(3))
-def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed: int) -> None:
-    """Carlone et al. (2015), IV-C, with every edge's equations written in rows; pose 0 is held."""
+def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed: int) -> None:
+    """Carlone et al. (2015), IV-C, with dense equations; pose 0 is fixed."""
     d, graph = dimension, random_graph(dimension, seed)
     assert (graph.second == 0).any()
     n, measured = len(graph), lie.rotation_matrix(graph.measurements)
@@ -81,7 +81,7 @@ def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed:
     edges = list(zip(*edge_arrays, strict=True))
 
     def least_squares(weights: list[Any], values: list[Any], at_0: np.ndarray) -> np.ndarray:
-        """Unknowns x of each pose with (weight of i, of j) · (x_i, x_j) = value; x_0 is held."""
+        """Solve (weight of i, of j) · (x_i, x_j) = value for all edges; x_0 is fixed."""
         rows, right = [], []
         for (i, j, *_), (of_i, of_j), value in zip(edges, weights, values, strict=True):
             row = np.zeros((d, n * d))
@@ -116,7 +116,7 @@ def test_chordal_initialisation_is_two_dense_least_squares(dimension: int, seed:
 
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_cost_is_gtsams(dimension: int, seed: int) -> None:
+def test_cost_equals_gtsam(dimension: int, seed: int) -> None:
     gtsam = pytest.importorskip("gtsam")
     graph = random_graph(dimension, seed)
     factors, values = gtsam_problem(gtsam, graph)
@@ -125,12 +125,12 @@ def test_cost_is_gtsams(dimension: int, seed: int) -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FILES)
-def test_minimum_is_gtsams(name: str) -> None:
+def test_solve_minimum_equals_gtsam(name: str) -> None:
     gtsam = pytest.importorskip("gtsam")
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
     solution = solve(graph)
     assert solution.converged
-    # Of toyExample nothing but rounding is left, 1e-11
+    # the cost of toyExample is rounding only, 1e-11
     factors, optimiser = gtsam_optimiser(gtsam, graph, 100)
     theirs = factors.error(optimiser.optimize())
     assert solution.cost == pytest.approx(theirs, rel=1e-6, abs=1e-18)
@@ -140,7 +140,7 @@ def test_minimum_is_gtsams(name: str) -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["SE-Sync_manhattan", "SE-Sync_CSAIL", "SE-Sync_kitti_00"])
-def test_start_of_graphs_without_vertices(name: str) -> None:
+def test_read_g2o_without_vertices_starts_chordal(name: str) -> None:
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
     assert graph.initialised == FROM_CHORDAL
     assert cost(graph) < 1e-3 * cost(compose_odometry(graph))
@@ -151,8 +151,8 @@ def test_start_of_graphs_without_vertices(name: str) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_square_loop_is_the_compass_rule(dimension: int) -> None:
-    """Equal variance per metre and perfect rotation: the correction grows with the distance."""
+def test_solve_square_loop_equals_compass_rule(dimension: int) -> None:
+    """With equal variance per metre and exact rotations the correction grows with distance."""
     free, side = TANGENT[dimension], 10
     step = np.zeros((4 * side, free))
     step[:, 0] = np.tile([0.5, 1.5], 2 * side)  # m
@@ -179,14 +179,14 @@ def test_square_loop_is_the_compass_rule(dimension: int) -> None:
     share = np.concatenate([[0.0], np.cumsum(length)]) / np.sum(length)
     compass = odometry[:, :dimension] - share[:, None] * odometry[-1, :dimension]
     np.testing.assert_allclose(solution.poses[:, :dimension], compass, atol=1e-6)
-    # All of the misclosure m goes into steps of variance length: m'm / (2 * sum of lengths)
+    # closure error m, distributed over steps with variance length: m'm / (2 * sum of lengths)
     missed = odometry[-1, :dimension]
     assert solution.cost == pytest.approx(missed @ missed / (2.0 * np.sum(length)), rel=1e-5)
 
 
 @settings(max_examples=30)
 @given(st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6), st.sampled_from([2, 3]))
-def test_cost_does_not_know_the_frame(values: list[float], dimension: int) -> None:
+def test_cost_is_independent_of_frame(values: list[float], dimension: int) -> None:
     tangent = np.array(values[: TANGENT[dimension]])
     tangent[dimension:] /= 40.0
     graph = noisy_graph(dimension, 2)
@@ -195,10 +195,10 @@ def test_cost_does_not_know_the_frame(values: list[float], dimension: int) -> No
     assert solve(moved).cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
 
-def test_order_of_edges_and_their_direction() -> None:
+def test_solve_is_independent_of_edge_order_and_direction() -> None:
     graph = noisy_graph(3, 4)
     shuffled = graph.select_edges(np.random.default_rng(0).permutation(len(graph.first)))
-    # Z^-1 exp(-Ad(Z) r): the other way round, the same information
+    # inverted edge with the same information: Z^-1 exp(-Ad(Z) r)
     back = np.linalg.inv(lie.adjoint(graph.measurements))
     turned = replace(
         graph, first=graph.second, second=graph.first,
@@ -212,7 +212,7 @@ def test_order_of_edges_and_their_direction() -> None:
 # --- refusals ------------------------------------------------------------------------------------
 
 
-def test_graphs_that_cannot_be_solved_are_refused() -> None:
+def test_solve_invalid_graph_states_reason() -> None:
     graph = noisy_graph(2, 0)
     poses = graph.poses.copy()
     poses[4, 1] = np.nan
@@ -230,26 +230,26 @@ def test_graphs_that_cannot_be_solved_are_refused() -> None:
 # --- starts --------------------------------------------------------------------------------------
 
 
-def test_edges_that_are_no_chain_are_composed_all_the_same() -> None:
-    # A star of vertices, edges in both directions
+def test_initialise_star_of_edges_composes_poses() -> None:
+    # star of vertices with edges in both directions
     unit = "1 0 0 1 0 1"
     text = "".join(f"EDGE_SE2 {9 if k % 2 else k} {k if k % 2 else 9} 1 0 1 {unit}\n" for k in (
         0, 2, 3, 5, 7))  # fmt: skip
     graph = parse_g2o(text, "star.g2o")
     assert graph.ids.tolist() == [0, 2, 3, 5, 7, 9]
     assert cost(graph) == pytest.approx(0.0, abs=1e-20)
-    # from the first pose on, wherever that is
+    # relative to the first pose
     away = lie.compose(np.array([[5.0, -2.0, 0.7]]), graph.poses)
     np.testing.assert_allclose(initialise(replace(graph, poses=away)).poses, away, atol=1e-9)
 
 
-# --- closures that may be false -------------------------------------------------------------------
+# --- false closures -------------------------------------------------------------------------------
 
 
 def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
-    """Four laps in space by odometry that drifts, a closure of position per lap, false ones.
+    """Simulate four laps with drifting odometry, one position closure per lap, and false ones.
 
-    Returns the graph from odometry, the truth, and which edges are true.
+    Returns the graph with poses from odometry, ground truth, and a mask of the true edges.
     """
     rng = np.random.default_rng(seed)
     per_lap, count, sigma = 40, 4, 0.10
@@ -261,7 +261,7 @@ def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
         Rotation.from_euler("ZYX", angles).as_quat(),
     ])  # fmt: skip
     spread = np.array([0.03] * 3 + [0.02] * 3)  # m and rad per step
-    odometry = drifted(truth, spread, rng)
+    odometry = noisy_odometry(truth, spread, rng)
     steps = lie.between(odometry[:-1], odometry[1:])
     pairs = [(0, lap * per_lap) for lap in range(1, count + 1)]
     while len(pairs) < count + false:
@@ -285,19 +285,19 @@ def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
 
 
 def ate(poses: np.ndarray, truth: np.ndarray) -> float:
-    """RMS of positions, m; both begin at the same pose."""
+    """Return the RMS position error (m) without alignment."""
     return float(np.sqrt(np.mean(np.sum((poses[:, :3] - truth[:, :3]) ** 2, axis=1))))
 
 
-def test_false_closure_is_set_aside() -> None:
-    """On all flights both are within 5 % of the solution that never saw the false closure."""
+def test_solve_robust_removes_false_closure() -> None:
+    """ATE of DCS and GNC is within 5 % of the solution without the false closure."""
     off: dict[str, list[float]] = {"none": [], "dcs": [], "gnc": []}
     for seed in range(SEEDS):
         graph, truth, true = laps(seed)
         known = ate(solve(graph.select_edges(true)).poses, truth)
         for method in ("none", "dcs", "gnc"):
             solution = solve(graph, robust=method)
-            # least squares has no good minimum here to converge to
+            # plain least squares may not converge with a false closure
             assert solution.converged or method == "none"
             off[method].append(ate(solution.poses, truth) / known - 1.0)
             assert np.all((solution.weights >= 0.0) & (solution.weights <= 1.0))
@@ -311,7 +311,7 @@ def test_false_closure_is_set_aside() -> None:
     assert within["none"] < 0.2
 
 
-def test_true_closures_keep_their_weight() -> None:
+def test_solve_gnc_true_closures_keep_weight_1() -> None:
     for seed in range(2):
         graph, _, _ = laps(seed, false=0)
         robust = solve(graph, robust="gnc")
@@ -319,7 +319,7 @@ def test_true_closures_keep_their_weight() -> None:
         assert robust.cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
 
-def test_edges_that_are_not_doubted_keep_their_weight() -> None:
+def test_solve_robust_reweights_given_loops_only() -> None:
     graph, _, true = laps(0)
     plain = solve(graph).cost
     for method in ("dcs", "gnc"):
@@ -335,7 +335,7 @@ def test_edges_that_are_not_doubted_keep_their_weight() -> None:
 
 
 def odometry_graph(dimension: int, sigma: float, poses: int = 40) -> PoseGraph:
-    """A walk without error, some edges turned round, and one closure."""
+    """Make a random walk without error, with some inverted edges and one closure."""
     rng = np.random.default_rng(11)
     free = TANGENT[dimension]
     steps = lie.exp(rng.normal(size=(poses - 1, free)) * 0.3)
@@ -351,7 +351,7 @@ def odometry_graph(dimension: int, sigma: float, poses: int = 40) -> PoseGraph:
 
 
 def simulated(graph: PoseGraph, seed: int) -> PoseGraph:
-    """Measurements Z with X_i^-1 X_j = Z exp(r), r from the information."""
+    """Draw measurements Z with X_i^-1 X_j = Z exp(r), r by the information."""
     rng = np.random.default_rng(seed)
     noise = np.zeros((len(graph.first), TANGENT[graph.dimension]))
     for row, omega in zip(noise, graph.information, strict=True):
@@ -368,7 +368,7 @@ POSITION_AND_YAW = np.diag([1e4, 1e4, 1e4, 0.0, 0.0, 4e4])
 @pytest.mark.parametrize(("dimension", "information", "freedom"), [
     (2, None, 3), (3, None, 6), (3, POSITION_ONLY, 3), (3, POSITION_AND_YAW, 4),
 ])  # fmt: skip
-def test_gate_is_uniform_for_true_closures(dimension, information, freedom) -> None:
+def test_gate_p_value_of_true_closures_is_uniform(dimension, information, freedom) -> None:
     graph = odometry_graph(dimension, 3e-3)
     edge = len(graph.first) - 1
     if information is not None:
@@ -381,8 +381,8 @@ def test_gate_is_uniform_for_true_closures(dimension, information, freedom) -> N
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("is_back", [False, True])
-def test_gate_measures_by_gtsams_covariance(dimension: int, is_back: bool) -> None:
-    """A closure that is known exactly is as far off as odometry's covariance says."""
+def test_gate_distance_uses_covariance_of_gtsam(dimension: int, is_back: bool) -> None:
+    """For an exact closure the distance depends on the odometry covariance only."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
     chain = graph.select_edges(graph.successive)
@@ -410,7 +410,7 @@ def test_gate_measures_by_gtsams_covariance(dimension: int, is_back: bool) -> No
         assert found.d2 == pytest.approx(off @ np.linalg.solve(covariance, off), rel=1e-4)
 
 
-def test_gate_needs_odometry() -> None:
+def test_gate_without_odometry_edge_raises_error() -> None:
     graph = odometry_graph(2, 1e-3)
     edge = len(graph.first) - 1
     gap = graph.select_edges(np.arange(len(graph.first)) != 10)
@@ -427,8 +427,8 @@ def test_gate_needs_odometry() -> None:
     assert gate(graph, []) == []
 
 
-def test_what_is_observed_and_how_well_is_the_whole_information() -> None:
-    """In metres and radians of very different sizes, with correlations, and a direction untold."""
+def test_information_eigenvectors_restore_information() -> None:
+    """Correlated metres and radians of different size, two directions without information."""
     rng = np.random.default_rng(4)
     root = rng.normal(size=(6, 4)) * np.array([3.0, 2.0, 5.0, 40.0, 70.0, 20.0])[:, None]
     directions, variance = information_eigenvectors(root @ root.T)

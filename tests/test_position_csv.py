@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import REPOSITORY, shared
-from patience import patience
+from time_limit import time_limit
 
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.readers import position_csv
@@ -77,7 +77,7 @@ def read(tmp_path: Path) -> Callable[..., PositionRecording]:
     return read_
 
 
-def refused(read: Callable[..., PositionRecording], content: str | bytes, **options) -> str:
+def error_message(read: Callable[..., PositionRecording], content: str | bytes, **options) -> str:
     """Return the error message (one line) of a rejected file."""
     with pytest.raises(Px4FuseError) as caught:
         read(content, **options)
@@ -436,7 +436,7 @@ def test_read_position_csv_invalid_options_raise_settings_error(read, options, w
 
 
 def test_read_position_csv_missing_column_is_named(read):
-    line = refused(read, table(PLAIN), columns=("time", "x", "y", "w"))
+    line = error_message(read, table(PLAIN), columns=("time", "x", "y", "w"))
     assert "no header with the columns 'time', 'w', 'x', 'y'" in line
 
 
@@ -463,14 +463,14 @@ def test_read_position_csv_missing_column_is_named(read):
     (table({**PLAIN, "time": ["12.5"] * ROWS}), "1 usable rows"),
 ])  # fmt: skip
 def test_read_position_csv_unreadable_file_raises_log_error(read, content, words):
-    line = refused(read, content)
+    line = error_message(read, content)
     assert words in line
     assert line.startswith("uwb.csv")
 
 
 def test_read_position_csv_too_large_file_is_rejected(read, monkeypatch):
     monkeypatch.setattr(position_csv, "MAX_FILE_BYTES", 1000)
-    assert "MB; the limit is" in refused(read, table(PLAIN))
+    assert "MB; the limit is" in error_message(read, table(PLAIN))
 
 
 # -- any bytes -------------------------------------------------------------------------------------
@@ -500,7 +500,7 @@ def test_read_position_csv_repeated_characters_end_in_time(read, line):
     text = table(PLAIN).encode()
     line += b"1\n"
     for content in (line + text, text + line, line * 30 + text, line * 300):
-        with patience():
+        with time_limit():
             check_any(read, content)
 
 

@@ -16,7 +16,7 @@ import click
 import numpy as np
 import pytest
 from browser import Browser
-from cli_tools import done
+from cli_tools import run_checked
 from explore_tools import ask, axe, serious, settle, show
 from hypothesis import given
 from hypothesis import strategies as st
@@ -135,7 +135,7 @@ def test_clock_offset_corrects_late_timestamps(level: int, seed: int) -> None:
     late_s = float(one.sizes[level - 1].removesuffix("ms")) / 1e3
     wrong, right = kf_statistics(flight), kf_statistics(flight, clock_offset_s=-late_s)
     assert wrong.nis_mean > 1.25 * right.nis_mean
-    assert (wrong.verdict, right.verdict) == ("variance understated", "consistent")
+    assert (wrong.verdict, right.verdict) == ("overconfident", "consistent")
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
@@ -195,11 +195,11 @@ def test_page_source_does_not_show_answers(quiz: Path) -> None:
     assert [one["right"] for one in answers] == [one.right for one in draw(SEED, 1, COUNT)]
     for content in re.findall(r'id="content-\d+">([^<]+)<', source):
         flight = json.loads(content)["flight"]
-        assert flight["findings"] == flight["story"] == []
+        assert flight["findings"] == flight["summary"] == []
         assert "mistake" not in content
         assert "px4fuse compare 'flight" in flight["command"]["bare"]
     for one in answers:
-        assert one["story"]
+        assert one["summary"]
         for mistake in one["mistakes"]:
             assert mistake["description"] not in source
             assert mistake["symptom"] not in source
@@ -264,7 +264,7 @@ def test_quiz_scores_right_and_wrong_answers(browser: Browser, quiz: Path) -> No
                 assert low < mistake["span"][0] < high < low + 25.0
         # after the answer the page shows ground truth
         assert "position RMSE" in element_text(page, "live")
-        assert key["story"][0] in element_text(page, "found")
+        assert key["summary"][0] in element_text(page, "found")
         assert page.ask("[...document.querySelectorAll('[name=choice]')].every((b) => b.disabled)")
         if number < COUNT - 1:
             renewed(page, "#quiz-next")
@@ -313,10 +313,10 @@ def test_practice_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(click, "launch", opened.append)
     # the content of the page is tested above
     monkeypatch.setattr("px4fuse.practice.practice_text", lambda *given: repr(given[:3]))
-    done("practice", "--seed", "3", "--flights", "1")
+    run_checked("practice", "--seed", "3", "--flights", "1")
     page = tmp_path / "reports" / "practice_3.html"
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [page]
     assert page.read_text(encoding="utf-8") == "(3, 1, 1)"
     assert opened == []  # without --open and without a terminal
-    done("practice", "--seed", "3", "--flights", "1", "--open", "-o", "a.html")
+    run_checked("practice", "--seed", "3", "--flights", "1", "--open", "-o", "a.html")
     assert opened == [str(tmp_path / "a.html")]

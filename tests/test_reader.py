@@ -595,7 +595,7 @@ def test_read_log_simulated_uwb_equals_sent_samples(shared_logs, name):
 
     distance = np.abs(read_z[:, None, :] - sent_z[None, :, :]).max(axis=2)
     match = distance.argmin(axis=1)
-    assert distance.min(axis=1).max() < 1e-4  # the truth file is rounded to 0.1 mm
+    assert distance.min(axis=1).max() < 1e-4  # the file with ground truth is rounded to 0.1 mm
     assert (np.diff(match) > 0).all()
 
     late = read_s - sent_s[match]

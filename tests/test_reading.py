@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from cli_tools import run_main
 from conftest import REPOSITORY
-from patience import patience
+from time_limit import time_limit
 
 from px4fuse import workers
 from px4fuse.errors import LogError, Px4FuseError
@@ -63,7 +63,7 @@ def refusal(monkeypatch, capsys, desk: Path, command: str) -> str:
     """Return the error of a command; assert one line, no other output, and no long wait."""
     monkeypatch.chdir(desk)
     before = sorted(desk.iterdir())
-    with patience():
+    with time_limit():
         code, out, err = run_main(monkeypatch, capsys, *command.split(" "))
     assert (code, out) == (2, "")
     assert err.startswith("px4fuse: ")
@@ -97,7 +97,7 @@ def test_files_by_sha256_ignores_special_and_huge_files(desk, monkeypatch, capsy
 
     monkeypatch.setattr(workers, "run_bounded", verify_nothing)
     monkeypatch.chdir(desk)
-    with patience():
+    with time_limit():
         code, out, err = run_main(monkeypatch, capsys, "verify", "r.pdf", ".")
     assert (code, err) == (0, "")
     assert "r.pdf: verified" in out

@@ -5,7 +5,7 @@ from exchange import replace
 from flights import Imu, aisle_flight
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import noises_and_clock
+from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight import Unavailable
 from px4fuse.log import Stream
@@ -22,7 +22,7 @@ def test_clock_offset_low_imu_rate_is_unavailable(topic, imu_hz, needed) -> None
     """Telemetry samples of a faster IMU are single values, not means over the interval."""
     flight = aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz))
     flight = replace(flight, streams={"imu": Stream((topic,), "boot clock", flight.log.name)})
-    _, found = noises_and_clock(compare(flight, axes=("north", "east")))
+    _, found = estimate_noises_and_clock(compare(flight, axes=("north", "east")))
     if needed is None:
         assert isinstance(found, ClockOffset)
         return

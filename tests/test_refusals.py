@@ -13,7 +13,7 @@ from ulog_tools import make_log
 
 from px4fuse.ekf2_parameters import PARAMETERS
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 SAMPLES = REPOSITORY / "sample_logs"
 REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"

@@ -87,7 +87,7 @@ def test_find_drifting_vio_lists_error_first_and_keeps_noises(seed, mistakes) ->
     analysis = flown(replace(LOOP, seed=seed), Settings(), *mistakes)
     findings = find(analysis)
     first = findings[0]
-    assert first.id == "errors_larger_than_claimed"
+    assert first.id == "error_exceeds_reported_sigma"
     assert first.evidence["kf_nees_position_mean"] > 100.0 * first.evidence["kf_nis_mean"]
     for finding in findings:
         assert "set EKF2_EVP_NOISE" not in finding.remedy
@@ -132,7 +132,7 @@ def offset(analysis: Analysis, offset_s: float) -> Analysis:
     """Make the analysis with another estimated time offset."""
     clock = replace(
         analysis.clock, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
-        sigma_s=0.005, determinable=True, change_p=None,
+        sigma_s=0.005, is_determinable=True, change_p_value=None,
     )  # fmt: skip
     return replace(analysis, clock=clock)
 
@@ -142,7 +142,7 @@ def summary(
 ) -> Summary:
     axis = AxisSummary(nis, (0.9, 1.1), std, 0.05, error)
     return Summary(
-        changed={}, north=axis, east=axis, samples=600, rejected_share=rejected,
+        changed={}, north=axis, east=axis, samples=600, rejected_fraction=rejected,
         longest_without_fusion_s=0.2, resets=0,
     )  # fmt: skip
 
@@ -171,7 +171,7 @@ def test_remedy_tests_require_improvement_without_larger_rmse(after, noise, fewe
 def ekf2_remedy(analysis: Analysis, **changes: float) -> str:
     model, why, fallback_remedy = analysis.ekf2_model, "Reason: ", "Other action."
     return remedies.format_ekf2_remedy(
-        model, changes, remedies.noise_helps, why=why, fallback_remedy=fallback_remedy
+        model, changes, remedies.noise_helps, difference_steps=why, fallback_remedy=fallback_remedy
     )
 
 

@@ -196,9 +196,10 @@ def offset(**changes: Any) -> ClockOffset:
     return replace(
         ClockOffset(
             applied_s=0.0, offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012,
-            determinable=True,
+            is_determinable=True,
             curve_s=curve, curve_drop=curve**2 * 1e3, parts=parts,
-            drift_ppm=100.0, drift_sigma_ppm=300.0, change_p=0.4, sigma_a_m_s2=0.1, sigma_z_m=0.1,
+            drift_ppm=100.0, drift_sigma_ppm=300.0, change_p_value=0.4, sigma_a_m_s2=0.1,
+            sigma_z_m=0.1,
             count=200,
         ),
         **changes,
@@ -213,7 +214,7 @@ def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
 
 def test_clock_page_exists_only_with_result_to_report() -> None:
     whole = offset(parts=())
-    fine, unknown = with_clock(whole), replace(whole, determinable=False, reason="no motion")
+    fine, unknown = with_clock(whole), replace(whole, is_determinable=False, reason="no motion")
     with_finding = [
         SimpleNamespace(findings=[Finding(name, "error", "", "")]) for name in clock.CLOCK_FINDINGS
     ]
@@ -241,7 +242,7 @@ def test_clock_page_exists_only_with_result_to_report() -> None:
         ({"offset_s": 0.25, "interval_s": (0.22, 0.28)}, 0.0,
          {"Result": "0.250 s early", "PX4": "cannot be negative"}),
         ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0, {"Result": "No significant"}),
-        ({"change_p": 0.001}, 0.0, {"Changes": "+0.00 s from 10 s"}),
+        ({"change_p_value": 0.001}, 0.0, {"Changes": "+0.00 s from 10 s"}),
         ({"drift_ppm": 1000.0}, 0.0, {"Drift": "+1000 ± 588 ppm (95 %)."}),
         ({"drift_ppm": 100.0}, 0.0, {"Drift": "not significant"}),
     ],

@@ -53,7 +53,7 @@ COMPARISONS = st.builds(
 LOOPS = st.builds(
     LoopRequest, source=NAMES, frame=maybe(st.sampled_from(["NED", "FRD", "ENU", "camera"])),
     system=maybe(st.integers(0, 255)), reference=maybe(NAMES), start_s=maybe(NUMBERS),
-    end_s=maybe(NUMBERS), came_back=st.booleans(),
+    end_s=maybe(NUMBERS), closed_loop=st.booleans(),
     landed_at=maybe(st.builds(requests.Landing, NUMBERS, NUMBERS, maybe(NUMBERS))),
     closures=st.lists(
         st.builds(requests.GivenClosure, NUMBERS, NUMBERS, POSITIVE), max_size=3

@@ -7,7 +7,7 @@ import jsonschema
 import pytest
 from exchange import replace
 from flights import unexplained
-from results_tools import EXAMPLE, LOOP, changed, decoded
+from results_tools import EXAMPLE, LOOP, changed_results, decode_results
 
 import px4fuse
 from px4fuse.analysis import explain
@@ -52,7 +52,7 @@ def test_schema_accepts_results_only(one):
         {"extra": 1}, {"provenance": ...}, {"schema__name": "px4fuse-tuning"}, {"loop": {}},
         {"schema__version": "1.0"}, {"loop": {"what": "loop"}}, {"student__name": 7},
     ):  # fmt: skip
-        assert not validator.is_valid(json.loads(json.dumps(changed(one, **wrong)))), wrong
+        assert not validator.is_valid(json.loads(json.dumps(changed_results(one, **wrong)))), wrong
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_results_too_few_updates_have_reason_not_zero(sample_flight):
 
 
 def test_to_json_rejects_nan_and_infinity():
-    made = decoded(EXAMPLE)
+    made = decode_results(EXAMPLE)
     for number in (math.nan, math.inf):
         broken = replace(made, settings=replace(made.settings, dt_s=number))
         with pytest.raises(ValueError, match="not JSON compliant"):
@@ -114,8 +114,8 @@ def test_to_json_rejects_nan_and_infinity():
         (b'[{"a": 1, "b": {}, "a": 2}]', "a key is repeated"),
         (b"[]", "no results of px4fuse"),
         (b"1", "no results of px4fuse"),
-        (b'{"schema": {"name": "px4fuse-loop", "version": "1.0"}}', "uses schema version 1.0"),
-        (b'{"schema": {"name": "px4fuse-loop", "version": "3.0"}}', "missing required field"),
+        (b'{"schema": {"name": "px4fuse-loop", "version": "3.0"}}', "uses schema version 3.0"),
+        (b'{"schema": {"name": "px4fuse-loop", "version": "4.0"}}', "missing required field"),
     ],
     ids=range(21),
 )
@@ -147,12 +147,12 @@ def test_read_results_invalid_file_is_refused(given, said):
 )
 def test_read_results_schema_violation_is_refused(values, said):
     with pytest.raises(ResultsError, match=f"does not follow the schema.*{said}|{said}"):
-        decoded(changed(**values))
+        decode_results(changed_results(**values))
 
 
 def test_read_results_cleans_keys_like_texts():
     nothing = {"what": "noises", "reason": "too short", "remedy": ""}
-    assert list(decoded(changed(tuning={"a\u202eb": nothing})).tuning) == ["ab"]
+    assert list(decode_results(changed_results(tuning={"a\u202eb": nothing})).tuning) == ["ab"]
 
 
 def test_to_json_numbers_have_ten_significant_digits():

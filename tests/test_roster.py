@@ -1,4 +1,4 @@
-"""Tables of platforms: class lists, whose a file is, and the grades that are put into them."""
+"""Tables of learning platforms: class lists, owners of files, and returned grades."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from px4fuse.grading.model import ExportOrigin
 from px4fuse.grading.outputs import fill_grades, grade_column
 
 SUBMITTED = "Friday, 20 November 2026, 11:58 PM"
-# As mod/assign/gradingtable.php of Moodle writes it
+# format of mod/assign/gradingtable.php of Moodle
 MOODLE = (
     'Identifier,"Full name","ID number","Email address",Status,Grade,"Maximum Grade",'
     '"Grade can be changed","Last modified (submission)","Last modified (grade)",'
@@ -80,7 +80,7 @@ def table(tmp_path: Path, text: str, encoding: str = "utf-8-sig") -> Sheet:
         ("Email\njane@x.edu\n", Person("jane@x.edu", "", "jane@x.edu")),
     ],
 )  # fmt: skip
-def test_columns_are_found_by_the_titles_that_platforms_write(tmp_path, text, is_) -> None:
+def test_read_people_finds_columns_of_each_platform(tmp_path, text, is_) -> None:
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
         assert read_people(table(tmp_path, text, encoding))[0] == is_
 
@@ -98,7 +98,7 @@ ROSTERS = {
 
 
 @pytest.mark.parametrize("content", ROSTERS.values(), ids=ROSTERS.keys())
-def test_spellings(tmp_path, content) -> None:
+def test_read_roster_any_table_format_gives_students(tmp_path, content) -> None:
     students = read_roster(written(tmp_path, content))
     assert [one.student_id for one in students] == ["1001", "1002"]
     assert [one.file for one in students] == ["1001.ulg", "1002.ulg"]
@@ -111,9 +111,9 @@ BAD_ROSTERS = {
     "header alone": ("id,name\n", "0 students"),
     "empty id": ("id,name\n1,A\n,B\n", "the id of 'B'"),
     "same id": ("id\n1\n2\n1\n", "rows 2 and 4 have the same id '1'"),
-    "same but for case": ("id\nab\nAB\n", "rows 2 and 3"),
+    "ids equal except for case": ("id\nab\nAB\n", "rows 2 and 3"),
     "same file": ("id\na/b\na:b\n", "the id of 'a:b' cannot be used as a file name"),
-    "nothing left": ("id\n///\n", "letters or digits"),
+    "no usable characters": ("id\n///\n", "letters or digits"),
     "binary": (b"\x00\x01\x02id", "not a text file"),
     "spreadsheet": (b"PK\x03\x04....", "Save it as CSV"),
     "too many": ("id\n" + "\n".join(map(str, range(1001))), "1001 students"),
@@ -124,14 +124,14 @@ BAD_ROSTERS = {
 
 
 @pytest.mark.parametrize(("content", "said"), BAD_ROSTERS.values(), ids=BAD_ROSTERS.keys())
-def test_bad_class_lists(tmp_path, content, said) -> None:
+def test_read_roster_invalid_list_raises_one_line(tmp_path, content, said) -> None:
     with pytest.raises(SettingsError) as error:
         read_roster(written(tmp_path, content, "utf-8"))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
 
 
-# -- whose a file is -------------------------------------------------------------------------------
+# -- owner of a file -------------------------------------------------------------------------------
 
 
 CLASS = Register(
@@ -144,7 +144,7 @@ CLASS = Register(
 
 
 def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOrigin:
-    """A file of a student whom a platform knows by its number."""
+    """Make the origin of a file: platform and number of the student there."""
     person = Person(more.pop("student_id", ""), name, numbers={platform: number}, **more)
     return ExportOrigin(platform, person)
 
@@ -152,34 +152,34 @@ def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOr
 @pytest.mark.parametrize(
     ("origin", "place"),
     [
-        # the participant, not the student of that id
+        # participant number, not student id
         (at("moodle", "4711", "Nobody"), 0),
         (at("moodle", "42", "Nobody"), 1),
         (at("moodle", "99", "doe JANE"), 0),
         (at("canvas", "12345", "x"), 0),
         (at("canvas", "99", "roemax"), 1),
-        (at("moodle", "99", "Zoe\u0308 Doe"), 2),  # the same letter, written as two
+        (at("moodle", "99", "Zoe\u0308 Doe"), 2),  # decomposed letter
         (at("blackboard", login="JDoe"), 0),
         (at("ilias", "7", "?", login="45"), 4),
         (at("gradescope", "7", student_id="42"), 0),
         (at("gradescope", "7", email="Jane@X.edu"), 0),
-        (at("moodle", "99", "Kim Min"), None),  # two of that name
+        (at("moodle", "99", "Kim Min"), None),  # the name is ambiguous
         (at("moodle", "99", "Jane"), None),
     ],
 )
-def test_whose_a_file_is_by_what_the_platform_says(origin, place) -> None:
+def test_student_index_uses_platform_number_then_name(origin, place) -> None:
     assert CLASS.student_index(origin.person) == place
 
 
-def test_whose_a_report_is_by_id_then_by_name() -> None:
+def test_student_index_uses_id_before_name() -> None:
     said = (("42", "Max Roe"), ("", "Roe, Max"), ("99", "Jane Doe"), ("", ""))
     assert [CLASS.student_index(Person(*each)) for each in said] == [0, 1, 0, None]
-    # of two ids that differ by zeros the exact one is meant
+    # an exact id has priority over one with leading zeros
     register = Register([Person("042"), Person("42")])
     assert [register.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
 
 
-def test_a_worksheet_adds_what_it_knows() -> None:
+def test_register_worksheet_fills_missing_fields() -> None:
     register = Register(
         [Person("0042", "Jane Doe"), Person("43", "Max Roe")],
         [Person("42", "Doe J", "j@x.edu", "jdoe", {"moodle": "7"}), Person("9", "No One")],
@@ -209,7 +209,7 @@ def register(sheet) -> Register:
         (BLACKBOARD, TITLE, TITLE, "Feedback to Learner"),
     ],
 )
-def test_a_platforms_table_comes_back_with_two_columns_filled(
+def test_fill_grades_changes_grade_and_feedback_only(
     tmp_path, text, column, title, feedback, encoding
 ) -> None:
     sheet = table(tmp_path, text, encoding)
@@ -225,7 +225,7 @@ def test_a_platforms_table_comes_back_with_two_columns_filled(
         assert {key for key in old if old[key] != new[key]} <= {title, feedback}
     grades = [row[title] for row in people]
     assert grades[:2] == ["87.5", "104"]
-    # who has no grade keeps what is there: an empty cell would delete, a zero would count
+    # without a grade the cell is unchanged: an empty one would delete, a zero would count
     assert after[-1] == before[-1]
     if text is MOODLE:
         assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"
@@ -233,20 +233,20 @@ def test_a_platforms_table_comes_back_with_two_columns_filled(
         assert any("above the maximum of the platform (100)" in note for note in notes)
 
 
-def test_a_row_is_found_by_the_participant_alone(tmp_path) -> None:
+def test_fill_grades_anonymous_row_matches_participant(tmp_path) -> None:
     hidden = MOODLE.replace("Doe Jane", "").replace("0042,jane@x.edu", ",")
     sheet = table(tmp_path, hidden)
     people = Register([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
     assert fill_grades(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
 
 
-def test_who_is_not_in_the_table_is_said(tmp_path) -> None:
+def test_fill_grades_missing_student_is_noted(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
     _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
     assert notes == ("table.csv: no row for Max Roe.",)
 
 
-def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
+def test_fill_grades_keeps_semicolon_and_decimal_comma(tmp_path) -> None:
     text = "Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;;\n"
     sheet = table(tmp_path, text, "cp1252")
     made, _ = fill_grades(sheet, ENTRIES, Register(PEOPLE), "", TEXTS)
@@ -267,7 +267,7 @@ def test_a_german_table_has_its_separator_and_comma(tmp_path) -> None:
         ("id,name\n1,A\n", "", "no grade column"),
     ],
 )
-def test_the_column_of_the_grade_is_named_or_the_only_one(tmp_path, text, column, says) -> None:
+def test_grade_column_ambiguous_or_missing_raises_error(tmp_path, text, column, says) -> None:
     with pytest.raises(SettingsError, match=says) as caught:
         grade_column(table(tmp_path, text), column)
     assert "\n" not in str(caught.value)

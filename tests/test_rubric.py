@@ -1,4 +1,4 @@
-"""The rubric: the one that ships, and those that an instructor spoils."""
+"""Default rubric, and errors of edited rubrics."""
 
 import tomllib
 
@@ -12,7 +12,7 @@ NOTES = ITEM + 'check = "verified"\n'
 NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 
 
-def test_default_uses_and_explains_every_check_and_parameter():
+def test_default_rubric_contains_each_check_and_parameter():
     text = rubric_text()
     used = {item["check"] for item in tomllib.loads(text)["item"]}
     checks = AnyItem.__args__
@@ -23,20 +23,20 @@ def test_default_uses_and_explains_every_check_and_parameter():
 
 
 @pytest.mark.parametrize("kind", ["compare", "loop"])
-def test_items_of_the_default_add_up_to_60_and_120_with_a_key(kind):
+def test_default_rubric_points_add_up_to_60_and_120_with_key(kind):
     items = [one for one in read_rubric(None).items if one.report in ("any", kind)]
     assert {one.points for one in items if one.needs_key} == {100.0, 20.0}
     assert [one.by_hand for one in items if one.needs_key] == [False, True]
     assert sum(one.points for one in items) == 60 + 120
 
 
-def test_copy_of_the_default_is_the_default(tmp_path):
+def test_read_rubric_copy_of_default_is_equal(tmp_path):
     path = tmp_path / "rubric.toml"
     path.write_bytes(b"\xef\xbb\xbf" + rubric_text().replace("\n", "\r\n").encode())
     assert read_rubric(path) == read_rubric(None)
 
 
-def test_parameters_left_out_have_their_defaults():
+def test_parse_rubric_missing_parameters_have_defaults():
     (item,) = parse_rubric(ITEM + 'check = "clock"\n', "x").items
     assert (item.margin_s, item.report) == (0.03, "any")
     (item,) = parse_rubric(NUMBER + "at_most = 1\n", "x").items
@@ -57,25 +57,31 @@ BAD = {
     "title of two lines": (NOTES.replace('"T"', '"a\\nb"'), "at item 1, title"),
     "negative points": (NOTES.replace("5", "-5"), "Expected `float` >= 0.0 - at item 1, points"),
     "unknown parameter": (NOTES + "min_letters = 3", "unknown field `min_letters` - at item 1"),
-    "the third": (NOTES + NOTES.replace("T", "U") + NUMBER + "at_most = 'x'", "at item 3, at_most"),
+    "invalid value in item 3": (
+        NOTES + NOTES.replace("T", "U") + NUMBER + "at_most = 'x'",
+        "at item 3, at_most",
+    ),
     "a check of an earlier rubric": (ITEM + 'check = "sections"', "Invalid value 'sections'"),
     "number without bound": (NUMBER, "give at_least, at_most or both"),
     "bounds exchanged": (NUMBER + "at_least = 2\nat_most = 1", "at_least <= at_most"),
-    "zero on the good side": (NUMBER + "at_most = 2\nzero_at = 1", "zero_at outside"),
-    "zero on the other good side": (NUMBER + "at_least = 0\nzero_at = 1", "zero_at outside"),
+    "zero_at below at_most": (NUMBER + "at_most = 2\nzero_at = 1", "zero_at outside"),
+    "zero_at above at_least": (NUMBER + "at_least = 0\nzero_at = 1", "zero_at outside"),
     "a parameter of an earlier rubric": (ITEM + 'check = "consistent"\naxes = []', "field `axes`"),
-    "but for capitals": (NOTES + NOTES.replace("T", "t"), "the title 't' is used by another item"),
-    "as the sum": (NOTES.replace("T", "Total"), "the title 'Total' is used by the sum"),
-    "two alike": (NOTES + NOTES, "the title 'T' is used by another item"),
+    "titles equal except for case": (
+        NOTES + NOTES.replace("T", "t"),
+        "the title 't' is used by another item",
+    ),
+    "title of the sum": (NOTES.replace("T", "Total"), "the title 'Total' is used by the sum"),
+    "duplicate title": (NOTES + NOTES, "the title 'T' is used by another item"),
     "too many": (NOTES * 101, "length <= 100"),
-    "others' log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
+    "invalid others_log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
     "too large": ("#" * 1_000_001, "the limit is"),
     "no text": (b"\xff\xfe\x00", "not a UTF-8 text file"),
 }
 
 
 @pytest.mark.parametrize(("text", "said"), BAD.values(), ids=BAD.keys())
-def test_spoilt_rubric_is_one_line_that_says_where(tmp_path, text, said):
+def test_read_rubric_invalid_text_names_place_in_one_line(tmp_path, text, said):
     path = tmp_path / "mine.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(SettingsError) as error:
@@ -87,7 +93,7 @@ def test_spoilt_rubric_is_one_line_that_says_where(tmp_path, text, said):
     assert len(message) < 500
 
 
-def test_files_that_are_no_rubric(tmp_path):
+def test_read_rubric_folder_or_missing_file_is_refused(tmp_path):
     for path, said in ((tmp_path, "is a folder"), (tmp_path / "none.toml", "cannot be read")):
         with pytest.raises(SettingsError, match=said):
             read_rubric(path)

@@ -1,4 +1,4 @@
-"""Points, comments, feedback and flags, on the example report with parts of it changed."""
+"""Points, comments, feedback and flags of the example report with changed results."""
 
 import copy
 import json
@@ -8,13 +8,21 @@ from pathlib import Path
 
 import pytest
 from exchange import replace
-from results_tools import EXAMPLE, LOOP, SHA256, changed, correction, decoded, finding
+from results_tools import (
+    EXAMPLE,
+    LOOP,
+    SHA256,
+    changed_results,
+    correction,
+    decode_results,
+    finding,
+)
 
-from px4fuse.answer_form import Answers, ClaimedMistake
+from px4fuse.answer_form import Answers, StudentMistake
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth
 from px4fuse.errors import ResultsError
-from px4fuse.findings import NAMES
+from px4fuse.findings import TITLES
 from px4fuse.grading.flags import class_flags, own_flags
 from px4fuse.grading.model import Entry, GradedReport
 from px4fuse.grading.outputs import feedback_text
@@ -31,114 +39,119 @@ SHA = SHA256
 NONE = {"what": "it", "reason": "too few of them", "remedy": ""}
 
 
-def assessed(results=EXAMPLE, verdict=VERIFIED, key=None, rubric=None, owner_id=""):
-    return assess(decoded(results), verdict, rubric or read_rubric(None), key, owner_id)
+def assess_results(results=EXAMPLE, verdict=VERIFIED, key=None, rubric=None, owner_id=""):
+    return assess(decode_results(results), verdict, rubric or read_rubric(None), key, owner_id)
 
 
-def checked(check, results=EXAMPLE, /, verdict=VERIFIED, key=None, **parameters):
-    """Share of the points and comment of one check."""
+def check_points(check, results=EXAMPLE, /, verdict=VERIFIED, key=None, **parameters):
+    """Return points (of 1) and comment of one check."""
     given = "\n".join(f"{name} = {json.dumps(value)}" for name, value in parameters.items())
     rubric = parse_rubric(f'[[item]]\ntitle = "T"\npoints = 1\ncheck = "{check}"\n{given}', "x")
-    (item,) = assessed(results, verdict, key, rubric).items
+    (item,) = assess_results(results, verdict, key, rubric).items
     assert item.comment.endswith(".")
     assert "\n" not in item.comment
     return item.points, item.comment
 
 
-def noted(text, results=EXAMPLE, **values):
-    return changed(results, student__notes=text, **values)
+def with_notes(text, results=EXAMPLE, **values):
+    return changed_results(results, student__notes=text, **values)
 
 
-def filled(kinds, results=EXAMPLE, **values):
-    """Results with a form that names these mistakes."""
+def with_form(kinds, results=EXAMPLE, **values):
+    """Return results with an answer form that contains these mistakes."""
     sha256 = (results.get("log") or results["track"])["sha256"]
     form = {"log_sha256": sha256, "mistakes": [{"kind": kind} for kind in kinds]}
-    return changed(results, student__answers=form, **values)
+    return changed_results(results, student__answers=form, **values)
 
 
 # ------------------------------------------------------------------ checks
 
 
-def test_a_file_that_is_not_at_hand():
+def test_check_verified_without_log_has_zero_points():
     pdf = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
-    assert checked("verified", verdict=verdict)[0] == 0.0
-    assert "Hand in aisle_uwb.ulg" in fed_back(graded(verdict=verdict))
+    assert check_points("verified", verdict=verdict)[0] == 0.0
+    assert "Hand in aisle_uwb.ulg" in feedback_words(graded(verdict=verdict))
     other = replace(verdict, reasons=("made with another version",), missing="")
-    points, comment = checked("verified", verdict=other)
+    points, comment = check_points("verified", verdict=other)
     assert (points, comment[-28:]) == (0.0, "(made with another version).")
 
 
+GAIN = "log_likelihood_gain_per_measurement"
 RMSE = "axes.north.filters.kf.truth.position_rmse_m"
-BLIND = changed(axes__north__filters__kf__truth=NONE)
-NORTH = changed(axes={"north": EXAMPLE["axes"]["north"]}, tuning={}, horizontal={})
+BLIND = changed_results(axes__north__filters__kf__truth=NONE)
+NORTH = changed_results(axes={"north": EXAMPLE["axes"]["north"]}, tuning={}, horizontal={})
 SIGMA_Z = "tuning__horizontal__sigma_z_m"
-UNCLEAR = changed(clock__determinable=False, clock__reason="no acceleration.")
-JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_clock_changes")]}
-UNDERSTATED = {"horizontal__kf__verdict": "variance understated", "horizontal__kf__nis_mean": 3.0}
+UNCLEAR = changed_results(clock__is_determinable=False, clock__reason="no acceleration.")
+JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_time_offset_changes")]}
+UNDERSTATED = {"horizontal__kf__verdict": "overconfident", "horizontal__kf__nis_mean": 3.0}
 AFTER = "loop__corrections__by_distance"
 WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
-REJECTED = changed(LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}])
-# Check, results, parameters, the points of 1, and what the comment says
+REJECTED = changed_results(
+    LOOP, loop__closures=[{**LOOP["loop"]["closures"][0], "accepted": False}]
+)
+# Check, results, parameters, points of 1, part of the comment
 CHECKED = [
     ("verified", EXAMPLE, {}, 1.0, "verified (all 900"),
     ("tuning", EXAMPLE, {"setting": "sigma_z_m"}, 1.0, "within"),
     ("tuning", EXAMPLE, {"setting": "sigma_a_m_s2"}, 0.72, "SIGMA_A"),
-    ("tuning", changed(settings__sigma_a_m_s2=0.1), {"setting": "sigma_a_m_s2"}, 0.0, "below"),
-    ("tuning", changed(**{SIGMA_Z: ..., f"{SIGMA_Z}_interval": [0.0, 0.2]}),
+    ("tuning", changed_results(settings__sigma_a_m_s2=0.1), {"setting": "sigma_a_m_s2"}, 0.0,
+     "below"),
+    ("tuning", changed_results(**{SIGMA_Z: ..., f"{SIGMA_Z}_interval": [0.0, 0.2]}),
      {"setting": "sigma_z_m"}, 1.0, "within"),
-    ("tuning", changed(tuning__horizontal=NONE), {"setting": "sigma_z_m"}, 0.0, "too few of them"),
+    ("tuning", changed_results(tuning__horizontal=NONE), {"setting": "sigma_z_m"}, 0.0,
+     "too few of them"),
     ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "leave --axis out"),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
      "The error is 0.06499; required: at most 0.05."),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
     ("number", EXAMPLE, {"path": RMSE, "at_least": 0.07, "zero_at": 0.06}, 0.5, ""),
     ("number", EXAMPLE, {"path": "axes.*.filters.kf.nis_mean", "at_least": 0.82}, 0.0,
-     "axes.north"),  # the worst of several
+     "axes.north"),  # worst of several values
     ("number", LOOP, {"path": 'loop.corrections.by_distance.scores."slam.tum".ate.translation_m.'
                               "rmse", "at_most": 0.3}, 1.0, ""),
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
     ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
-    ("number", NORTH, {"path": "tuning.horizontal.held_out.gain_nats", "at_most": 1.0}, 0.0,
+    ("number", NORTH, {"path": f"tuning.horizontal.held_out.{GAIN}", "at_most": 1.0}, 0.0,
      "leave --axis out"),
-    ("consistent", changed(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
+    ("consistent", changed_results(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
     ("consistent", EXAMPLE, {}, 0.72, "σ of KF is 1.06 times too large"),
-    ("consistent", changed(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times too small"),
+    ("consistent", changed_results(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times too small"),
     ("consistent", NORTH, {}, 0.0, "leave --axis out"),
-    ("consistent", changed(**UNDERSTATED), {}, 0.0, "times too small"),
-    ("consistent", changed(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
+    ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "times too small"),
+    ("consistent", changed_results(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
      "no setting corrects the rest"),
     ("clock", EXAMPLE, {}, 1.0, "the estimate is -0.022 to 0.061 s (95 %)"),
-    ("clock", changed(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
+    ("clock", changed_results(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
-    ("clock", changed(clock=NONE), {}, 0.0, "too few of them"),
+    ("clock", changed_results(clock=NONE), {}, 0.0, "too few of them"),
     ("clock", LOOP, {}, 0.0, "is not a compare report"),
-    ("clock", changed(**JUMPS), {}, 0.5, "state its time in your form"),
-    ("clock", filled(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
-    ("clock", filled(["dropout"], **JUMPS), {}, 0.5, "state its time in your form"),
+    ("clock", changed_results(**JUMPS), {}, 0.5, "state its time in your form"),
+    ("clock", with_form(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
+    ("clock", with_form(["dropout"], **JUMPS), {}, 0.5, "state its time in your form"),
     ("loop", LOOP, {}, 1.0, "changed from 0.41 m to 0.26 m"),
-    ("loop", changed(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "increases the error"),
-    ("loop", changed(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
-    ("loop", changed(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
+    ("loop", changed_results(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "increases the error"),
+    ("loop", changed_results(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
+    ("loop", changed_results(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
-    ("loop", changed(LOOP, loop__absolute=True), {}, 0.0, "does not drift"),
+    ("loop", changed_results(LOOP, loop__is_absolute_track=True), {}, 0.0, "does not drift"),
     ("loop", REJECTED, {}, 0.25, "no closure was accepted"),
-    ("loop", changed(LOOP, loop__closure_error_m=..., loop__known_end=NONE), {}, 0.0,
+    ("loop", changed_results(LOOP, loop__closure_error_m=..., loop__true_end=NONE), {}, 0.0,
      "too few of them"),
-    ("number", changed(axes__north__updates__count=50), {"path": "axes.*.updates.count",
+    ("number", changed_results(axes__north__updates__count=50), {"path": "axes.*.updates.count",
      "at_least": 100, "zero_at": 0}, 0.5, "axes.north"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("check", "results", "given", "points", "said"), CHECKED)
-def test_what_a_check_gives(check, results, given, points, said):
-    found, comment = checked(check, results, **given)
+def test_check_gives_points_and_comment(check, results, given, points, said):
+    found, comment = check_points(check, results, **given)
     assert found == pytest.approx(points, abs=0.01), comment
     assert said in comment
 
 
-def test_the_clock_of_a_flight_that_was_handed_out_is_not_the_student_s_choice():
-    assert checked("clock", UNCLEAR, key=key())[0] == 1.0
+def test_check_clock_of_assigned_flight_has_full_points():
+    assert check_points("clock", UNCLEAR, key=key())[0] == 1.0
 
 
 # ------------------------------------------------------------------ mistakes
@@ -157,13 +170,13 @@ def key(*mistakes, sha256=SHA, **values):
 
 
 class TestForm:
-    def test_points_by_the_key(self):
-        found = filled(["dropout"], student__id="S01 ")
-        points, comment = checked("answers", found, key=key())
+    def test_form_is_scored_by_answer_key(self):
+        found = with_form(["dropout"], student__id="S01 ")
+        points, comment = check_points("answers", found, key=key())
         assert points == 0.3
         assert "kinds 30 of 30, sizes 0 of 15" in comment
         assert "You found dropout." in comment
-        points, comment = checked("answers", filled(["yaw"], student__id="s01"), key=key())
+        points, comment = check_points("answers", with_form(["yaw"], student__id="s01"), key=key())
         assert points == 0.0
         assert "you missed dropout (gap in the position source of this length)" in comment.lower()
         assert "not in your flight: yaw" in comment
@@ -177,26 +190,28 @@ class TestForm:
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
         ],
     )
-    def test_what_is_no_form(self, form, said):
+    def test_missing_or_invalid_form_has_zero_points(self, form, said):
         more = {"student__answers": form} if form else {}
-        points, comment = checked("answers", changed(student__id="s01", **more), key=key())
+        points, comment = check_points(
+            "answers", changed_results(student__id="s01", **more), key=key()
+        )
         assert (points, said in comment) == (0.0, True)
 
-    def test_another_log_and_an_unknown_id(self):
+    def test_form_on_other_log_has_zero_points(self):
         for student_id in ("s01", "zz"):
-            results = filled(["dropout"], student__id=student_id)
-            points, comment = checked("answers", results, key=key(sha256="c" * 64))
+            results = with_form(["dropout"], student__id=student_id)
+            points, comment = check_points("answers", results, key=key(sha256="c" * 64))
             assert (points, "not about the log that you were given" in comment) == (0.0, True)
 
     @pytest.mark.parametrize(("owner_id", "points"), [("", 0.0), ("s01", 30.0), ("zz", 0.0)])
-    def test_a_mistyped_id_costs_nothing_where_the_platform_knows_it(self, owner_id, points):
-        mistyped = filled(["dropout"], student__id="s02")
-        items = assessed(mistyped, key=key(), owner_id=owner_id).items
+    def test_platform_id_overrides_mistyped_report_id(self, owner_id, points):
+        mistyped = with_form(["dropout"], student__id="s02")
+        items = assess_results(mistyped, key=key(), owner_id=owner_id).items
         assert [item.points for item in items if "Mistakes" in item.title] == [points]
 
-    def test_a_text_waits_for_the_instructor(self):
+    def test_notes_await_points_of_instructor(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
-            made = assessed(noted(notes, student__id="s01"), key=key())
+            made = assess_results(with_notes(notes, student__id="s01"), key=key())
             assert (made.awaits_points, made.counted is None, made.items[-1].points) == (
                 awaits_points,
                 awaits_points,
@@ -204,46 +219,46 @@ class TestForm:
             )
 
 
-# ------------------------------------------------------------------ the whole
+# ------------------------------------------------------------------ whole reports
 
 
 class TestScore:
-    def test_refuted_reports_get_nothing(self):
+    def test_report_with_differing_numbers_has_zero_points(self):
         verdict = Verdict("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
-        made = assessed(verdict=verdict)
+        made = assess_results(verdict=verdict)
         assert {item.points for item in made.items} == {0.0}
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
         assert made.pending == ""
 
-    def test_what_cannot_be_verified_is_pending_unless_the_rubric_says_so(self):
+    def test_unverified_report_is_pending_or_zero_by_rubric(self):
         verdict = Verdict("other log", ("no log",), False, remedy="Look.")
-        made = assessed(verdict=verdict)
+        made = assess_results(verdict=verdict)
         assert made.items[0].points == 0.0
         assert sum(item.points for item in made.items) > 30
         assert made.pending == "Look."
-        zero = assessed(verdict=verdict, rubric=replace(read_rubric(None), unverified="zero"))
+        zero = assess_results(verdict=verdict, rubric=replace(read_rubric(None), unverified="zero"))
         assert {item.points for item in zero.items} == {0.0}
         assert zero.pending == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
-    def test_somebody_else_s_log_is_pending_unless_the_rubric_says_so(self, student_id):
-        given = changed(student__id=student_id)
+    def test_log_of_other_student_follows_rubric_rule(self, student_id):
+        given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
-        assert f"given to s01, the {said}" in assessed(given, key=key()).pending
+        assert f"given to s01, the {said}" in assess_results(given, key=key()).pending
         for rule, earns in (("zero", False), ("count", True)):
             rubric = replace(read_rubric(None), others_log=rule)
-            made = assessed(given, key=key(), rubric=rubric)
+            made = assess_results(given, key=key(), rubric=rubric)
             assert (made.pending, any(item.points for item in made.items)) == ("", earns)
-        # the platform says whose it is
-        assert assessed(given, key=key(), owner_id="s01").pending == ""
+        # with the owner from the platform
+        assert assess_results(given, key=key(), owner_id="s01").pending == ""
 
-    def test_a_log_that_nobody_was_given(self):
-        made = assessed(noted("", student__id="s01"), key=key(sha256="c" * 64))
+    def test_log_outside_answer_key_is_pending(self):
+        made = assess_results(with_notes("", student__id="s01"), key=key(sha256="c" * 64))
         assert "not about a log of the answer key" in made.pending
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
-    def test_whatever_can_be_read_can_be_scored(self, results):
-        """Extreme values, and parts that are absent, wherever the contract allows them."""
+    def test_any_valid_results_can_be_scored(self, results):
+        """Extreme values and missing parts, as far as the schema allows."""
         rng = random.Random(0)
         numbers, others = [1e308, -1e308, 5e-324, 0.0, -1, 10**19], [NONE, ..., "x" * 2000, "\0"]
         rubric, read = read_rubric(None), 0
@@ -262,7 +277,7 @@ class TestScore:
                         break
                     place = place[name]
             try:
-                found = decoded(spoilt)
+                found = decode_results(spoilt)
             except ResultsError:
                 continue
             read += 1
@@ -274,8 +289,8 @@ class TestScore:
         assert read > 40
 
 
-def fed_back(one, title=""):
-    """What the student reads, its line ends left out."""
+def feedback_words(one, title=""):
+    """Return the feedback text without line ends."""
     text = feedback_text(Entry(one.student, one.student_id, one), title)
     assert all(len(line) <= 100 for line in text.splitlines())
     return " ".join(text.split())
@@ -286,37 +301,38 @@ def graded(items=(), **values):
     return GradedReport(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
 
 
-class TestWhatStudentsRead:
+class TestFeedback:
     @pytest.mark.parametrize(
         ("values", "there", "absent"),
         [
-            ({"items": assessed().items, "flags": ("copied",)},
+            ({"items": assess_results().items, "flags": ("copied",)},
              ("Lab 2 Report a.pdf Student Ann Lee, 1001",), "copied"),
             ({"verdict": Verdict("cannot verify", ("one", "page 3: two"), False)},
              ("could not be verified: one; page 3: two. Make a new report",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
-            ({"items": assessed().items, "pending": "Add uwb.csv to --logs."},
+            ({"items": assess_results().items, "pending": "Add uwb.csv to --logs."},
              ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip
-    def test_feedback(self, values, there, absent):
-        text = fed_back(graded(**values), "Lab 2")
+    def test_feedback_text_has_status_and_hides_flags(self, values, there, absent):
+        text = feedback_words(graded(**values), "Lab 2")
         assert all(said in text for said in there), text
         assert absent not in text
 
-    def test_words_never_ids(self):
-        """Whatever is missing is told in words; paths and ids are the program's own."""
-        wrong = [finding(name, "error") for name in NAMES]
+    def test_comments_contain_no_ids_or_paths(self):
+        """Ids of findings and paths in results are internal names."""
+        wrong = [finding(name, "error") for name in TITLES]
         spoilt = [
-            changed(findings=wrong, student__notes="It is a flight of 5 s.", tuning={}, clock=NONE),
-            changed(LOOP, findings=wrong, loop__closure_error_m=..., loop__known_end=NONE,
+            changed_results(findings=wrong, student__notes="It is a flight of 5 s.", tuning={},
+                            clock=NONE),
+            changed_results(LOOP, findings=wrong, loop__closure_error_m=..., loop__true_end=NONE,
                     loop__closures=[]),
-            filled(["nlos", "dropout"], student__id="s01", findings=wrong),
+            with_form(["nlos", "dropout"], student__id="s01", findings=wrong),
         ]  # fmt: skip
         for results in spoilt:
             for answers in (None, key()):
-                for item in assessed(results, key=answers).items:
+                for item in assess_results(results, key=answers).items:
                     left = item.comment.replace("answers.toml", "")
                     assert not re.search(r"[a-z]+_[a-z]+|\w\.\*|\w\.[a-z]", left), item.comment
 
@@ -336,14 +352,14 @@ class TestWhatStudentsRead:
         ({"log__hardware": HARDWARE}, ("simulate",)),
         ({"settings__sigma_z_m": 100.0}, ("SIGMA_Z 100 is far from",)),
         ({"settings__sigma_a_m_s2": 0.001}, ("SIGMA_A 0.001 is far from",)),
-        ({"source__passage": "kept by EKF2"}, ("kept by EKF2",)),
+        ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
-def test_what_stands_out_in_one_report(values, said):
-    found = list(own_flags(decoded(changed(**values))))
+def test_own_flags_suspicious_report_lists_each_flag(values, said):
+    found = list(own_flags(decode_results(changed_results(**values))))
     assert len(found) == len(said)
     assert all(word in flag for word, flag in zip(said, found, strict=True))
-    assert list(own_flags(decoded(LOOP))) == []
+    assert list(own_flags(decode_results(LOOP))) == []
 
 
 @pytest.mark.parametrize(
@@ -356,12 +372,12 @@ def test_what_stands_out_in_one_report(values, said):
     ],
 )
 def test_own_flags_stated_drift_far_from_usual(option, stated, said):
-    found = list(own_flags(decoded(changed(LOOP, **{f"request__{option}": stated}))))
+    found = list(own_flags(decode_results(changed_results(LOOP, **{f"request__{option}": stated}))))
     assert len(found) == bool(said)
     assert all(flag.startswith(said) for flag in found)
 
 
-def of(number, **values):
+def report(number, **values):
     given = {
         "submission": f"{number}.pdf", "student": f"Student{number} Name{number}",
         "student_id": f"10{number:02d}", "sha256": f"{number:064d}",
@@ -371,14 +387,15 @@ def of(number, **values):
 
 
 class TestClassFlags:
-    def test_an_honest_class(self):
-        assert class_flags([of(n) for n in range(12)]) == {}
+    def test_class_flags_different_reports_have_none(self):
+        assert class_flags([report(n) for n in range(12)]) == {}
 
-    def test_logs_ids_and_files(self):
+    def test_class_flags_shared_log_id_or_file_is_listed(self):
         made = class_flags(
-            [of(1, student="a\n<b>", log_sha256="x"), of(2, log_sha256="x"), of(4), of(5),
-             of(6, student_id="1005"),
-             of(7, sha256="y"), of(8, sha256="y")]
+            [report(1, student="a\n<b>", log_sha256="x"), report(2, log_sha256="x"), report(4),
+             report(5),
+             report(6, student_id="1005"),
+             report(7, sha256="y"), report(8, sha256="y")]
         )  # fmt: skip
         assert set(made) == {f"{n}.pdf" for n in (1, 2, 5, 6, 7, 8)}
         assert "same log as Student2" in made["1.pdf"][0]
@@ -388,22 +405,25 @@ class TestClassFlags:
         assert "same student id" in made["5.pdf"][0]
         assert "same file" in made["8.pdf"][0]
 
-    def test_two_reports_of_one_student_on_one_log(self):
-        two = [of(1, log_sha256="x"), of(1, log_sha256="x", sha256="z", submission="b.pdf")]
+    def test_class_flags_two_reports_of_one_student_name_id(self):
+        two = [
+            report(1, log_sha256="x"),
+            report(1, log_sha256="x", sha256="z", submission="b.pdf"),
+        ]
         assert class_flags(two) == {
             "1.pdf": ["The same student id as in Student1 Name1, 1001 (b.pdf)."],
             "b.pdf": ["The same student id as in Student1 Name1, 1001 (1.pdf)."],
         }
 
-    def test_a_classmates_numbers_each_changed_a_little(self):
-        claims = ClaimedMistake("yaw", -20.5), ClaimedMistake("nlos", 1.23)
+    def test_class_flags_similar_form_numbers_are_listed(self):
+        claims = StudentMistake("yaw", -20.5), StudentMistake("nlos", 1.23)
         mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
-        other = (ClaimedMistake("nlos", 1.24), ClaimedMistake("yaw", -20.3))
+        other = (StudentMistake("nlos", 1.24), StudentMistake("yaw", -20.3))
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
-        made = class_flags([of(1, form=mine), of(2, form=theirs)])
+        made = class_flags([report(1, form=mine), report(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}
         assert "The answer form has the same numbers as" in made["1.pdf"][0]
-        # two may be by chance
+        # two equal numbers are not enough
         theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
         apart = replace(mine, quantities=(0.123, None, 0.3))
-        assert class_flags([of(1, form=apart), of(2, form=theirs)]) == {}
+        assert class_flags([report(1, form=apart), report(2, form=theirs)]) == {}

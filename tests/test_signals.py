@@ -54,7 +54,7 @@ def flight_of(*, imu=ABSENT, attitude=ABSENT, track=None, duration_s=10.0, airbo
 
 
 def ned_acceleration_of(time, force, attitude):
-    """Acceleration in NED that a specific force in the body gives."""
+    """Return the acceleration in NED of a specific force in the body frame."""
     return ned_acceleration(flight_of(imu=still_imu(time, force), attitude=attitude))
 
 
@@ -140,7 +140,7 @@ def test_step_means_piecewise_linear_are_exact(gaps_ms, data):
     ],
 )  # fmt: skip
 def test_step_means_gap_is_share_without_imu(time, edges, gaps):
-    """A gap between equal values says the same value; outside the mean is zero."""
+    """In a gap between equal values the mean is that value; outside the data it is zero."""
     mean, gap = step_means(acceleration_of(time, np.ones(len(time))), edges)
     np.testing.assert_allclose(gap, gaps, atol=1e-9)
     inside = np.clip(np.diff(np.clip(edges, time[0], time[-1])) / np.diff(edges), 0.0, 1.0)
@@ -159,7 +159,7 @@ def test_acceleration_rms_uses_segment_only():
 
 
 def line_track(heading_deg, count=200, noise=0.0):
-    """Back and forth along a direction, 6 m either way, at a height of 1.5 m."""
+    """Return a track along a direction, ±6 m, at a height of 1.5 m."""
     time = np.arange(count) / 5.0
     along = 6.0 * np.sin(0.4 * time)
     heading = np.radians(heading_deg)
@@ -274,7 +274,7 @@ EV_TIME = np.arange(0.05, 19.8, 0.2)
 
 
 def truth_at(time):
-    """A slow curve, so that a shift in time or place shows."""
+    """Slow curve on which a shift in time or position is visible."""
     return np.stack([0.5 * time, 2.0 * np.sin(0.3 * time), -1.5 + 0.0 * time], axis=1)
 
 
@@ -338,7 +338,7 @@ def test_continuous_state_treats_height_separately():
 
 
 def test_continuous_state_keeps_unmeasured_resets():
-    """A source without height cannot say that the frame changed."""
+    """A source without height contains no information on a change of the frame."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
     offset = np.where(STATE_TIME[:, None] >= 8.0, [0.0, 0.0, 3.0], 0.0)

@@ -1,4 +1,4 @@
-"""EKF2 of simulated flights: against the truth, against its replay, and in the findings."""
+"""EKF2 of simulated flights against ground truth and its replay, and in the findings."""
 
 import numpy as np
 import pandas as pd
@@ -219,7 +219,7 @@ def test_simulated_log_notes_ekf2_model(clean, tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(to_ulog(simulate(AISLE)))
     assert read_log(path).log.notes == clean.log.notes == (MODEL_NOTE,)
-    assert "ekf2_is_a_model" in named(clean)
+    assert "ekf2_simulated" in named(clean)
     path.write_bytes(to_ulog(simulate(replace(AISLE, ekf2=False))))
     flight = read_log(path)
     assert isinstance(flight.ekf2, Unavailable)

@@ -26,7 +26,12 @@ from px4fuse.simulation.scenario import Scenario
 RIGHT = Settings(0.27, 0.10)
 NONE = np.zeros(0)
 pytestmark = pytest.mark.usefixtures("quick_filter")
-NEW = {"source_coloured", "source_repeats", "source_axes_unequal", "source_noise_changes"}
+NEW = {
+    "source_noise_time_correlated",
+    "source_samples_repeated",
+    "source_noise_unequal_axes",
+    "source_noise_varies",
+}
 
 
 @cache
@@ -57,10 +62,10 @@ def analysed(
 
 def root_findings(analysis: Analysis) -> dict[str, Finding]:
     """Findings by id without infos, KF settings and consequences."""
-    left_out = SETTINGS | {"ekf2_unavailable"}
+    left_out = SETTINGS | {"ekf2_not_logged"}
     return {
         one.id: one for one in find(analysis)
-        if one.severity != "info" and one.caused_by is None and one.id not in left_out
+        if one.severity != "note" and one.caused_by is None and one.id not in left_out
     }  # fmt: skip
 
 
@@ -84,15 +89,16 @@ def test_find_white_noise_returns_nothing() -> None:
 @pytest.mark.parametrize(
     ("model", "name", "severity", "evidence"),
     [
-        (SLOW, "source_coloured", "error",  # the severity of its consequences
+        (SLOW, "source_noise_time_correlated", "error",  # the severity of its consequences
          {"tau_s": (0.5, 0.35), "slow_m": (0.1, 0.03), "white_m": (0.0, 0.04)}),
-        (MIXED, "source_coloured", "warning", {"slow_m": (0.07, 0.03), "white_m": (0.07, 0.02)}),
-        (HELD, "source_repeats", "warning", {"share": (0.15, 0.03)}),
-        (OFTEN_HELD, "source_repeats", "error", {"share": (0.6, 0.05)}),
-        (UNEQUAL, "source_axes_unequal", "error",
+        (MIXED, "source_noise_time_correlated", "warning",
+         {"slow_m": (0.07, 0.03), "white_m": (0.07, 0.02)}),
+        (HELD, "source_samples_repeated", "warning", {"share": (0.15, 0.03)}),
+        (OFTEN_HELD, "source_samples_repeated", "error", {"share": (0.6, 0.05)}),
+        (UNEQUAL, "source_noise_unequal_axes", "error",
          {"north_sigma_z_m": (0.05, 0.01), "east_sigma_z_m": (0.2, 0.02)}),
-        (LOUD, "source_noise_changes", "error", {"ratio": (2.7, 0.4)}),
-        (LOUDER, "source_noise_changes", "error", {"ratio": (6.0, 1.3)}),
+        (LOUD, "source_noise_varies", "error", {"ratio": (2.7, 0.4)}),
+        (LOUDER, "source_noise_varies", "error", {"ratio": (6.0, 1.3)}),
     ],
 )  # fmt: skip
 def test_find_noise_model_reports_kind_and_size(model, name, severity, evidence) -> None:
@@ -105,7 +111,7 @@ def test_find_noise_model_reports_kind_and_size(model, name, severity, evidence)
 
 def test_noise_variation_reports_the_noisy_third() -> None:
     analysis = analysed(LOUD)
-    ((start, end),) = root_findings(analysis)["source_noise_changes"].spans_s
+    ((start, end),) = root_findings(analysis)["source_noise_varies"].spans_s
     time = analysis.axes["north"].axis.measurement_time_s
     third = (time[-1] - time[0]) / 3.0
     assert start == pytest.approx(time[0] + third, abs=third / 3.0)
@@ -114,9 +120,9 @@ def test_noise_variation_reports_the_noisy_third() -> None:
 
 def test_find_separates_correlated_noise_from_low_pass() -> None:
     slow, smooth = analysed(SLOW), analysed(SMOOTH)
-    assert "source_smoothed" not in {one.id for one in find(slow)}
-    assert "source_coloured" not in {one.id for one in find(smooth)}
-    assert "source_smoothed" in root_findings(smooth)
+    assert "source_low_pass_filtered" not in {one.id for one in find(slow)}
+    assert "source_noise_time_correlated" not in {one.id for one in find(smooth)}
+    assert "source_low_pass_filtered" in root_findings(smooth)
     for analysis, lags in ((slow, False), (smooth, True)):
         found = analysis.coloured
         assert found.gain_nats > 30.0
@@ -127,8 +133,8 @@ def test_find_separates_correlated_noise_from_low_pass() -> None:
 def test_find_other_mistakes_report_no_noise_kind() -> None:
     for model, name in (
         (partial(errors.with_outliers, share=0.05), "source_outliers"),
-        (partial(errors.jumped, size=1.0), "source_jumps"),
-        (partial(errors.clock, late=0.3), "source_clock_offset"),
+        (partial(errors.jumped, size=1.0), "source_position_jump"),
+        (partial(errors.clock, late=0.3), "source_time_offset"),
     ):
         found = root_findings(analysed(model))
         assert name in found
@@ -142,13 +148,15 @@ def test_find_other_mistakes_report_no_noise_kind() -> None:
 def test_rerun_smaller_noise_is_checked_against_truth(model, sigma_z_m, contradicts) -> None:
     """The estimate is 0.7 SIGMA_Z in both cases; the first one has time-correlated errors too."""
     analysis = analysed(model, truth_for=sigma_z_m)
-    tried = [each for each in analysis.causes if "sigma_z_m" in each.change and each.of == "nis"]
+    tried = [
+        each for each in analysis.causes if "sigma_z_m" in each.change and each.statistic == "nis"
+    ]
     assert {each.axis for each in tried} == {"north", "east"}
-    assert all(each.denied_by_truth == contradicts for each in tried)
+    assert all(each.contradicts_truth == contradicts for each in tried)
     assert all(each.change["sigma_z_m"] == pytest.approx(0.7 * sigma_z_m, rel=0.05)
                for each in tried)  # fmt: skip
     if contradicts:
-        assert set(root_findings(analysis)) == {"source_coloured"}
+        assert set(root_findings(analysis)) == {"source_noise_time_correlated"}
 
 
 @pytest.mark.parametrize(("tau_s", "seed"), [(5.0, 1), (20.0, 2)])
@@ -156,26 +164,29 @@ def test_find_slow_errors_with_truth_reports_correlation(tau_s: float, seed: int
     """Correlation times of IMU errors, so the innovations do not show them."""
     analysis = analysed(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
     found = root_findings(analysis)
-    assert set(found) == {"source_coloured"}
-    finding = found["source_coloured"]
+    assert set(found) == {"source_noise_time_correlated"}
+    finding = found["source_noise_time_correlated"]
     evidence = finding.evidence
     assert evidence["low_s"] < tau_s < 1.1 * evidence.get("high_s", np.inf)
     assert evidence["white_m"] == pytest.approx(0.07, abs=0.015)
     assert 0.03 < evidence["slow_m"] < 0.15
-    assert ("over at least" in finding.headline) == ("high_s" not in evidence)
+    assert ("over at least" in finding.title) == ("high_s" not in evidence)
     blind = root_findings(analysed(partial(errors.coloured, tau_s=tau_s), 5.0, seed))
-    assert "source_coloured" not in blind or "over at least" in blind["source_coloured"].headline
+    assert (
+        "source_noise_time_correlated" not in blind
+        or "over at least" in blind["source_noise_time_correlated"].title
+    )
 
 
 @pytest.mark.parametrize(
     ("model", "name"),
     [
-        (SCALED, "source_scale_wrong"),
-        (partial(errors.jumped, size=1.0), "source_jumps"),
-        (partial(errors.clock, late=0.3), "source_clock_offset"),
-        (LOUD, "source_noise_changes"),
-        (UNEQUAL, "source_axes_unequal"),
-        (partial(errors.low_pass, tau_s=0.3), "source_smoothed"),
+        (SCALED, "source_scale_error"),
+        (partial(errors.jumped, size=1.0), "source_position_jump"),
+        (partial(errors.clock, late=0.3), "source_time_offset"),
+        (LOUD, "source_noise_varies"),
+        (UNEQUAL, "source_noise_unequal_axes"),
+        (partial(errors.low_pass, tau_s=0.3), "source_low_pass_filtered"),
     ],
 )
 def test_find_other_mistakes_with_truth_report_no_correlation(
@@ -188,12 +199,14 @@ def test_find_other_mistakes_with_truth_report_no_correlation(
 def test_find_small_clock_jump_reports_no_correlation() -> None:
     """Errors along the motion after the jump are correlated in time against ground truth."""
     changes = partial(errors.clock_jump, late=0.15)
-    assert "source_coloured" not in root_findings(analysed(changes, 20.0, truth_for=0.10))
+    assert "source_noise_time_correlated" not in root_findings(
+        analysed(changes, 20.0, truth_for=0.10)
+    )
 
 
 def test_find_low_pass_reports_lag_below_time_constant() -> None:
     """Expected lag for steady motion: Δt ρ / (1 - ρ)."""
-    found = root_findings(analysed(SMOOTH, 5.0))["source_smoothed"]
+    found = root_findings(analysed(SMOOTH, 5.0))["source_low_pass_filtered"]
     assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)
 
 
@@ -202,9 +215,9 @@ def test_find_low_pass_reports_lag_below_time_constant() -> None:
     ("name", "model", "seed", "finding"),
     [
         # not a time-correlated error with a time offset, which fits as well
-        ("nominal", partial(errors.low_pass, tau_s=0.3), 8, "source_smoothed"),
+        ("nominal", partial(errors.low_pass, tau_s=0.3), 8, "source_low_pass_filtered"),
         # not a jump of 0.5 m, which one noise for both axes would suggest
-        ("10hz", UNEQUAL, 1107, "source_axes_unequal"),
+        ("10hz", UNEQUAL, 1107, "source_noise_unequal_axes"),
     ],
 )
 def test_find_px4_flight_reports_only_the_added_mistake(
@@ -255,12 +268,12 @@ def test_time_correlation_fit_tries_zero_and_estimated_offset(
 
 def test_find_correlated_noise_with_outliers_reports_both() -> None:
     """Jumps and outliers are removed before the correlation is estimated."""
-    assert {"source_jumps", "source_coloured"} <= set(
+    assert {"source_position_jump", "source_noise_time_correlated"} <= set(
         root_findings(analysed(partial(both, jump_m=2.0)))
     )
     found = root_findings(analysed(partial(both, outliers=0.03)))
-    assert {"source_outliers", "source_coloured"} <= set(found)
-    assert "source_jumps" not in found
+    assert {"source_outliers", "source_noise_time_correlated"} <= set(found)
+    assert "source_position_jump" not in found
 
 
 def both(rng: Any, time: Any, true: Any, jump_m: float = 0.0, outliers: float = 0.0) -> Any:
@@ -282,8 +295,8 @@ def test_find_jump_among_outliers_reports_one_jump(seed: int) -> None:
         return error, 0.0
 
     found = root_findings(analysed(model, seed=seed, passes=5))
-    assert {"source_jumps", "source_outliers"} == set(found)
-    evidence = found["source_jumps"].evidence
+    assert {"source_position_jump", "source_outliers"} == set(found)
+    evidence = found["source_position_jump"].evidence
     assert evidence["count"] == 1
     assert evidence["size_m"] == pytest.approx(1.0, abs=4.0 * evidence["sigma_m"])
     assert evidence["at_s"] == pytest.approx(kept["at_s"], abs=0.2)

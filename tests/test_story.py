@@ -14,7 +14,7 @@ from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import EV_POS, FLOW, Aid
 from px4fuse.findings import find
-from px4fuse.findings.summary import MAX_PARAGRAPHS, summarise_flight
+from px4fuse.findings.summary import MAX_PARAGRAPHS, summarise
 from px4fuse.flight import AidLog
 
 ALONG_DEG = 30.0
@@ -23,7 +23,7 @@ ALONG_DEG = 30.0
 def summary(comparison: Comparison) -> tuple[str, ...]:
     """Summarise a comparison, and check the form of each paragraph."""
     analysis = with_noises(comparison)
-    paragraphs = summarise_flight(analysis, find(analysis))
+    paragraphs = summarise(analysis, find(analysis))
     assert 1 <= len(paragraphs) <= MAX_PARAGRAPHS
     for paragraph in paragraphs:
         assert re.fullmatch(r"[A-Z0-9].*[^.]\.", paragraph), paragraph

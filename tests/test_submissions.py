@@ -1,4 +1,4 @@
-"""Submissions in folders and zip files: found, named, read within bounds, never unpacked."""
+"""Submissions in folders and zip files: search, names, limits; zip files are not unpacked."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ def reason(submission: Submission) -> str:
     return str(refused.value)
 
 
-def who(name: str) -> tuple[str, str]:
+def name_and_number(name: str) -> tuple[str, str]:
     origin = origin_of(name)
     return origin.person.name, "".join(origin.person.numbers.values())
 
 
-def only(path: Path) -> Submission:
+def single_submission(path: Path) -> Submission:
     (submission,), _ = find_submissions([path])
     return submission
 
 
-# ------------------------------------------------------------------ what is found
+# ------------------------------------------------------------------ search
 
 
-def test_folders_are_searched_and_sorted(tmp_path):
+def test_find_submissions_searches_folders_and_sorts(tmp_path):
     for name in ("b/report.pdf", "A/Report.PDF", "c.pdf", "notes.docx", "b/log.ulg", "x.docx"):
         write(tmp_path / name, PDF)
     for name in (".hidden.pdf", "__MACOSX/x.pdf", ".git/x.pdf"):
@@ -81,7 +81,7 @@ def test_folders_are_searched_and_sorted(tmp_path):
         ("doejane_12345_67890_report-1.pdf", ("doejane", "12345")),
         ("roejo_LATE_5_6_r.pdf", ("roejo", "5")),
         ("assignment_7_export/submission_31/report.pdf", ("", "31")),
-        # what a student puts into a zip file or a name stands behind the platform's own part
+        # the part of the platform comes first, then names that a student chose
         ("Roe Max_1_assignsubmission_file_/Doe Jane_2_assignsubmission_file_/r.pdf",
          ("Roe Max", "1")),
         ("roemax_5_6_doejane_7_8_report.pdf", ("roemax", "5")),
@@ -89,11 +89,11 @@ def test_folders_are_searched_and_sorted(tmp_path):
         ("flight_lab_reports_2026/r.pdf", ("", "")),
     ],
 )  # fmt: skip
-def test_who_handed_in_is_what_the_platform_wrote(name, is_):
-    assert who(name) == is_
+def test_origin_of_uses_platform_part_of_name(name, is_):
+    assert name_and_number(name) == is_
 
 
-def test_logins_and_times_in_names():
+def test_origin_of_reads_login_time_and_late_mark():
     blackboard = origin_of("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
     assert (blackboard.person.login, blackboard.platform) == ("roe1", "blackboard")
     assert origin_of("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
@@ -120,8 +120,8 @@ submission_31:
 """
 
 
-def test_a_name_that_a_student_chose_does_not_change_platform_or_time():
-    """Blackboard's export, with a second time and with Moodle's way in the student's own part."""
+def test_with_origins_forged_name_keeps_platform_and_time():
+    """The student's part of the name contains a second time, or a name as from Moodle."""
     usual = [f"Lab_user{n}_attempt_2026-11-20-11-00-0{n}_r.pdf" for n in range(3)]
     forged = [
         "Lab_eve_attempt_2026-11-23-10-00-00_x_attempt_2026-11-19-10-00-00_r.pdf",
@@ -134,7 +134,7 @@ def test_a_name_that_a_student_chose_does_not_change_platform_or_time():
     assert {one.time.day for one in origins[3:]} == {23}
 
 
-def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
+def test_find_submissions_reads_gradescope_metadata(tmp_path):
     forged = METADATA.replace("Doe, Jane", "Mallory")
     content = zipped(
         {
@@ -157,7 +157,7 @@ def test_gradescope_says_who_and_when_beside_its_submissions(tmp_path):
         assert found.origin.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
 
 
-def test_metadata_that_cannot_be_read_is_said(tmp_path):
+def test_find_submissions_unreadable_metadata_is_noted(tmp_path):
     bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
     (found,), (note,) = find_submissions([write(tmp_path / "export.zip", bomb)])
     assert found.origin.person == Person("", numbers={"gradescope": "3"})
@@ -166,7 +166,7 @@ def test_metadata_that_cannot_be_read_is_said(tmp_path):
     )
 
 
-def test_times_of_entries_are_kept(tmp_path):
+def test_find_submissions_keeps_zip_entry_times(tmp_path):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(zipfile.ZipInfo("a.pdf", (2026, 11, 20, 12, 34, 56)), PDF)
@@ -176,13 +176,13 @@ def test_times_of_entries_are_kept(tmp_path):
     assert times == {"a.pdf": "2026-11-20T12:34:56", "b.pdf": None}
 
 
-def test_a_zip_that_a_student_handed_in_is_told_and_not_opened(tmp_path):
+def test_find_submissions_zip_inside_export_is_not_opened(tmp_path):
     name = "Roe_1_assignsubmission_file_/work.zip"
     handed_in = zipped({"report.pdf": PDF, "more.zip": zipped({"deep.pdf": PDF})})
     export = write(tmp_path / "all.zip", zipped({name: handed_in, "log.ulg": b""}))
     found, notes = find_submissions([export])
     assert [each.name for each in found] == [name]
-    assert who(found[0].name) == ("Roe", "1")
+    assert name_and_number(found[0].name) == ("Roe", "1")
     with pytest.raises(ResultsError) as refused:
         read_report(read(found[0]), found[0].name)
     assert str(refused.value) == f"{name}: not a PDF. Hand in the file that px4fuse wrote."
@@ -190,18 +190,18 @@ def test_a_zip_that_a_student_handed_in_is_told_and_not_opened(tmp_path):
         "Ignored files (not PDF): 1.",
         "Zip files not opened: 1. Name the export of a platform on the command line.",
     )
-    # the same where the export was unpacked
+    # the same for an unpacked export
     write(tmp_path / "unpacked" / name, handed_in)
     ((again,), _) = find_submissions([tmp_path / "unpacked"])
     assert (again.name, again.entry) == (name, "")
 
 
-def test_a_class_has_more_files_than_a_student(tmp_path):
+def test_find_submissions_80_files_are_found(tmp_path):
     class_ = {f"N_{n}_assignsubmission_file_/r.pdf": PDF for n in range(80)}
     assert len(find_submissions([write(tmp_path / "class.zip", zipped(class_))])[0]) == 80
 
 
-def test_nothing_there(tmp_path):
+def test_find_submissions_without_pdf_raises_error(tmp_path):
     with pytest.raises(SettingsError, match="not a file or folder"):
         find_submissions([tmp_path / "absent"])
     write(tmp_path / "a.txt", b"")
@@ -210,7 +210,7 @@ def test_nothing_there(tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_damaged_zip_leaves_the_others(tmp_path):
+def test_find_submissions_damaged_zip_is_skipped_with_note(tmp_path):
     bad = write(tmp_path / "bad.zip", b"PK" + bytes(100))
     good = write(tmp_path / "good.zip", zipped({"a.pdf": PDF}))
     found, notes = find_submissions([bad, good])
@@ -220,7 +220,7 @@ def test_a_damaged_zip_leaves_the_others(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights that tests do not have")
-def test_links_do_not_lead_out_of_the_folder(tmp_path):
+def test_find_submissions_ignores_links_and_special_files(tmp_path):
     outside = write(tmp_path / "outside" / "secret.pdf", PDF)
     inside = write(tmp_path / "in" / "a.pdf", PDF)
     (tmp_path / "in" / "link.pdf").symlink_to(outside)
@@ -237,8 +237,8 @@ def test_links_do_not_lead_out_of_the_folder(tmp_path):
     )
 
 
-def test_folders_in_each_other_without_end(tmp_path):
-    """More than functions may call themselves."""
+def test_find_submissions_1500_nested_folders_are_searched(tmp_path):
+    """Deeper than Python's recursion limit."""
     folders = [tmp_path / "in" / ("d/" * depth) for depth in range(1_500)]
     for folder in folders:
         folder.mkdir()
@@ -246,20 +246,20 @@ def test_folders_in_each_other_without_end(tmp_path):
     try:
         found, notes = find_submissions([tmp_path / "in"])
         known = files_by_sha256([tmp_path / "in"])
-    finally:  # shutil.rmtree, which clears the tests' folders, calls itself
+    finally:  # shutil.rmtree, which removes temporary folders, is recursive
         for path in paths:
             path.unlink()
         for folder in reversed(folders):
             folder.rmdir()
     assert [each.file for each in found] == paths
     assert notes == ()
-    assert [*known.values()] == paths[:1]  # both have the same content
+    assert [*known.values()] == paths[:1]  # equal content
 
 
 # ------------------------------------------------------------------ names
 
 
-def test_hostile_names_are_shown_and_never_used(tmp_path):
+def test_find_submissions_cleans_names_and_writes_nothing(tmp_path):
     shown_as = {
         "../../../etc/x.pdf": "etc/x.pdf",
         "C:\\Windows\\system32\\y.pdf": "Windows/system32/y.pdf",
@@ -279,30 +279,30 @@ def test_hostile_names_are_shown_and_never_used(tmp_path):
 # ------------------------------------------------------------------ bounds
 
 
-def test_files_that_are_too_large(tmp_path):
+def test_read_too_large_file_is_rejected_in_bounded_memory(tmp_path):
     path = tmp_path / "large.pdf"
     with path.open("wb") as file:
-        file.truncate(500_000_000)  # sparse: it takes no space
+        file.truncate(500_000_000)  # sparse file
     tracemalloc.start()
-    said = reason(only(path))
+    said = reason(single_submission(path))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert said == "large.pdf: larger than 25 MB; reports are below 2 MB."
     assert peak < 3 * MAX_BYTES
 
 
-def test_bombs_and_lies(tmp_path, monkeypatch):
+def test_read_zip_bomb_or_wrong_size_is_rejected(tmp_path, monkeypatch):
     packed = zipped({"bomb.pdf": bytes(20_000_000)})
     path = write(tmp_path / "x.zip", packed)
-    assert "compressed more than 100 times" in reason(only(path))
+    assert "compressed more than 100 times" in reason(single_submission(path))
     path.write_bytes(zipped({"large.pdf": bytes(MAX_BYTES + 1)}))
-    assert "larger than 25 MB" in reason(only(path))
-    # a declared size that is smaller than what there is: zipfile stops there, and the sum is off
+    assert "larger than 25 MB" in reason(single_submission(path))
+    # declared size below the actual one: zipfile stops there, and the checksum is wrong
     path.write_bytes(packed.replace(struct.pack("<I", 20_000_000), struct.pack("<I", 1000)))
-    assert "cannot be read" in reason(only(path))
+    assert "cannot be read" in reason(single_submission(path))
     monkeypatch.setattr(submissions, "MAX_BYTES", len(PDF))
     path.write_bytes(zipped({"just.pdf": PDF}))
-    assert read(only(path)) == PDF
+    assert read(single_submission(path)) == PDF
 
 
 @pytest.mark.parametrize(
@@ -313,7 +313,7 @@ def test_bombs_and_lies(tmp_path, monkeypatch):
         ("MAX_DIRECTORY_BYTES", 100, "damaged"),
     ],
 )
-def test_bounds_of_a_whole_zip_file(tmp_path, monkeypatch, limit, value, said):
+def test_find_submissions_zip_beyond_limits_is_skipped(tmp_path, monkeypatch, limit, value, said):
     path = write(tmp_path / "x.zip", zipped({f"{n}.pdf": bytes(100) for n in range(4)}))
     other = write(tmp_path / "y.pdf", PDF)
     monkeypatch.setattr(submissions, limit, value)
@@ -322,7 +322,7 @@ def test_bounds_of_a_whole_zip_file(tmp_path, monkeypatch, limit, value, said):
     assert any(note.startswith("x.zip: ignored: ") and said in note for note in notes)
 
 
-def test_entries_that_are_not_read_say_why(tmp_path):
+def test_read_unsupported_zip_entry_states_reason(tmp_path):
     link = zipfile.ZipInfo("link.pdf")
     link.external_attr = 0o120777 << 16
     out = io.BytesIO()
@@ -348,21 +348,21 @@ def test_entries_that_are_not_read_say_why(tmp_path):
     assert reason(by_name["same.pdf"]).endswith("(No such file or directory).")
 
 
-def test_equal_names_are_told_apart(tmp_path):
+def test_find_submissions_equal_names_are_numbered(tmp_path):
     for folder in "abc":
         write(tmp_path / folder / "Report.pdf", folder.encode())
     folders = [tmp_path / folder for folder in "abc"]
     found, _ = find_submissions([*folders, *folders])
     assert [each.name for each in found] == ["Report.pdf", "Report.pdf (2)", "Report.pdf (3)"]
     assert [read(each) for each in found] == [b"a", b"b", b"c"]
-    # of an unmarked code page
+    # names without the UTF-8 flag
     content = zipped({"M_ller.pdf": PDF, "Zo__.pdf": PDF})
     content = content.replace(b"M_ller", b"M\x81ller").replace(b"Zo__", "Zoë".encode())
     found, _ = find_submissions([write(tmp_path / "x.zip", content)])
     assert [each.name for each in found] == ["Müller.pdf", "Zoë.pdf"]
 
 
-def test_mutated_zip_files_never_raise_anything_else(tmp_path):
+def test_find_submissions_mutated_zip_is_read_or_rejected(tmp_path):
     rng = random.Random(6)
     whole = zipped({"a/report.pdf": PDF * 20, "b.zip": zipped({"c.pdf": PDF}), "d.txt": b""})
     path = tmp_path / "x.zip"

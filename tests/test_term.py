@@ -1,4 +1,4 @@
-"""A term: forty students on three platforms, graded, edited, overridden, regraded, imported."""
+"""Grading of 40 students on three platforms, with a new rubric, overrides and grade tables."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from class_tools import at_once, report_of, zipped
-from golden_tools import agrees
+from class_tools import make_report, skip_verification, write_zip
+from golden_tools import assert_matches_golden
 
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import read_people
@@ -22,9 +22,9 @@ from px4fuse.grading.model import Entry
 from px4fuse.grading.rubric import read_rubric, rubric_text
 
 STUDENTS = range(1, 41)
-MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 hand in nothing
+MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 submit nothing
 LATE, RESUBMITTED, COPIED, HOSTILE, INTRUDER = 30, 31, 20, 5, 9
-# Whose feedback is kept
+# Students whose feedback is in the golden file
 SHOWN = ("0001", "0005", "0009", "0020", "0030", "0031", "0039")
 HEADS = {
     "moodle": ["Identifier", "Full name", "ID number", "Email address", "Status", "Grade",
@@ -58,7 +58,7 @@ def log(number: int) -> bytes:
 
 def report(number: int) -> bytes:
     made = hashlib.sha256(log(number)).hexdigest()
-    return report_of(name(number), student_id(number), made)
+    return make_report(name(number), student_id(number), made)
 
 
 def table(path: Path, head: list[str], rows: list[list[str]], separator: str = ",") -> Path:
@@ -69,7 +69,7 @@ def table(path: Path, head: list[str], rows: list[list[str]], separator: str = "
 
 
 class Lab:
-    """The folder of an instructor in the middle of a term."""
+    """Folder of an instructor: logs, exports of platforms, class list and grade tables."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.output, self.logs = folder, folder / "class", folder / "logs"
@@ -95,16 +95,16 @@ class Lab:
                  for n in MOODLE}  # fmt: skip
         own = f"{name(HOSTILE)}_{9000 + HOSTILE}_assignsubmission_file_"
         files[f"{own}/report.pdf"] = b"%PDF-1.7 /JavaScript %%EOF"
-        # a zip file with another student's folder in it
+        # zip file that contains the folder of another student
         inner = io.BytesIO()
         with zipfile.ZipFile(inner, "w") as archive:
             archive.writestr(f"{name(1)}_9001_assignsubmission_file_/report.pdf", b"%PDF- none")
         files[f"{name(INTRUDER)}_{9000 + INTRUDER}_assignsubmission_file_/w.zip"] = inner.getvalue()
-        return zipped(self.folder / "moodle.zip", files)
+        return write_zip(self.folder / "moodle.zip", files)
 
     def canvas(self) -> Path:
         self.pdf[COPIED] = self.pdf[3]
-        return zipped(
+        return write_zip(
             self.folder / "canvas.zip",
             {f"{(last(n) + first(n)).lower()}_{'LATE_' if n == 17 else ''}{700 + n}_{n}_r.pdf":
              self.pdf[n] for n in CANVAS},
@@ -114,7 +114,7 @@ class Lab:
         files = {f"Lab_user{n}_attempt_2026-11-{20 if n != LATE else 22}-11-00-00_r.pdf":
                  self.pdf[n] for n in BLACKBOARD}  # fmt: skip
         files[f"Lab_user{RESUBMITTED}_attempt_2026-11-20-11-30-00_r.pdf"] = self.better
-        return zipped(self.folder / "blackboard.zip", files)
+        return write_zip(self.folder / "blackboard.zip", files)
 
     def worksheet(self) -> Path:
         rows = [[f"Participant {9000 + n}", name(n), "", f"s{n}@x.edu", "Submitted for grading", "",
@@ -145,7 +145,7 @@ def lab(tmp_path: Path) -> Lab:
     return Lab(tmp_path)
 
 
-def of(outcome: GradeOutcome, number: int) -> Entry:
+def entry_of(outcome: GradeOutcome, number: int) -> Entry:
     return next(one for one in outcome.entries if one.student_id == student_id(number))
 
 
@@ -153,39 +153,39 @@ def points(outcome: GradeOutcome) -> dict[str, float | None]:
     return {one.student_id: one.total for one in outcome.entries}
 
 
-def test_a_term(lab, monkeypatch) -> None:
-    verified = at_once(monkeypatch)
+def test_grade_term_applies_new_rubric_and_overrides(lab, monkeypatch) -> None:
+    verified = skip_verification(monkeypatch)
     outcome = lab.grade()
-    as_it_was_written(lab.output)
-    assert outcome.reused == 2  # the copy, and what was handed in twice
+    check_golden_tables(lab.output)
+    assert outcome.reused == 2  # the copied and the repeated report
     count = len(verified)
-    another_rubric(lab, outcome)
-    the_instructors_word(lab, outcome)
-    assert len(verified) == count  # points changed, and no report was looked at again
-    anonymous(lab, outcome)
+    check_other_rubric(lab, outcome)
+    check_overrides(lab, outcome)
+    assert len(verified) == count  # points changed without a new verification
+    check_pseudonyms(lab, outcome)
 
 
-def as_it_was_written(output: Path) -> None:
-    """Tables, and what some are told, as they were looked at."""
+def check_golden_tables(output: Path) -> None:
+    """Compare tables and some feedback with the golden file."""
     lines = []
     tables = [output / "class.csv", *sorted((output / "grades").glob("*.csv"))]
     told = [path for path in sorted((output / "feedback").iterdir()) if path.stem in SHOWN]
     for path in (*tables, *told):
         lines += ["", path.name, *path.read_text(encoding="utf-8-sig").splitlines()]
-    agrees("term", lines)
+    assert_matches_golden("term", lines)
 
 
-def another_rubric(lab: Lab, outcome: GradeOutcome) -> None:
+def check_other_rubric(lab: Lab, outcome: GradeOutcome) -> None:
     doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
     (lab.folder / "lab.toml").write_text(doubled, encoding="utf-8")
     second = lab.grade(read_rubric(lab.folder / "lab.toml"))
-    assert second.reused == 38  # two of the files are no reports
-    assert of(second, 1).total == pytest.approx(2 * of(outcome, 1).total, abs=0.2)
+    assert second.reused == 38  # two files are not reports
+    assert entry_of(second, 1).total == pytest.approx(2 * entry_of(outcome, 1).total, abs=0.2)
 
 
-def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> None:
-    """Overrides are read, never written over, and kept by every regrade."""
-    usual = of(outcome, 1)
+def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
+    """Check that overrides are applied, not overwritten, and kept when grading again."""
+    usual = entry_of(outcome, 1)
     item = usual.counting.items[0].title
     said = lab.output / "overrides.csv"
     assert said.read_text(encoding="utf-8-sig") == "id,item,points,comment\n"
@@ -198,8 +198,8 @@ def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> None:
     third = lab.grade()
     assert said.read_bytes() == before
     expected = usual.total - usual.counting.items[0].points + 1.0
-    assert of(third, 1).total == pytest.approx(expected)
-    assert of(third, 40).total == 12.0
+    assert entry_of(third, 1).total == pytest.approx(expected)
+    assert entry_of(third, 40).total == 12.0
     assert "overrides.csv: no student has the id 0099." in third.notes
     changed = {key for key, value in points(third).items() if value != points(outcome)[key]}
     assert changed == {"0001", "0040"}
@@ -212,8 +212,8 @@ def the_instructors_word(lab: Lab, outcome: GradeOutcome) -> None:
     assert (lab.output / "class.csv").read_bytes() == fleet_table
 
 
-def anonymous(lab: Lab, outcome: GradeOutcome) -> None:
-    """Who is who stands in a file of its own, and stays."""
+def check_pseudonyms(lab: Lab, outcome: GradeOutcome) -> None:
+    """Check the table of pseudonyms."""
     text = (lab.output / "names.csv").read_text(encoding="utf-8-sig")
     rows = list(csv.DictReader(io.StringIO(text, newline="")))
     assert {row["id"] for row in rows} == {one.student_id for one in outcome.entries}

@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli_tools import done, refused
-from conftest import page_of
+from cli_tools import error_line, run_checked
+from conftest import blank_page
 from exchange import replace
 from rich.console import Console
 
@@ -32,7 +32,7 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 WIDTH = 80
 
@@ -91,9 +91,9 @@ def test_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
     assert "\x1b" not in whole
     # in a pipe a paragraph is one line; the summary comes first and is not repeated
     lines = whole.splitlines()
-    story = document[1].story
-    assert lines[: len(story) + 1] == [*story, ""]
-    assert all(whole.count(sentence) == 1 for sentence in story)
+    paragraphs = document[1].summary
+    assert lines[: len(paragraphs) + 1] == [*paragraphs, ""]
+    assert all(whole.count(paragraph) == 1 for paragraph in paragraphs)
 
 
 def test_paragraph_has_hanging_indent(capsys) -> None:
@@ -146,26 +146,26 @@ def test_expand_commands_adds_typed_files_and_options() -> None:
 def test_printed_commands_run_when_pasted(desk, monkeypatch, typed) -> None:
     monkeypatch.chdir(desk.parent)  # the typed path then contains blanks and a quote
     words = shlex.split(typed.format(log=shlex.quote(f"{desk.name}/l.ulg")))
-    printed = commands(done(*words).stdout)
+    printed = commands(run_checked(*words).stdout)
     assert printed
     for command in printed:
         pasted = shlex.split(command)
         assert pasted[:3] == ["px4fuse", "compare", f"{desk.name}/l.ulg"]
         assert {word for word in words if word.startswith("--")} <= set(pasted)
-        done(*pasted[1:])
+        run_checked(*pasted[1:])
 
 
 @pytest.mark.usefixtures("no_drawing")
 def test_command_of_finding_removes_finding(desk) -> None:
-    first = done("compare", "l.ulg", "--sigma-z", "0.12", "--json", "a.json")
+    first = run_checked("compare", "l.ulg", "--sigma-z", "0.12")
     assert "reports/l_sigma-z-0.12.pdf" in first.stdout.replace(os.sep, "/")
     command = next(command for command in commands(first.stdout) if "--clock-offset" in command)
-    done(*shlex.split(command)[1:], "--json", "b.json")
+    run_checked(*shlex.split(command)[1:], "--json", "b.json")
     findings = [
         {one["id"] for one in json.loads(Path(name).read_text())["findings"]}
-        for name in ("a.json", "b.json")
+        for name in ("reports/l_sigma-z-0.12.json", "b.json")
     ]
-    assert "source_clock_offset" in findings[0] - findings[1]
+    assert "source_time_offset" in findings[0] - findings[1]
 
 
 # --- files ---
@@ -177,8 +177,13 @@ def files(folder: Path) -> set[str]:
 
 @pytest.mark.parametrize("command", ["compare", "tune", "sync", "whatif", "loop", "info"])
 def test_json_to_standard_output_writes_no_file(command, desk) -> None:
-    assert json.loads(done(command, "l.ulg", "--json", "-").stdout)
+    assert json.loads(run_checked(command, "l.ulg", "--json", "-").stdout)
     assert files(desk) == {"l.ulg"}
+
+
+def test_json_to_file_writes_no_report(desk) -> None:
+    run_checked("compare", "l.ulg", "--json", "a.json")
+    assert files(desk) == {"a.json", "l.ulg"}
 
 
 @pytest.fixture
@@ -196,7 +201,7 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     changed = replace(made, request=request.without_paths(), student=student)
     path = default_report(Path(request.log).stem, settings_name(request), changed)
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(page_of(None, to_json(changed)))
+    path.write_bytes(blank_page(None, to_json(changed)))
     path.with_suffix(".json").write_text(to_json(changed), encoding="utf-8")
     return path.name
 
@@ -241,11 +246,41 @@ def test_default_name_of_another_file_is_refused(made, name) -> None:
 def test_same_name_in_two_folders_keeps_first_report(desk, sample_log) -> None:
     (desk / "b").mkdir()
     shutil.copy(sample_log, desk / "b" / "l.ulg")
-    done("compare", "l.ulg")
+    run_checked("compare", "l.ulg")
     before = Path("reports/l.pdf").read_bytes()
-    assert "Choose another name with -o" in refused("compare", "b/l.ulg")
+    assert "Choose another name with -o" in error_line("compare", "b/l.ulg")
     assert Path("reports/l.pdf").read_bytes() == before
-    done("compare", "l.ulg")
+    run_checked("compare", "l.ulg")
+
+
+def test_default_page_of_another_log_is_kept(desk, sample_log) -> None:
+    (desk / "b").mkdir()
+    shutil.copy(sample_log, desk / "b" / "l.ulg")
+    page = Path("reports/l.html")
+    run_checked("explore", "l.ulg")
+    before = page.read_bytes()
+    assert "l.html exists and is not a page" in error_line("explore", "b/l.ulg")
+    assert page.read_bytes() == before
+    run_checked("explore", "l.ulg")
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["explore l.ulg", "practice --seed 3 --flights 1 --no-open"],
+    ids=["explore", "practice"],
+)
+@pytest.mark.parametrize(
+    "mine", [b"mine", b"\xff", b"<html><title>l.ulg - px4fuse explore</title>"]
+)
+def test_default_page_of_user_is_kept(desk, command, mine) -> None:
+    page = Path("reports", "practice_3.html" if "practice" in command else "l.html")
+    page.parent.mkdir()
+    page.write_bytes(mine)
+    assert f"{page} exists and is not a page of" in error_line(*command.split())
+    assert page.read_bytes() == mine
+    run_checked(*command.split(), "-o", page)
+    assert page.read_bytes() != mine
+    run_checked(*command.split())  # an own page is replaced
 
 
 def test_settings_name_is_valid_in_file_names() -> None:

@@ -8,13 +8,13 @@ from typing import Any
 import jsonschema
 import pypdf
 import pytest
-from cli_tools import contents, refused, run
+from cli_tools import contents, error_line, run
 from click.testing import Result
 from conftest import REPOSITORY
 
 from px4fuse.results.contract import schema
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 LOG = REPOSITORY / "sample_logs" / "loop_vio.ulg"
 SLAM = REPOSITORY / "sample_logs" / "loop_slam.tum"
@@ -23,7 +23,7 @@ ROWS = [line for line in SLAM.read_text().splitlines() if not line.startswith("#
 
 
 def results(*arguments: str | Path) -> dict[str, Any]:
-    """What a command prints with ``--json -``."""
+    """Return the JSON that a command prints with ``--json -``."""
     result = run(*arguments, "--json", "-")
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
@@ -157,7 +157,7 @@ def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
     assert found == results(*command)
     assert found["alignment"] == "se3"
     assert found["ate"]["translation_m"]["rmse"] == pytest.approx(0.060, abs=0.01)
-    assert found["time_offset"]["determinable"]
+    assert found["time_offset"]["is_determinable"]
     assert run(*command).exit_code == 0
     assert contents(tmp_path) == before
     deltas = results(*command, "--rpe", "5m", "--rpe", "10s", "--rpe", "1f")["rpe"]
@@ -179,7 +179,7 @@ def test_evaluate_other_settings_or_files_keep_old_report(desk, tmp_path, monkey
         written = {Path(name).stem for name in contents(tmp_path / "reports")}
         assert written == set(list(commands)[:count])
     before = contents(tmp_path / "reports")
-    assert "-o" in refused("evaluate", tmp_path / "other" / "s.tum", desk / "s.tum")
+    assert "-o" in error_line("evaluate", tmp_path / "other" / "s.tum", desk / "s.tum")
     assert contents(tmp_path / "reports") == before
 
 

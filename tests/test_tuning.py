@@ -63,12 +63,12 @@ def test_tune_clean_data_have_no_outliers() -> None:
 
 
 def test_held_out_true_settings_have_no_gain() -> None:
-    gains = np.array([found.held_out.gain_nats for found in many()])
+    gains = np.array([found.held_out.log_likelihood_gain_per_measurement for found in many()])
     assert np.mean(gains) < 0.0
     assert np.median(gains) <= 0.0
     assert np.max(gains) < 0.05
     # on the data of the fit there is always a gain: half a χ² of two parameters, mean 1 per flight
-    seen = np.array([found.gain_nats * found.count for found in many()])
+    seen = np.array([found.log_likelihood_gain_per_measurement * found.count for found in many()])
     assert np.all(seen >= -1e-3)
     assert np.mean(seen) == pytest.approx(1.0, abs=2.6 / np.sqrt(SEEDS))
 
@@ -76,9 +76,9 @@ def test_held_out_true_settings_have_no_gain() -> None:
 def test_held_out_wrong_settings_have_a_gain() -> None:
     bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, input="zero")
     found = tuned(modelled(1), chosen=bad)
-    assert found.held_out.gain_nats > 0.1
+    assert found.held_out.log_likelihood_gain_per_measurement > 0.1
     assert found.held_out.count == COUNT // 2
-    assert found.gain_nats > 0.1
+    assert found.log_likelihood_gain_per_measurement > 0.1
     assert found.before.verdict != "consistent"
     assert found.after.verdict == "consistent"
     assert abs(found.after.lag1_autocorrelation) < abs(found.before.lag1_autocorrelation)
@@ -123,7 +123,7 @@ def test_map_equals_likelihood_and_interval_its_profile() -> None:
         # possible outliers have a slightly lower weight
         assert found.map.drop[i, j] == pytest.approx(drop, rel=0.02, abs=0.02)
     assert found.map.drop.min() == 0.0
-    ends = ((grid_a, 1, found.filter_sigma_a), (grid_z, 0, found.sigma_z))
+    ends = ((grid_a, 1, found.sigma_a_two_state), (grid_z, 0, found.sigma_z))
     for grid, axis_of_other, noise in ends:
         profile = CubicSpline(np.log(grid), found.map.drop.min(axis=axis_of_other))
         for end in (noise.low, noise.high):
@@ -191,10 +191,10 @@ def test_tune_separates_biases_and_tilt_from_noise() -> None:
     found, without = horizontal(flight), horizontal(flight, imu=False)
     assert found.sigma_a.low <= 0.1 <= found.sigma_a.high
     assert found.sigma_z.low <= 0.1 <= found.sigma_z.high
-    assert found.filter_sigma_a.low > found.sigma_a.high
+    assert found.sigma_a_two_state.low > found.sigma_a.high
     # without fitted constants there is only KF's SIGMA_A
-    assert without.sigma_a == without.filter_sigma_a
-    assert without.sigma_a.value == pytest.approx(found.filter_sigma_a.value, rel=0.1)
+    assert without.sigma_a == without.sigma_a_two_state
+    assert without.sigma_a.value == pytest.approx(found.sigma_a_two_state.value, rel=0.1)
     assert len(found.outlier_time_s) == 0
     assert found.noises.walk_m == 0.0
 

@@ -1,4 +1,4 @@
-"""Reports that prove themselves: no change of one reaches what an instructor then looks at."""
+"""Verification: a changed report is detected, and the redrawn report does not contain it."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from typing import Any
 
 import pytest
 from class_tools import in_this_process
-from cli_tools import done
+from cli_tools import run_checked
 from conftest import LOG, REPORT, SAMPLES
 from forgery import (
-    Base,
     Change,
     Edit,
     Forge,
-    appended,
+    VerifiedReport,
+    append_update,
     array,
-    base,
+    attached_results,
+    catalogue,
     dictionary,
-    edited,
+    document_info,
+    edit_stream,
     font,
     forged,
     glyphs,
+    make_verified_report,
     on_page,
-    plain,
-    put,
+    pdf_bytes,
     read_again,
-    report_of,
-    root,
-    saved,
+    set_value,
     text,
-    titled,
+    to_dict,
     with_results,
 )
 from pypdf import PdfReader, PdfWriter
@@ -60,47 +60,47 @@ from px4fuse.verification.verification import (
     verify,
 )
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 LOOP_LOG = SAMPLES / "loop_vio.ulg"
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _pages_in_this_process() -> Iterator[None]:
-    """The process that bounds the comparison of pages takes seconds; test_pages.py has one."""
+def _compare_pages_in_process() -> Iterator[None]:
+    """Compare pages in this process; test_pages.py tests the separate one."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
         yield
 
 
 @pytest.fixture(scope="module")
-def aisle() -> Base:
-    return base(REPORT.read_bytes(), LOG)
+def aisle() -> VerifiedReport:
+    return make_verified_report(REPORT.read_bytes(), LOG)
 
 
 @pytest.fixture(scope="module")
-def loop(tmp_path_factory: pytest.TempPathFactory) -> Base:
+def loop(tmp_path_factory: pytest.TempPathFactory) -> VerifiedReport:
     folder = tmp_path_factory.mktemp("loop")
     (folder / "notes.md").write_text("# Drift\n\nThe *heading* drifts most.\n", encoding="utf-8")
     target = folder / "loop.pdf"
     own = "--student", "Ada", "--id", "7", "--notes", folder / "notes.md"
-    done("loop", LOOP_LOG, "-o", target, *own)
-    return base(target.read_bytes(), LOOP_LOG)
+    run_checked("loop", LOOP_LOG, "-o", target, *own)
+    return make_verified_report(target.read_bytes(), LOOP_LOG)
 
 
-# -- what is untouched -----------------------------------------------------------------------------
+# -- unchanged reports -----------------------------------------------------------------------------
 
 
-def test_the_shipped_report_is_verified(aisle: Base) -> None:
+def test_verify_example_report_is_verified(aisle: VerifiedReport) -> None:
     shipped = REPORT.read_bytes()
-    verdict = verify(report_of(shipped), shipped, aisle.files, recompute=aisle.recompute)
+    verdict = verify(attached_results(shipped), shipped, aisle.files, recompute=aisle.recompute)
     assert verdict.status == "verified", verdict
     assert verdict.with_log
     assert verdict.page_status == "same"
     assert LIMIT in verdict.reasons
 
 
-def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
+def test_verify_loop_report_is_verified(loop: VerifiedReport) -> None:
     verdict = loop.verified(loop.pdf)
     assert verdict.status == "verified", verdict
     text = "".join(page.extract_text() for page in PdfReader(io.BytesIO(loop.pdf)).pages)
@@ -108,25 +108,25 @@ def test_a_report_on_a_loop_is_verified(loop: Base) -> None:
     assert "heading drifts most" in text.replace("*", "")
 
 
-def test_nothing_is_verified_without_the_log(aisle: Base, loop: Base) -> None:
+def test_verify_without_log_cannot_verify(aisle: VerifiedReport, loop: VerifiedReport) -> None:
     for one in (aisle, loop):
-        verdict = verify(report_of(one.pdf), one.pdf, {})
+        verdict = verify(attached_results(one.pdf), one.pdf, {})
         assert verdict.status == "cannot verify"
         assert verdict.reasons == (NO_LOG,)
         assert verdict.redrawn == b""
         assert not verdict.with_log
 
 
-def nudged(value: Any, share: float) -> Any:
+def scaled(value: Any, share: float) -> Any:
     if isinstance(value, float):
         return value * (1.0 + share)
     if isinstance(value, dict):
-        return {name: nudged(part, share) for name, part in value.items()}
-    return [nudged(part, share) for part in value] if isinstance(value, list | tuple) else value
+        return {name: scaled(part, share) for name, part in value.items()}
+    return [scaled(part, share) for part in value] if isinstance(value, list | tuple) else value
 
 
-def shifted(pdf: bytes, by: float) -> bytes:
-    """All lines and marks a little aside."""
+def move_lines(pdf: bytes, by: float) -> bytes:
+    """Move all lines and marks by a distance."""
     ends = re.compile(rb"(\d[\d.]*) (\d[\d.]*) ([ml])\b")
 
     def moved(match: re.Match[bytes]) -> bytes:
@@ -141,34 +141,38 @@ def shifted(pdf: bytes, by: float) -> bytes:
 
 
 @pytest.mark.parametrize("which", ["aisle", "loop"])
-def test_another_platform_is_still_verified(which: str, request: pytest.FixtureRequest) -> None:
-    one: Base = request.getfixturevalue(which)
-    drawn = shifted(one.pdf, 0.01)
-    nudged_ = read_again(nudged(json.loads(to_json(one.again[0])), -1e-9))
-    elsewhere = (nudged_, lambda: drawn)
-    verdict = verify(report_of(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
+def test_verify_numbers_of_other_platform_are_verified(
+    which: str, request: pytest.FixtureRequest
+) -> None:
+    one: VerifiedReport = request.getfixturevalue(which)
+    drawn = move_lines(one.pdf, 0.01)
+    scaled_results = read_again(scaled(json.loads(to_json(one.again[0])), -1e-9))
+    elsewhere = (scaled_results, lambda: drawn)
+    verdict = verify(attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
     assert verdict.outcome == "verified", verdict
     assert f"within {RELATIVE_TOLERANCE:g}" in verdict.reasons[0]
-    aside = shifted(one.pdf, 0.6)
+    aside = move_lines(one.pdf, 0.6)
     elsewhere = (one.again[0], lambda: aside)
-    verdict = verify(report_of(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
+    verdict = verify(attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere)
     assert (verdict.status, verdict.outcome) == ("verified", "page differs")
     assert verdict.redrawn == aside
 
 
-def test_verify_numbers_1e_12_apart_are_verified(aisle: Base) -> None:
+def test_verify_numbers_1e_12_apart_are_verified(aisle: VerifiedReport) -> None:
     """Other kernels of OpenBLAS change results of the sample flights by 3e-8 at most."""
-    nudged_ = read_again(nudged(json.loads(to_json(aisle.again[0])), -1e-12))
-    elsewhere = (nudged_, lambda: forged(aisle.pdf))
-    verdict = verify(report_of(aisle.pdf), aisle.pdf, aisle.files, recompute=lambda *_: elsewhere)
+    scaled_results = read_again(scaled(json.loads(to_json(aisle.again[0])), -1e-12))
+    elsewhere = (scaled_results, lambda: forged(aisle.pdf))
+    verdict = verify(
+        attached_results(aisle.pdf), aisle.pdf, aisle.files, recompute=lambda *_: elsewhere
+    )
     assert verdict.outcome == "verified", verdict
 
 
-def test_compare_results_numbers_1e_4_apart_differ(aisle: Base) -> None:
-    """Every number but those with the tolerance of an estimate, and those near zero."""
+def test_compare_results_numbers_1e_4_apart_differ(aisle: VerifiedReport) -> None:
+    """All numbers, except estimates, which have another tolerance, and those near zero."""
     ours = json.loads(to_json(aisle.again[0]))
     for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
-        theirs = nudged(ours, share)
+        theirs = scaled(ours, share)
         found = {one.path for one in compare_results(theirs, ours)[0]}
         wide = verification.ESTIMATE_PATHS if least == RELATIVE_TOLERANCE else ()
         expected = {
@@ -182,7 +186,7 @@ def test_compare_results_numbers_1e_4_apart_differ(aisle: Base) -> None:
 KF = ("axes", "north", "filters", "kf")
 
 
-def test_tolerances(aisle: Base) -> None:
+def test_compare_results_applies_each_tolerance(aisle: VerifiedReport) -> None:
     ours = json.loads(to_json(aisle.again[0]))
     for share, path, alike in (
         (0.5 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), True),
@@ -198,7 +202,7 @@ def test_tolerances(aisle: Base) -> None:
         assert (not compare_results(theirs, ours)[0]) == alike, path
 
 
-# -- what is changed in the results ----------------------------------------------------------------
+# -- changed results -------------------------------------------------------------------------------
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -211,10 +215,10 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield path
 
 
-def one_of_each_kind() -> list[tuple[Any, ...]]:
-    """A leaf of every name in the results."""
-    results = plain(report_of(REPORT.read_bytes()))
-    # what another test is for: the log, the version, and what is printed anew
+def leaf_of_each_name() -> list[tuple[Any, ...]]:
+    """Return one path to a value for each name in the results."""
+    results = to_dict(attached_results(REPORT.read_bytes()))
+    # other tests cover the log, the version, and texts that are printed
     apart = ("schema", "student", "provenance")
     kinds = {
         path[-1]: path
@@ -224,11 +228,11 @@ def one_of_each_kind() -> list[tuple[Any, ...]]:
     return list(kinds.values())
 
 
-KINDS = one_of_each_kind()
+KINDS = leaf_of_each_name()
 assert len(KINDS) >= 100
 
 
-def changed(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
+def change_value(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
     forged = copy.deepcopy(results)
     part: Any = forged
     for name in path[:-1]:
@@ -248,13 +252,15 @@ def changed(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("path", KINDS, ids=lambda path: ".".join(map(str, path)))
-def test_a_changed_leaf_of_the_results(aisle: Base, path: tuple[Any, ...]) -> None:
-    found, *_ = compare_results(changed(aisle.results, path), to_plain(aisle.again[0]))
-    difference = found[0]  # where there was none, a list has places of its own
+def test_compare_results_finds_each_changed_value(
+    aisle: VerifiedReport, path: tuple[Any, ...]
+) -> None:
+    found, *_ = compare_results(change_value(aisle.results, path), to_plain(aisle.again[0]))
+    difference = found[0]  # an additional list has paths below this one
     assert difference.path.startswith(".".join(map(str, path)))
 
 
-def without(*path: Any) -> Change:
+def delete_value(*path: Any) -> Change:
     def change(results: dict[str, Any]) -> None:
         part: Any = results
         for name in path[:-1]:
@@ -268,36 +274,40 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
     "a finding more": (
         lambda r: r["findings"].append(copy.deepcopy(r["findings"][0])), "numbers differ",
     ),
-    "an axis less": (without("axes", "down"), "numbers differ"),
+    "an axis less": (delete_value("axes", "down"), "numbers differ"),
     "a filter's part as if it were not available": (
-        put({"what": "a", "reason": "b", "remedy": "c"}, "axes", "north", "filters", "ekf2"),
+        set_value({"what": "a", "reason": "b", "remedy": "c"}, "axes", "north", "filters", "ekf2"),
         "numbers differ",
     ),
-    "a parameter more": (put(1.0, "log", "parameters", "EKF2_HACK"), "numbers differ"),
-    "a note more": (put("all is well", "notes", 1), "numbers differ"),
-    "a number as a text": (put("0.5", "settings", "sigma_a_m_s2"), "cannot verify"),
+    "a parameter more": (set_value(1.0, "log", "parameters", "EKF2_HACK"), "numbers differ"),
+    "a note more": (set_value("all is well", "notes", 1), "numbers differ"),
+    "a number as a text": (set_value("0.5", "settings", "sigma_a_m_s2"), "cannot verify"),
     "an interval narrower": (
         lambda r: r["tuning"]["horizontal"].update(
             sigma_z_m_interval=[r["tuning"]["horizontal"]["sigma_z_m"]] * 2
         ),
         "numbers differ",
     ),
-    "a step of a millisecond": (put(0.001, "request", "dt_s"), "cannot verify"),
-    "no request": (without("request"), "numbers differ"),
-    "another command": (put("tune", "request", "command"), "numbers differ"),
-    "an unknown setting": (put(1, "request", "please"), "numbers differ"),
+    "a step of a millisecond": (set_value(0.001, "request", "dt_s"), "cannot verify"),
+    "no request": (delete_value("request"), "numbers differ"),
+    "another command": (set_value("tune", "request", "command"), "numbers differ"),
+    "an unknown setting": (set_value(1, "request", "please"), "numbers differ"),
 }  # fmt: skip
 
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize("name", STRUCTURE)
-def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verify_forged_results_are_not_verified(
+    aisle: VerifiedReport, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     change, expected = STRUCTURE[name]
-    monkeypatch.setattr(verification, "compare_pages", lambda *_, **__: ())  # they are as drawn
+    monkeypatch.setattr(
+        verification, "compare_pages", lambda *_, **__: ()
+    )  # the pages are unchanged
     results = copy.deepcopy(aisle.results)
     change(results)
     verdict = aisle.verified(aisle.with_results(results))
-    if verdict.reasons[0].startswith("results.json"):  # no such results are read at all
+    if verdict.reasons[0].startswith("results.json"):  # rejected by the schema
         expected = "cannot verify"
     assert verdict.status == verdict.outcome == expected, verdict
 
@@ -305,12 +315,14 @@ def test_changed_results(aisle: Base, name: str, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     "path", [("student", "name"), ("student", "notes"), ("provenance", "libraries", "matplotlib")]
 )
-def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> None:
+def test_verify_changed_printed_record_is_not_verified(
+    loop: VerifiedReport, path: tuple[str, ...]
+) -> None:
     results = copy.deepcopy(loop.results)
-    put({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
+    set_value({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
     again = verification.recompute(read_again(results), loop.files)
     pdf = loop.with_results(results)
-    verdict = verify(report_of(pdf), pdf, loop.files, recompute=lambda *_: again)
+    verdict = verify(attached_results(pdf), pdf, loop.files, recompute=lambda *_: again)
     assert verdict.outcome != "verified", verdict
     assert verdict.differences == ()
     assert verdict.redrawn != loop.pdf
@@ -318,10 +330,10 @@ def test_what_is_printed_from_the_record(loop: Base, path: tuple[str, ...]) -> N
     assert named == (path[-1] == "matplotlib")
 
 
-# -- what is changed on the pages ------------------------------------------------------------------
+# -- changed pages ---------------------------------------------------------------------------------
 
 
-def once(pattern: bytes, replacement: Any) -> Callable[[bytes], bytes]:
+def replace_last(pattern: bytes, replacement: Any) -> Callable[[bytes], bytes]:
     """Replace the last match."""
 
     def change(content: bytes) -> bytes:
@@ -332,12 +344,12 @@ def once(pattern: bytes, replacement: Any) -> Callable[[bytes], bytes]:
     return change
 
 
-LETTERS = glyphs(font("/f0")(PdfWriter(clone_from=REPORT)))  # nearly all text; /f1 is bold
+LETTERS = glyphs(font("/f0")(PdfWriter(clone_from=REPORT)))  # regular font; /f1 is bold
 DIGITS = [LETTERS[digit] for digit in "0123456789"]
 
 
 def last_digit(replacement: Callable[[int], bytes]) -> Edit:
-    """The last digit on a page in its usual font, as something else."""
+    """Replace the last digit of a page in the regular font."""
 
     def change(content: bytes) -> bytes:
         line = list(re.finditer(rb"/f0 [^\[]*\[(.*?)\]TJ", content, re.DOTALL))[-1]
@@ -357,13 +369,13 @@ A = text(LETTERS["A"])
 DRAWING: dict[str, Edit] = {
     "another digit": last_digit(lambda digit: text(DIGITS[(digit + 1) % 10])),
     "a digit less": last_digit(lambda _: b""),
-    "a point of a line moved": once(rb"([\d.]+) ([\d.]+) l\b", aside),
+    "a point of a line moved": replace_last(rb"([\d.]+) ([\d.]+) l\b", aside),
     "a white rectangle": lambda c: c + b"\n1 g\n100 690 300 90 re\nf\n",
     "a text more": lambda c: c + b"\nBT\n/f0 12 Tf\n100 100 Td\n(" + A + b") Tj\nET\n",
-    "a text moved": once(rb"q 1 0 0 -1 ([\d.]+) ([\d.]+) cm", rb"q 1 0 0 -1 9\1 \2 cm"),
-    "a text invisible": once(rb"BT 0 Tr", b"BT 3 Tr"),
-    "another font": once(rb"/f0 ", b"/f1 "),
-    "a colour": once(rb"[\d.]+ [\d.]+ [\d.]+ scn", b"0.123 0.123 0.123 scn"),
+    "a text moved": replace_last(rb"q 1 0 0 -1 ([\d.]+) ([\d.]+) cm", rb"q 1 0 0 -1 9\1 \2 cm"),
+    "a text invisible": replace_last(rb"BT 0 Tr", b"BT 3 Tr"),
+    "another font": replace_last(rb"/f0 ", b"/f1 "),
+    "a colour": replace_last(rb"[\d.]+ [\d.]+ [\d.]+ scn", b"0.123 0.123 0.123 scn"),
     "a comment": lambda c: c + b"\n% nothing\n",
     "clipped": lambda c: b"0 0 300 300 re W n\n" + c,
     "turned over": lambda c: b"-1 0 0 1 595 0 cm\n" + c,
@@ -371,8 +383,8 @@ DRAWING: dict[str, Edit] = {
 }
 PAGES = 8
 
-# Every page in one way, and each of the others on one page
-DRAW_LABEL = [
+# One change on every page, each other change on one page
+PAGE_CASES = [
     (page, name)
     for place, name in enumerate(DRAWING)
     for page in range(1, PAGES + 1)
@@ -380,10 +392,10 @@ DRAW_LABEL = [
 ]
 
 
-@pytest.mark.parametrize(("page", "name"), DRAW_LABEL)
-def test_a_changed_page(aisle: Base, page: int, name: str) -> None:
+@pytest.mark.parametrize(("page", "name"), PAGE_CASES)
+def test_verify_changed_page_differs(aisle: VerifiedReport, page: int, name: str) -> None:
     verdict = aisle.verified(forged(aisle.pdf, on_page(page, DRAWING[name])))
-    assert verdict.redrawn == aisle.pdf  # what is redrawn is never touched by a forgery
+    assert verdict.redrawn == aisle.pdf  # the redrawn report does not contain the forgery
     assert verdict.status == "verified"
     assert verdict.outcome == "page differs", verdict
     assert [one.page for one in verdict.pages] == [page]
@@ -391,8 +403,10 @@ def test_a_changed_page(aisle: Base, page: int, name: str) -> None:
 
 DOCUMENT: dict[str, tuple[Forge, str, str]] = {
     "a page away": (lambda w: w.remove_page(7), "page differs", "page 8: missing"),
-    "another title": (titled(Title="my report"), "page differs", "document: /Title is"),
-    "a form": (root("/AcroForm", dictionary(Fields=array())), "cannot verify", "form fields that"),
+    "another title": (document_info(Title="my report"), "page differs", "document: /Title is"),
+    "a form": (
+        catalogue("/AcroForm", dictionary(Fields=array())), "cannot verify", "form fields that",
+    ),
     "an annotation": (
         lambda w: w.add_annotation(1, Link(rect=(50, 50, 200, 70), url="http://example.org")),
         "cannot verify", "page 2: an annotation that px4fuse does not write",
@@ -402,14 +416,14 @@ DOCUMENT: dict[str, tuple[Forge, str, str]] = {
 
 
 @pytest.mark.parametrize("name", DOCUMENT)
-def test_a_changed_document(aisle: Base, name: str) -> None:
+def test_verify_changed_document_states_reason(aisle: VerifiedReport, name: str) -> None:
     forge, expected, said = DOCUMENT[name]
     verdict = aisle.verified(forged(aisle.pdf, forge))
     assert verdict.redrawn == aisle.pdf
     assert verdict.outcome == expected, verdict
     assert verdict.status == ("verified" if expected == "page differs" else expected)
     assert any(said in reason for reason in verdict.reasons), verdict
-    # the reason that a class table shows is the one that counts
+    # the class table prints the first reason
     if expected == "cannot verify":
         assert said in verdict.reasons[0]
         assert verdict.remedy.startswith("Ask for the PDF")
@@ -417,53 +431,55 @@ def test_a_changed_document(aisle: Base, name: str) -> None:
 
 
 @pytest.mark.parametrize("key", ["/OpenAction", "/AA"])
-def test_a_document_with_a_script_is_refused(aisle: Base, key: str) -> None:
+def test_read_report_with_script_is_refused(aisle: VerifiedReport, key: str) -> None:
     script = dictionary(S=NameObject("/JavaScript"), JS=TextStringObject("app.alert(1)"))
     with pytest.raises(ResultsError):
-        read_report(forged(aisle.pdf, root(key, script)), "r.pdf")
+        read_report(forged(aisle.pdf, catalogue(key, script)), "r.pdf")
 
 
-def test_verify_numbers_that_differ_come_first(aisle: Base) -> None:
+def test_verify_lists_differing_numbers_first(aisle: VerifiedReport) -> None:
     results = copy.deepcopy(aisle.results)
     results["axes"]["north"]["filters"]["kf"]["nis_mean"] = 1.0
-    form = root("/AcroForm", dictionary(Fields=array()))
+    form = catalogue("/AcroForm", dictionary(Fields=array()))
     verdict = aisle.verified(forged(aisle.pdf, form, with_results(to_json(results))))
     assert verdict.status == "numbers differ"
     assert "1 of" in verdict.reasons[0]
     assert any("form fields" in reason for reason in verdict.reasons)
 
 
-def emptied(writer: PdfWriter) -> None:
-    """The first page without what it draws."""
-    stream = edited(writer.pages[0]["/Contents"].get_object(), lambda _: b" ")
+def empty_first_page(writer: PdfWriter) -> None:
+    """Remove the content of the first page."""
+    stream = edit_stream(writer.pages[0]["/Contents"].get_object(), lambda _: b" ")
     writer.pages[0][NameObject("/Contents")] = writer._add_object(stream)
 
 
-def pages_of_another(one: Base, other: Base) -> bytes:
-    """A report with the last page of another."""
+def pages_of_another(one: VerifiedReport, other: VerifiedReport) -> bytes:
+    """Return a report with the last page of another one."""
     writer = PdfWriter(clone_from=io.BytesIO(one.pdf))
     writer.remove_page(PAGES - 1)
     writer.add_page(PdfReader(io.BytesIO(other.pdf)).pages[-1])
-    return saved(writer)
+    return pdf_bytes(writer)
 
 
-def packed(writer: PdfWriter) -> None:
-    """As programs that save a PDF again pack it: object streams, other compression."""
+def recompress(writer: PdfWriter) -> None:
+    """Compress again, as programs do when they save a PDF."""
     writer.compress_identical_objects(remove_duplicates=True)
     for page in writer.pages:
         page.compress_content_streams(level=9)
     writer.add_metadata({"/Producer": "Another program"})
 
 
-FILES: dict[str, tuple[Callable[[Base, Base], bytes], set[str]]] = {
+FILES: dict[str, tuple[Callable[[VerifiedReport, VerifiedReport], bytes], set[str]]] = {
     "saved again": (lambda a, _: forged(a.pdf), {"verified"}),
-    "packed in another way": (lambda a, _: forged(a.pdf, packed), {"verified"}),
-    "metadata appended": (lambda a, _: appended(a.pdf, titled(Author="Ada")), {"page differs"}),
+    "packed in another way": (lambda a, _: forged(a.pdf, recompress), {"verified"}),
+    "metadata appended": (
+        lambda a, _: append_update(a.pdf, document_info(Author="Ada")), {"page differs"},
+    ),
     "bytes appended": (lambda a, _: a.pdf + b"\n% Eve\n", {"cannot verify"}),
-    "a version appended": (lambda a, _: appended(a.pdf, emptied), {"page differs"}),
+    "a version appended": (lambda a, _: append_update(a.pdf, empty_first_page), {"page differs"}),
     "a page of another report": (pages_of_another, {"cannot verify"}),
     "a link": (
-        lambda a, _: forged(a.pdf, root("/URI", TextStringObject("http://example.org"))),
+        lambda a, _: forged(a.pdf, catalogue("/URI", TextStringObject("http://example.org"))),
         {"cannot verify"},
     ),
     "results of another report": (
@@ -473,7 +489,9 @@ FILES: dict[str, tuple[Callable[[Base, Base], bytes], set[str]]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_changed_file(aisle: Base, loop: Base, name: str) -> None:
+def test_verify_changed_file_has_expected_outcome(
+    aisle: VerifiedReport, loop: VerifiedReport, name: str
+) -> None:
     forge, expected = FILES[name]
     pdf = forge(aisle, loop)
     read_report(pdf, "r.pdf")
@@ -483,20 +501,20 @@ def test_a_changed_file(aisle: Base, loop: Base, name: str) -> None:
     assert verdict.redrawn == (b"" if verdict.status == "other log" else aisle.pdf)
 
 
-def test_another_log(aisle: Base) -> None:
+def test_verify_other_log_is_reported(aisle: VerifiedReport) -> None:
     for files in ([LOOP_LOG], [LOOP_LOG, Path(__file__)]):
-        verdict = verify(report_of(aisle.pdf), aisle.pdf, files)
+        verdict = verify(attached_results(aisle.pdf), aisle.pdf, files)
         assert verdict.status == "other log"
         assert not verdict.with_log
 
 
-@pytest.mark.usefixtures("drawn_once")
-def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
-    """And what it is called here does not show."""
+@pytest.mark.usefixtures("cached_pages")
+def test_verify_finds_joined_recording_by_hash(tmp_path: Path) -> None:
+    """The file names differ from those of the report."""
     positions, target = SAMPLES / "aisle_uwb_external.csv", tmp_path / "joined.pdf"
-    done("compare", LOG, "--position", positions, "--axis", "down", "-o", target)
+    run_checked("compare", LOG, "--position", positions, "--axis", "down", "-o", target)
     pdf = target.read_bytes()
-    report = report_of(pdf)
+    report = attached_results(pdf)
     (tmp_path / "a").write_bytes(LOG.read_bytes())
     (tmp_path / "b").write_bytes(positions.read_bytes())
     verdict = verify(report, pdf, files_by_sha256([tmp_path / "a"]))
@@ -509,26 +527,26 @@ def test_a_joined_recording_is_found_by_its_content(tmp_path: Path) -> None:
 # -- the command -----------------------------------------------------------------------------------
 
 
-def test_the_command_says_what_it_found(
-    tmp_path: Path, aisle: Base, monkeypatch: pytest.MonkeyPatch
+def test_verify_command_prints_and_writes_verdict(
+    tmp_path: Path, aisle: VerifiedReport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    in_this_process(monkeypatch)  # the next one takes one of its own
+    in_this_process(monkeypatch)  # the next test uses a worker process
     target = tmp_path / "verdict.json"
-    output = done("verify", REPORT, LOOP_LOG, "--json", target, code=1).output
+    output = run_checked("verify", REPORT, LOOP_LOG, "--json", target, code=1).output
     assert "other log" in output
     assert LIMIT in output
     told = json.loads(target.read_text(encoding="utf-8"))
     assert told["status"] == "other log"
     assert told["limit"] == LIMIT
-    assert "cannot verify" in done("verify", REPORT, code=1).output
-    output = done("verify", REPORT, "--json", "-", code=1).output
+    assert "cannot verify" in run_checked("verify", REPORT, code=1).output
+    output = run_checked("verify", REPORT, "--json", "-", code=1).output
     assert json.loads(output)["status"] == "cannot verify"
 
 
-def test_the_command_verifies(tmp_path: Path) -> None:
+def test_verify_command_finds_renamed_log(tmp_path: Path) -> None:
     target = tmp_path / "loop.pdf"
-    done("loop", f"{LOOP_LOG}:ekf2", "-o", target)
+    run_checked("loop", f"{LOOP_LOG}:ekf2", "-o", target)
     folder = tmp_path / "logs"
     folder.mkdir()
     (folder / "renamed.bin").write_bytes(LOOP_LOG.read_bytes())
-    assert "verified" in done("verify", target, folder).output
+    assert "verified" in run_checked("verify", target, folder).output

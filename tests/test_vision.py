@@ -58,7 +58,7 @@ def on_gnss() -> Model:
 def sent(
     rate_hz: float = 15.0, sigma_m: float = 0.3, late_s: float = 0.0, seed: int = 1
 ) -> ReceivedPositions:
-    """Return vision positions: the truth in an offset frame with a random walk."""
+    """Return vision positions: ground truth in an offset frame, plus a random walk."""
     truth = on_gnss().flight.truth
     rng = np.random.default_rng(seed)
     stamp = np.arange(1.0, truth.samples.index[-1] - 1.0, 1.0 / rate_hz)
@@ -308,7 +308,7 @@ def test_vision_gap_restarts_bias() -> None:
 
 
 def test_vision_without_gnss_resets_position() -> None:
-    """As in ev_pos_control.cpp: a reset without bias, with the noise of vision."""
+    """Reset without bias, with the noise of vision (ev_pos_control.cpp)."""
     inputs = flying(sent(sigma_m=0.05))
     lost_s = float(inputs.segments[0].time_s[0]) + 20.0
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), lost_s)
@@ -477,9 +477,9 @@ def test_what_if_smaller_vision_gate_rejects_more() -> None:
     assert "external vision, position: mean NIS" in update_log
     results = json.loads(to_json(whatif_results(request, made_of)))
     jsonschema.validate(results, schema())
-    assert results["replayed"]["others"]["ev_pos"]["rejected_share"] == 0.0
-    assert found.replayed.others["ev_pos"].rejected_share == 0.0
-    assert found.whatif[0].others["ev_pos"].rejected_share > 0.2
+    assert results["replayed"]["others"]["ev_pos"]["rejected_fraction"] == 0.0
+    assert found.replayed.others["ev_pos"].rejected_fraction == 0.0
+    assert found.whatif[0].others["ev_pos"].rejected_fraction > 0.2
 
 
 def test_what_if_without_vision_or_gnss_uses_other() -> None:
@@ -488,7 +488,7 @@ def test_what_if_without_vision_or_gnss_uses_other() -> None:
     lost = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0))
     (after,) = lost.whatif
     assert after.resets == 1
-    # vision frame: 5 m north and 3 m west of the truth
+    # vision frame: 5 m north and 3 m west of ground truth
     assert after.position_rmse_to_truth_m == pytest.approx(np.hypot(5.0, 3.0), abs=0.5)
     assert "EKF2_NOAID_TOUT" not in lost.notes[-1]
     none = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel", "ev_pos"), 40.0))
@@ -545,7 +545,7 @@ def test_steps_contain_vision_and_causes_only_kf() -> None:
             < names.index(steps.VISION_STEP)
             < names.index(steps.GATE)
         )
-        assert why.position_left_share < 0.05
+        assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
         assert min(moved_m[steps.VELOCITY_STEP], moved_m[steps.VISION_STEP]) > 0.05
     analysis = explain(compare(flown(), Settings(0.27, 0.4)))

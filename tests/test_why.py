@@ -10,7 +10,7 @@ from flights import unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.difference_steps import add_sentences, explain_ekf2_difference
-from px4fuse.ekf2.steps import SAMPLES, STAMPS, Why
+from px4fuse.ekf2.steps import SAMPLES, STAMPS, DifferenceExplanation
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
@@ -18,27 +18,29 @@ from px4fuse.report.difference_page import draw, unexplained_note
 from px4fuse.report.style import report_style
 
 
-def of(analysis: Analysis, name: str = "aisle") -> Why:
-    return analysis.why[name]
+def of(analysis: Analysis, name: str = "aisle") -> DifferenceExplanation:
+    return analysis.difference_steps[name]
 
 
-def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> Why:
+def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> DifferenceExplanation:
     """Explain the difference along the aisle with other settings."""
     comparison = compare(analysis.flight, settings, axes=("aisle",), **choices)
     return explain_ekf2_difference(comparison, analysis.ekf2_model, analysis.clock)["aisle"]
 
 
 def test_explain_ekf2_difference_total_is_kf_minus_published(sample: Analysis) -> None:
-    why = of(sample)
+    explanation = of(sample)
     result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
-    position, speed = state_at(result.replay, why.times_s)
-    logged = result.ekf2_state.loc[why.times_s]
+    position, speed = state_at(result.replay, explanation.times_s)
+    logged = result.ekf2_state.loc[explanation.times_s]
     difference = position - logged["position_m"].to_numpy()
-    np.testing.assert_allclose(why.kf_minus_ekf2_m, difference, atol=1e-9)
-    assert why.position_mean_square_m2 == pytest.approx(np.mean(difference**2))
+    np.testing.assert_allclose(explanation.kf_minus_ekf2_m, difference, atol=1e-9)
+    assert explanation.position_mean_square_m2 == pytest.approx(np.mean(difference**2))
     v = speed - logged["velocity_m_s"].to_numpy()
-    assert why.velocity_mean_square_m2_s2 == pytest.approx(np.mean(v**2))
-    assert np.mean(why.unexplained_m**2) == pytest.approx(why.position_left_mean_square_m2)
+    assert explanation.velocity_mean_square_m2_s2 == pytest.approx(np.mean(v**2))
+    assert np.mean(explanation.unexplained_m**2) == pytest.approx(
+        explanation.unexplained_mean_square_m2
+    )
 
 
 def test_explain_ekf2_difference_kf_settings_change_their_step(sample: Analysis) -> None:
@@ -52,14 +54,14 @@ def test_explain_ekf2_difference_kf_settings_change_their_step(sample: Analysis)
     late = explain_again(sample, Settings(clock_offset_s=-0.3))
     assert STAMPS in late.sentences[0]
     assert "KF 300 ms" in late.sentences[0]
-    left = pytest.approx(plain.position_left_mean_square_m2, rel=0.02)
-    assert [o.position_left_mean_square_m2 for o in (zero, small, late)] == [left] * 3
+    left = pytest.approx(plain.unexplained_mean_square_m2, rel=0.02)
+    assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3
 
 
 def test_explain_ekf2_difference_covers_the_segment_only(sample: Analysis) -> None:
-    why = explain_again(sample, Settings(), start_s=30.0, end_s=60.0)
-    assert why.spans_s[0][0] == pytest.approx(30.0, abs=0.2)
-    assert why.spans_s[0][1] == pytest.approx(60.0, abs=0.3)
+    explanation = explain_again(sample, Settings(), start_s=30.0, end_s=60.0)
+    assert explanation.spans_s[0][0] == pytest.approx(30.0, abs=0.2)
+    assert explanation.spans_s[0][1] == pytest.approx(60.0, abs=0.3)
     assert of(sample).outside.at_s < of(sample).spans_s[0][0]
 
 
@@ -68,9 +70,9 @@ def test_explain_ekf2_difference_without_model_gives_reason(sample: Analysis) ->
     found = explain_ekf2_difference(down, sample.ekf2_model, sample.clock)["down"]
     assert "horizontal" in found.reason
     none = Unavailable("EKF2 replay", "no IMU", "Record it.")
-    for name, why in explain_ekf2_difference(sample, none, sample.clock).items():
+    for name, explanation in explain_ekf2_difference(sample, none, sample.clock).items():
         assert name != "down"
-        assert (why.reason, why.remedy) == ("no IMU", "Record it.")
+        assert (explanation.reason, explanation.remedy) == ("no IMU", "Record it.")
 
 
 def drawn(analysis: Analysis) -> list:
@@ -82,10 +84,10 @@ def test_report_without_agreeing_replay_has_no_why_page(sample: Analysis) -> Non
     model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(model, agreement=agreement, flown=replace(model.flown, agreement=agreement))
-    why = explain_ekf2_difference(sample, doubtful, sample.clock)
-    parted = replace(sample, ekf2_model=doubtful, why=why)
+    explanation = explain_ekf2_difference(sample, doubtful, sample.clock)
+    parted = replace(sample, ekf2_model=doubtful, difference_steps=explanation)
     absent = Unavailable("EKF2 replay", "no IMU", "Record it.")
-    without = replace(sample, ekf2_model=absent, why={"north": absent, "east": absent})
+    without = replace(sample, ekf2_model=absent, difference_steps={"north": absent, "east": absent})
     for analysis, reason in ((parted, "they part"), (without, "no IMU")):
         assert drawn(analysis) == []
         line = unexplained_note(analysis)
@@ -101,13 +103,13 @@ def test_report_without_agreeing_replay_has_no_why_page(sample: Analysis) -> Non
     [(0.47, "47 % of the mean square"), (1.4, "more than the whole mean square")],
 )
 def test_add_sentences_states_step_share_and_largest_effect(sample, share, text) -> None:
-    why = of(sample)
-    first, whole = why.steps[0], why.position_mean_square_m2
-    shares = [share, *[1e-3] * (len(why.steps) - 1)]
+    explanation = of(sample)
+    first, whole = explanation.steps[0], explanation.position_mean_square_m2
+    shares = [share, *[1e-3] * (len(explanation.steps) - 1)]
     steps = tuple(replace(one, position_mean_square_m2=of * whole)
-                  for one, of in zip(why.steps, shares, strict=True))  # fmt: skip
+                  for one, of in zip(explanation.steps, shares, strict=True))  # fmt: skip
     reasons = {step.name: f"Reason of {step.name}" for step in steps}
-    explained = add_sentences(replace(why, steps=steps), "the aisle", reasons)
+    explained = add_sentences(replace(explanation, steps=steps), "the aisle", reasons)
     assert f"along the aisle: {first.name} ({text}" in explained.cause
     assert explained.cause.endswith(f"Reason of {first.name}.")
     assert explained.sentences[0].startswith(explained.cause)

@@ -1,4 +1,4 @@
-"""Outputs: each complete or not at all; what is not a regular file stays; messages name files."""
+"""Outputs are complete or absent, special files are kept, and messages name files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from cli_tools import contents, done, refused, run, run_main
+from cli_tools import contents, error_line, run, run_checked, run_main
 from conftest import SAMPLES
 from exchange import replace
 from ulog_tools import make_log
@@ -28,7 +28,7 @@ from px4fuse.report import fonts, pdf
 from px4fuse.request import ComparisonRequest
 from px4fuse.writing import STANDARD_OUTPUT, write_all
 
-pytestmark = pytest.mark.usefixtures("analysed_once")
+pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 SECONDS = 20.0
 posix = pytest.mark.skipif(os.name == "nt", reason="devices, pipes and signals are those of POSIX")
@@ -55,7 +55,7 @@ def start(desk: Path, *arguments: str, **kwargs) -> subprocess.Popen[bytes]:
 
 LOOP = ("loop", "s.tum", "--tum", "c.tum")
 
-# --- what is no regular file ---
+# --- special files -------------
 
 
 @posix
@@ -65,7 +65,7 @@ def test_write_named_pipe_is_written_and_kept(desk) -> None:
     heard = []
     reader = threading.Thread(target=lambda: heard.append(pipe.read_bytes()), daemon=True)
     reader.start()
-    done("info", "l.ulg", "--json", "pipe")
+    run_checked("info", "l.ulg", "--json", "pipe")
     reader.join(10.0)
     assert pipe.is_fifo()
     assert json.loads(heard[0])["log"]["name"] == "l.ulg"
@@ -74,7 +74,7 @@ def test_write_named_pipe_is_written_and_kept(desk) -> None:
 
 @posix
 def test_write_device_is_written_and_kept(desk) -> None:
-    """By a link, so that a failure replaces the link and not the machine's device."""
+    """Use a link, so that a failure replaces the link and not the device."""
     link = desk / "null"
     link.symlink_to(os.devnull)
     write_all({link: b"gone"})
@@ -88,7 +88,7 @@ def test_write_socket_is_refused_and_kept(desk) -> None:
 
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind("socket")
-        said = refused("info", "l.ulg", "--json", "socket")
+        said = error_line("info", "l.ulg", "--json", "socket")
         assert said.startswith("socket: cannot be written")
         assert (desk / "socket").is_socket()
 
@@ -109,7 +109,7 @@ def test_write_symbolic_link_replaces_its_target(tmp_path) -> None:
 
 @posix
 def test_write_dev_stdout_appends_to_redirected_file(desk) -> None:
-    """By a link, so that a failure replaces the link and not the machine's /dev/stdout."""
+    """Use a link, so that a failure replaces the link and not /dev/stdout."""
     out = desk / "out.txt"
     out.write_bytes(b"before\n")
     (desk / "stdout").symlink_to("/dev/stdout")
@@ -147,23 +147,23 @@ def deny() -> None:
     raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def test_error_stops_writing_and_lists_what_was_written(tmp_path, monkeypatch) -> None:
+def test_error_stops_writing_and_lists_written_files(tmp_path, monkeypatch) -> None:
     a, b, c = (tmp_path / name for name in "abc")
     for path in (a, b, c):
         path.write_bytes(b"old")
     at_rename_to(b, monkeypatch, deny)
     placed: list[Path] = []
-    with pytest.raises(OutputError) as refused:
+    with pytest.raises(OutputError) as caught:
         write_all(dict.fromkeys((a, b, c), b"new"), placed.append)
     said = f"{b}: cannot be written (Permission denied); already written: {a}. Choose another name."
-    assert str(refused.value) == said
+    assert str(caught.value) == said
     assert placed == [a]
     assert contents(tmp_path) == {"a": b"new", "b": b"old", "c": b"old"}
     with pytest.raises(OutputError, match=r"\(Permission denied\)\. Choose"):
         write_all({b: b"new"})
 
 
-def test_locked_file_is_to_be_closed(tmp_path, monkeypatch) -> None:
+def test_write_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -> None:
     path = tmp_path / "r.pdf"
     path.write_bytes(b"old")
     at_rename_to(path, monkeypatch, deny)
@@ -309,13 +309,13 @@ def test_written_names_have_no_escape_sequences(desk, command: str) -> None:
 def test_extract_into_folder_of_other_log_is_refused(desk) -> None:
     make_log("v1.14", SECONDS).write(desk / "other.ulg")
     for _ in range(2):  # the same log again
-        done("extract", "l.ulg", "-o", "tables")
+        run_checked("extract", "l.ulg", "-o", "tables")
     before = contents(desk / "tables")
-    assert "l.ulg" in refused("extract", "other.ulg", "-o", "tables")
+    assert "l.ulg" in error_line("extract", "other.ulg", "-o", "tables")
     assert contents(desk / "tables") == before
     # the same log under another name is the same log
     (desk / "l.ulg").rename(desk / "renamed.ulg")
-    done("extract", "renamed.ulg", "-o", "tables")
+    run_checked("extract", "renamed.ulg", "-o", "tables")
 
 
 @pytest.mark.parametrize("command", ["info", "extract"])
@@ -372,5 +372,5 @@ def test_write_pipe_without_reader_ends_after_timeout(
     monkeypatch.setattr("px4fuse.writing.READER_S", 0.1)
     os.mkfifo(tmp_path / "pipe")
     pipe = tmp_path / "pipe"
-    assert "the pipe has no reader" in refused("info", sample_log, "--json", pipe)
-    assert "is not a file or folder" in refused("grade", pipe, "-o", tmp_path / "out")
+    assert "the pipe has no reader" in error_line("info", sample_log, "--json", pipe)
+    assert "is not a file or folder" in error_line("grade", pipe, "-o", tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Trajectories whose truth is known, published ones, and GTSAM's view of a pose graph."""
+"""Trajectories with ground truth, public trajectories, and pose graphs in GTSAM."""
 
 from functools import cache
 from typing import Any
@@ -27,7 +27,7 @@ NAMES = [estimate.removesuffix(".txt") for estimate, _ in PUBLISHED]
 def flight(
     seconds: float = 60.0, rate_hz: float = 20.0, kind: Kind = "truth", frame: Frame = "NED"
 ) -> Trajectory:
-    """A smooth flight in three dimensions whose speed varies."""
+    """Return a smooth flight in three dimensions with varying speed."""
     time = np.arange(0.0, seconds, 1.0 / rate_hz)
     position = np.column_stack(
         [
@@ -43,16 +43,16 @@ def flight(
     return Trajectory("flight.tum", kind, time, position, rotation, frame)
 
 
-def moved(
+def transformed(
     one: Trajectory, turn: Rotation, shift: np.ndarray, scale: float = 1.0, **changes: Any
 ) -> Trajectory:
-    """The same motion in another world."""
+    """Rotate, scale and shift a trajectory."""
     position = scale * turn.apply(one.position_m) + shift
     return replace(one, position_m=position, rotation=turn * one.rotation, **changes)
 
 
 def square(per_leg: int, side_m: float, laps: int = 1) -> tuple[np.ndarray, Rotation]:
-    """Positions and rotations around a square, nose first, corners turned on the spot."""
+    """Return positions and rotations around a square; the vehicle yaws in the corners."""
     count = np.arange(4 * laps * per_leg + 1)
     leg = np.minimum(count // per_leg, 4 * laps - 1)
     corners = side_m * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -61,8 +61,8 @@ def square(per_leg: int, side_m: float, laps: int = 1) -> tuple[np.ndarray, Rota
     return position, Rotation.from_rotvec(np.outer(leg * np.pi / 2, [0.0, 0.0, 1.0]))
 
 
-def drifted(poses: np.ndarray, sigma: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poses by odometry whose steps err by so much (m, then rad), shapes (n, 7) and (6,)."""
+def noisy_odometry(poses: np.ndarray, sigma: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return poses (n, 7) of odometry with noise per step, sigma (6,) in m, then rad."""
     steps = lie.between(poses[:-1], poses[1:])
     noise = lie.exp(rng.normal(size=(len(steps), 6)) * sigma)
     return lie.compose(poses[:1], lie.chain(lie.compose(steps, noise)))
@@ -73,7 +73,7 @@ TURN = Rotation.from_euler("ZYX", [2.0, 0.4, -0.7])
 
 
 @cache
-def published(name: str) -> Trajectory:
+def read_public(name: str) -> Trajectory:
     return read_trajectory(shared("trajectories") / name)
 
 
@@ -103,7 +103,7 @@ def gtsam_problem(gtsam: Any, graph: PoseGraph) -> tuple[Any, Any]:
 
 
 def gtsam_optimiser(gtsam: Any, graph: PoseGraph, iterations: int = 100) -> tuple[Any, Any]:
-    """GTSAM's factors, and its optimiser from the same start with tolerances as tight as ours."""
+    """Return GTSAM's factors, and its optimiser with the same start and tolerances."""
     factors, values = gtsam_problem(gtsam, graph)
     kind = "Pose2" if graph.dimension == 2 else "Pose3"
     held = getattr(values, f"at{kind}")(0)

@@ -86,7 +86,7 @@ def join(flight: Flight, other: Flight) -> Flight:
             ),
             senders=log.senders or other_log.senders,
             restarts=log.restarts or other_log.restarts,
-            receipt_went_back=log.receipt_went_back or other_log.receipt_went_back,
+            receive_time_reversals=log.receive_time_reversals or other_log.receive_time_reversals,
             dropped={
                 **{f"{other_log.name}: {k}": n for k, n in other_log.dropped.items()},
                 **log.dropped,

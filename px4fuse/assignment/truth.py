@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.answer_form import GATE_UPDATES, FormQuestion, draw_questions, update_values
+from px4fuse.answer_form import GATE_UPDATES, FormQuestion, draw_questions
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import noises_and_clock
+from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import COVARIANCES, process_noise_unit, symmetric_matrix, transition
@@ -75,7 +75,7 @@ class FormTruth(Record, frozen=True):
 
     mistakes: tuple[TrueMistake, ...]
     sigma_z_m: float
-    ours: VerdictTruth
+    kf: VerdictTruth
     ekf2: VerdictTruth
     ekf2_did: tuple[str, ...]
     ekf2_did_also: tuple[str, ...]
@@ -114,8 +114,8 @@ def _true_mistake(
         size, tolerance = measured if isinstance(measured, float) else size, CLOSURE_WITHIN_M
     low, high = size - tolerance, size + tolerance
     if name == "clock-offset":  # the 95 % interval of the estimated time offset is right, too
-        _, found = noises_and_clock(comparison)
-        if isinstance(found, ClockOffset) and found.determinable:
+        _, found = estimate_noises_and_clock(comparison)
+        if isinstance(found, ClockOffset) and found.is_determinable:
             low, high = min(low, -found.interval_s[1]), max(high, -found.interval_s[0])
     from_s = until_s = None
     match name:
@@ -135,9 +135,9 @@ def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
     filter_summary = comparison.main.filters[which]
     if not isinstance(filter_summary, FilterSummary):
         return VerdictTruth("")
-    verdict = update_values(filter_summary.verdict.removeprefix("variance "))
-    is_consistent = verdict == "consistent"
-    return VerdictTruth(verdict, None if is_consistent else filter_summary.sigma_error_factor)
+    is_consistent = filter_summary.verdict == "consistent"
+    factor = None if is_consistent else filter_summary.sigma_error_factor
+    return VerdictTruth(filter_summary.verdict, factor)
 
 
 def _ekf2_behaviour(

@@ -10,7 +10,7 @@ from px4fuse.cli import inputs, outputs
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
-Severity = Literal["error", "warning", "info"]
+Severity = Literal["error", "warning", "note"]
 SEVERITIES = get_args(Severity)
 
 
@@ -56,7 +56,7 @@ def compare(
     outputs.write_and_print(contents, summary(outcome, results, output), request)
     bad = failed_checks(outcome) if checks else {}
     for name, verdict in bad.items():
-        click.echo(f"{name}: {verdict}", err=True)
+        click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
     if bad:
         sys.exit(1)
     if fail_on is not None:

@@ -38,10 +38,11 @@ def _list_page() -> Page:
 
 def _finding_page(typed: str) -> Page:
     from px4fuse.findings.cause_grouping import CONSEQUENCES
-    from px4fuse.findings.model import CATALOGUE, load_examples
+    from px4fuse.findings.model import CATALOGUE, RENAMED_IDS, load_examples
     from px4fuse.report.page import Page
 
     name = typed.lower().replace("-", "_")
+    name = RENAMED_IDS.get(name, name)
     if name not in CATALOGUE:
         raise SettingsError(
             f"{typed!r} is not a finding",

@@ -155,7 +155,7 @@ def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
             f"{sender.system}/{sender.component}",
             sender.description + (" (this flight)" if sender.chosen else ""),
             f"{sender.messages}",
-            "unknown" if sender.lost_share is None else f"{sender.lost_share:.1%}",
+            "unknown" if sender.lost_fraction is None else f"{sender.lost_fraction:.1%}",
         )
         for sender in inventory.flight.log.senders
     ]

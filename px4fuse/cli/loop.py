@@ -114,7 +114,7 @@ def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
     """Make a request of the values of the command's options."""
     del option_values["robust"]
     return LoopRequest(
-        source=str(source), came_back=not option_values.pop("opened"), **option_values
+        source=str(source), closed_loop=not option_values.pop("opened"), **option_values
     )
 
 

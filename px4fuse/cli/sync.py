@@ -21,7 +21,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     recording.
     """
     from px4fuse.analysis import prepare_comparison
-    from px4fuse.comparison.estimates import noises_and_clock
+    from px4fuse.comparison.estimates import estimate_noises_and_clock
     from px4fuse.errors import MissingDataError
     from px4fuse.flight import Unavailable
     from px4fuse.report.clock import clock_advice
@@ -32,9 +32,9 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     check_targets([json_path])
     with progress(json_path) as step:
         compared = prepare_comparison(request, step)
-        _, clock_result = noises_and_clock(compared, step)
+        _, clock_result = estimate_noises_and_clock(compared, step)
     advice = clock_advice(compared, clock_result)
-    if isinstance(clock_result, Unavailable) or not clock_result.determinable:
+    if isinstance(clock_result, Unavailable) or not clock_result.is_determinable:
         name = compared.flight.log.name
         remedy = clock_result.remedy if isinstance(clock_result, Unavailable) else advice["Action"]
         raise MissingDataError(

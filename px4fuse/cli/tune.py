@@ -91,9 +91,15 @@ def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> P
             if not isinstance(consistency, Unavailable)
         ]
         lag_text = " ".join(lags) if len(lags) == len(consistencies) else ""
-        gain = "" if isinstance(validation, Unavailable) else f"{validation.gain_nats:+.3f}"
-        noises = [noise_text(noise) for noise in (tuning.filter_sigma_a, tuning.sigma_z)]
-        rows.append([name, *noises, f"{tuning.gain_nats:.3f}", gain, lag_text])
+        gain = (
+            ""
+            if isinstance(validation, Unavailable)
+            else f"{validation.log_likelihood_gain_per_measurement:+.3f}"
+        )
+        noises = [noise_text(noise) for noise in (tuning.sigma_a_two_state, tuning.sigma_z)]
+        rows.append(
+            [name, *noises, f"{tuning.log_likelihood_gain_per_measurement:.3f}", gain, lag_text]
+        )
     page.labelled("Chosen", format_settings(compared.settings))
     if rows:
         page.table(TUNING_HEAD, rows, right=(1, 2, 3, 4, 5))

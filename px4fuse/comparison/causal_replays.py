@@ -58,7 +58,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.record import Positive, Record
 
-Of = Literal["nis", "nees", "apart"]
+Statistic = Literal["nis", "nees", "difference"]
 Change = Mapping[str, float]
 # Mean NEES from which errors exceed the reported σ (by 2 in σ); below 3 without a fault
 MIN_NEES_FINDING = 4.0
@@ -106,7 +106,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    of : {"nis", "nees", "apart"}
+    statistic : {"nis", "nees", "difference"}
         Statistic: mean NIS, mean NEES of position, or RMS difference KF - EKF2 (m). The last one is
         computed for causes only.
     filter : {"kf", "ekf2"}
@@ -117,32 +117,32 @@ class Intervention(Record, frozen=True, kw_only=True):
         ``bias_forward_m_s2`` and ``bias_right_m_s2``.
     before, after : float
         Statistic without the change (EKF2: from the log) and with it (from a re-run).
-    explains : float
+    explained_fraction : float
         Share of ln(statistic) that the change removes; above 1 it overshoots. For the RMS
         difference, the share of the mean square.
-    brings_into_band : bool
+    is_sufficient : bool
         True if the mean NIS is in its 95 % band, or the mean NEES below
         :data:`MIN_NEES_FINDING`.
-    denied_by_truth : bool
+    contradicts_truth : bool
         True if the reported σ would then be smaller than the errors.
     """
 
-    of: Of
+    statistic: Statistic
     filter: FilterName
     axis: str
     change: Change
     before: Positive
     after: Positive
-    explains: float
-    brings_into_band: bool
-    denied_by_truth: bool = False
+    explained_fraction: float
+    is_sufficient: bool
+    contradicts_truth: bool = False
 
     @property
     def is_cause(self) -> bool:
         """True if it explains at least half of ln(statistic) and does not overshoot by more."""
         return (
-            MIN_EXPLAINED_SHARE <= self.explains <= 2.0 - MIN_EXPLAINED_SHARE
-            and not self.denied_by_truth
+            MIN_EXPLAINED_SHARE <= self.explained_fraction <= 2.0 - MIN_EXPLAINED_SHARE
+            and not self.contradicts_truth
         )
 
     @property
@@ -151,39 +151,40 @@ class Intervention(Record, frozen=True, kw_only=True):
         return not SENSOR_CHANGES.isdisjoint(self.change)
 
     @property
-    def is_enough(self) -> bool:
+    def needs_no_other(self) -> bool:
         """True if no other cause is needed: in the band, or nearly all by a sensor."""
-        return self.brings_into_band or (
-            self.of_sensors and abs(self.explains - 1.0) <= SUFFICIENT_TOLERANCE
+        return self.is_sufficient or (
+            self.of_sensors and abs(self.explained_fraction - 1.0) <= SUFFICIENT_TOLERANCE
         )
 
 
 def interventions_on(
-    causes: Iterable[Intervention], owner: FilterName, axis: str, of: Of = "nis"
+    causes: Iterable[Intervention], owner: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Intervention]:
     """Return the re-runs for one discrepancy."""
     return [
         intervention
         for intervention in causes
-        if (intervention.of, intervention.filter, intervention.axis) == (of, owner, axis)
+        if (intervention.statistic, intervention.filter, intervention.axis)
+        == (statistic, owner, axis)
     ]
 
 
 def cause_of(
-    causes: Iterable[Intervention], owner: FilterName, axis: str, of: Of = "nis"
+    causes: Iterable[Intervention], owner: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Intervention | None:
     """Return the cause of one discrepancy, or None if no re-run explains it."""
     return min(
         (
             intervention
-            for intervention in interventions_on(causes, owner, axis, of)
+            for intervention in interventions_on(causes, owner, axis, statistic)
             if intervention.is_cause
         ),
         key=lambda intervention: (
-            not intervention.is_enough,
+            not intervention.needs_no_other,
             len(intervention.change.keys() - ACCOMPANYING_CHANGES),
             not intervention.of_sensors,
-            abs(intervention.explains - 1.0),
+            abs(intervention.explained_fraction - 1.0),
         ),
         default=None,
     )
@@ -243,10 +244,10 @@ def interventions(
         filters.append(_Ekf2Changes(*estimates, model.inputs, model))
     rows: list[Intervention] = []
     for changed in filters:
-        for result, of in changed.discrepancies():
-            tried_changes = _try_candidates(changed, result, of)
+        for result, statistic in changed.discrepancies():
+            tried_changes = _try_candidates(changed, result, statistic)
             rows += tried_changes
-            if cause := cause_of(tried_changes, changed.owner, result.axis.name, of):
+            if cause := cause_of(tried_changes, changed.owner, result.axis.name, statistic):
                 rows += _difference_reduction(cause, result, changed)
     return tuple(rows)
 
@@ -278,7 +279,7 @@ def _difference_reduction(
 ) -> list[Intervention]:
     """Compute the RMS difference KF - EKF2 (m) with and without a cause."""
     before, after = (
-        changed.statistic_after(result, "apart", change) for change in ({}, cause.change)
+        changed.statistic_after(result, "difference", change) for change in ({}, cause.change)
     )
     if before is None or after is None:
         return []
@@ -286,11 +287,11 @@ def _difference_reduction(
     return [
         structs.replace(
             cause,
-            of="apart",
+            statistic="difference",
             before=before[0],
             after=after[0],
-            explains=explained_share,
-            brings_into_band=False,
+            explained_fraction=explained_share,
+            is_sufficient=False,
         )
     ]
 
@@ -304,42 +305,46 @@ def is_inconsistent(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[Filt
     )
 
 
-def _find_discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Of]:
+def _find_discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Statistic]:
     """Return the statistics of a filter that are outside their limits."""
-    found: list[Of] = ["nees"] if error_beyond_reported_sigma(statement) else []
+    found: list[Statistic] = ["nees"] if error_beyond_reported_sigma(statement) else []
     return [*found, "nis"] if is_inconsistent(statement) else found
 
 
-def _try_candidates(changed: _FilterChanges, result: AxisComparison, of: Of) -> list[Intervention]:
+def _try_candidates(
+    changed: _FilterChanges, result: AxisComparison, statistic: Statistic
+) -> list[Intervention]:
     """Re-run all candidates alone; if none suffices, combine the best with each other one."""
-    statement, candidates = result.filters[changed.owner], changed.candidates(result, of)
+    statement, candidates = result.filters[changed.owner], changed.candidates(result, statistic)
     assert isinstance(statement, FilterSummary)  # else it has no discrepancy
     truth = statement.truth
     nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
-    before = statement.nis_mean if nees is None or of == "nis" else nees
-    is_checked_by_truth = of == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
+    before = statement.nis_mean if nees is None or statistic == "nis" else nees
+    is_checked_by_truth = (
+        statistic == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
+    )
 
     def rerun(change: Change) -> list[Intervention]:
-        statistic = changed.statistic_after(result, of, change)
-        if statistic is None or statistic[0] <= 0.0:
+        after_change = changed.statistic_after(result, statistic, change)
+        if after_change is None or after_change[0] <= 0.0:
             return []
-        after, count = statistic
-        low, high = nis_band(count) if of == "nis" else (0.0, MIN_NEES_FINDING)
+        after, count = after_change
+        low, high = nis_band(count) if statistic == "nis" else (0.0, MIN_NEES_FINDING)
         nees_after = (
             changed.statistic_after(result, "nees", change) if is_checked_by_truth else None
         )
         max_nees = MAX_NEES_AFTER_CHANGE if nees is not None and nees > 1.0 else MIN_NEES_FINDING
         return [
             Intervention(
-                of=of,
+                statistic=statistic,
                 filter=changed.owner,
                 axis=result.axis.name,
                 change=change,
                 before=before,
                 after=after,
-                explains=1.0 - float(np.log(after) / np.log(before)),
-                brings_into_band=low <= after <= high,
-                denied_by_truth=nees_after is not None and nees_after[0] >= max_nees,
+                explained_fraction=1.0 - float(np.log(after) / np.log(before)),
+                is_sufficient=low <= after <= high,
+                contradicts_truth=nees_after is not None and nees_after[0] >= max_nees,
             )
         ]
 
@@ -348,11 +353,11 @@ def _try_candidates(changed: _FilterChanges, result: AxisComparison, of: Of) -> 
         (
             intervention
             for intervention in single_changes
-            if MIN_HELPFUL_SHARE < intervention.explains < 2.0 - MIN_HELPFUL_SHARE
+            if MIN_HELPFUL_SHARE < intervention.explained_fraction < 2.0 - MIN_HELPFUL_SHARE
         ),
-        key=lambda intervention: abs(intervention.explains - 1.0),
+        key=lambda intervention: abs(intervention.explained_fraction - 1.0),
     )
-    if not helpful_changes or any(each.brings_into_band for each in helpful_changes):
+    if not helpful_changes or any(each.is_sufficient for each in helpful_changes):
         return single_changes
     best_change, *other_changes = helpful_changes
     return single_changes + [
@@ -367,7 +372,7 @@ def _rms_difference(run: Replay, state: pd.DataFrame) -> tuple[float, int] | Non
     kf_minus_ekf2 = difference(run, state)
     if isinstance(kf_minus_ekf2, Unavailable):
         return None
-    return kf_minus_ekf2.position_rmse_m, kf_minus_ekf2.count
+    return kf_minus_ekf2.position_rms_m, kf_minus_ekf2.count
 
 
 def _mean_nees(errors: AgainstTruth | Unavailable) -> tuple[float, int] | None:
@@ -398,13 +403,13 @@ class _FilterChanges:
 
     owner: ClassVar[FilterName]
 
-    def discrepancies(self) -> list[tuple[AxisComparison, Of]]:
+    def discrepancies(self) -> list[tuple[AxisComparison, Statistic]]:
         """Return the discrepancies with their axes; for EKF2 along horizontal axes only."""
         return [
-            (result, of)
+            (result, statistic)
             for result in self.comparison.axes.values()
             if self.owner == "kf" or result.axis.name != "down"
-            for of in _find_discrepancies(result.filters[self.owner])
+            for statistic in _find_discrepancies(result.filters[self.owner])
         ]
 
     @abstractmethod
@@ -419,15 +424,15 @@ class _FilterChanges:
 
     @abstractmethod
     def statistic_after(
-        self, result: AxisComparison, of: Of, change: Change
+        self, result: AxisComparison, statistic: Statistic, change: Change
     ) -> tuple[float, int] | None:
         """Return a statistic along an axis after a change, and the number of its samples."""
 
-    def candidates(self, result: AxisComparison, of: Of) -> list[Change]:
+    def candidates(self, result: AxisComparison, statistic: Statistic) -> list[Change]:
         """Return the candidate changes for a discrepancy along an axis."""
         statement, origin = result.filters[self.owner], self.comparison.source.origin
         assert isinstance(statement, FilterSummary)  # else it has no discrepancy
-        is_underconfident = of == "nis" and statement.nis_mean < 1.0
+        is_underconfident = statistic == "nis" and statement.nis_mean < 1.0
         tuned = tuning_of_axis(self.tuning, result.axis.name)
         changes = list[Change]()
         # innovations against GNSS or a drifting source do not show its slow errors
@@ -440,13 +445,13 @@ class _FilterChanges:
         if result.axis.name == "down":
             return changes
         if isinstance(turn := self.heading, HeadingError):
-            is_significant = abs(turn.turn_deg) > HEADING_SIGMAS * turn.sigma_deg
-            changes += [{TURN: -round(turn.turn_deg, 1)}] if is_significant else []
+            is_significant = abs(turn.misalignment_deg) > HEADING_SIGMAS * turn.sigma_deg
+            changes += [{TURN: -round(turn.misalignment_deg, 1)}] if is_significant else []
         return changes + self.other_candidates(None if is_underconfident else tuned)
 
     def time_offset_candidates(self) -> list[Change]:
         """Return the time offset if the part that the filter does not apply is significant."""
-        if isinstance(self.clock, Unavailable) or not self.clock.determinable:
+        if isinstance(self.clock, Unavailable) or not self.clock.is_determinable:
             return []
         applied_s = self.comparison.settings.clock_offset_s
         offset_s = applied_s + self.clock.remaining_s
@@ -467,7 +472,7 @@ class _KfChanges(_FilterChanges):
     ) -> list[Change]:
         """Return SIGMA_A and SIGMA_Z whose interval excludes the value in use."""
         changes = list[Change]()
-        for name, noise in ((SIGMA_A, tuned.filter_sigma_a), (SIGMA_Z, tuned.sigma_z)):
+        for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
             chosen_sigma = getattr(self.comparison.settings, name)
             ml_sigma = noise.value or (noise.high if over else None) or 0.0
             bound = noise.high if over else noise.low
@@ -506,7 +511,7 @@ class _KfChanges(_FilterChanges):
         return project_acceleration(corrected_ned, direction, self.comparison.segment)
 
     def statistic_after(
-        self, result: AxisComparison, of: Of, change: Change
+        self, result: AxisComparison, statistic: Statistic, change: Change
     ) -> tuple[float, int] | None:
         """Re-run KF with the change."""
         source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
@@ -538,12 +543,12 @@ class _KfChanges(_FilterChanges):
             measurement_time_s=time_s[is_used] + shift_s,
             measurement_m=axis.measurement_m[is_used],
         )
-        if of == "nis":
+        if statistic == "nis":
             legs = preintegrate(axis, settings)
             nu, s = innovations(legs, settings.sigma_a_m_s2, settings.sigma_z_m)
             return float(np.mean(nu**2 / s)), len(nu)
         run = quick_replay(axis, settings)
-        if of == "apart":
+        if statistic == "difference":
             state = result.ekf2_state
             return (
                 None
@@ -603,9 +608,9 @@ class _Ekf2Changes(_FilterChanges):
         """
         steps = self.comparison.settings.dt_s / self.inputs.step_s
         flown, px4_maximum = self.inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
-        if (tuned.filter_sigma_a.low or 0.0) * steps**0.5 <= VIBRATION_FACTOR * flown:
+        if (tuned.sigma_a_two_state.low or 0.0) * steps**0.5 <= VIBRATION_FACTOR * flown:
             return {}
-        ml_noise = min((tuned.filter_sigma_a.value or 0.0) * steps**0.5, px4_maximum)
+        ml_noise = min((tuned.sigma_a_two_state.value or 0.0) * steps**0.5, px4_maximum)
         return {ACC_NOISE: float(f"{ml_noise:.2g}")} if ml_noise > flown else {}
 
     def noise_candidates(
@@ -621,23 +626,23 @@ class _Ekf2Changes(_FilterChanges):
         return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, ml_noise_m)]
 
     def statistic_after(
-        self, result: AxisComparison, of: Of, change: Change
+        self, result: AxisComparison, statistic: Statistic, change: Change
     ) -> tuple[float, int] | None:
         """Replay EKF2 with the change; the difference without a change is from the log."""
         assert self.model is not None
-        compared_s, axis = self.model.flown.judged_s, result.axis
+        compared_s, axis = self.model.flown.evaluated_s, result.axis
         ekf2_replay = self._replay_with(self.model, change)
         if TURN in change and self.comparison.source.origin.is_gnss:
             # the change corrects the attitude: only its frame rotates, north stays
             axis = replace(axis, direction=_rotate_direction(axis.direction, -change[TURN]))
         weights = axis.direction[:2]
         updates = ekf2_replay.updates[inside_spans(ekf2_replay.updates.index, compared_s)]
-        if of == "nis":
+        if statistic == "nis":
             nu = along(updates, INNOVATION_COLUMNS, weights)
             s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
             return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
         state = project(ekf2_replay.published, axis, self.comparison.segment)
-        if of == "apart":
+        if statistic == "difference":
             logged = result.ekf2_state
             state = state if change or isinstance(logged, Unavailable) else logged
             return _rms_difference(result.replay, state[inside_spans(state.index, compared_s)])

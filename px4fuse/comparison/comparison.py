@@ -122,7 +122,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
             ),
         },
         difference=axis_difference,
-        rejected_share=float(rejected.mean()) if len(rejected) else None,
+        rejected_fraction=float(rejected.mean()) if len(rejected) else None,
         axis=axis,
         replay=kf_run,
         ekf2_state=state,
@@ -173,10 +173,10 @@ def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailabl
         )
     return Difference(
         count=len(position),
-        position_rmse_m=_rmse(position),
+        position_rms_m=_rmse(position),
         position_mean_m=float(np.mean(position)),
         position_maximum_m=float(np.max(np.abs(position))),
-        velocity_rmse_m_s=_rmse(velocity),
+        velocity_rms_m_s=_rmse(velocity),
         velocity_mean_m_s=float(np.mean(velocity)),
         velocity_maximum_m_s=float(np.max(np.abs(velocity))),
     )

@@ -17,7 +17,7 @@ from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Spans, inside_spans
-from px4fuse.ekf2.steps import Step, UnreplayedPart, Why
+from px4fuse.ekf2.steps import DifferenceExplanation, Step, UnreplayedPart
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.time_offset import ClockOffset
@@ -33,7 +33,7 @@ MIN_ELSEWHERE_M, MIN_ELSEWHERE_RATIO = 0.5, 3.0
 
 def explain_ekf2_difference(
     comparison: Comparison, model: Model | Unavailable, clock: ClockOffset | Unavailable
-) -> dict[str, Why | Unavailable]:
+) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each axis of a comparison.
 
     Parameters
@@ -46,7 +46,7 @@ def explain_ekf2_difference(
 
     Returns
     -------
-    mapping from axis name to Why or Unavailable
+    mapping from axis name to DifferenceExplanation or Unavailable
         "down" only if no other axis was compared: the replay covers horizontal positions only.
     """
     results = {name: result for name, result in comparison.axes.items() if name != "down"}
@@ -66,9 +66,11 @@ def explain_ekf2_difference(
     if isinstance(explanations, Unavailable):
         return dict.fromkeys(results, explanations)
     reasons = _step_reasons(comparison, model, clock)
-    sentences_by_axis: dict[str, Why | Unavailable] = {}
-    for name, why in explanations.items():
-        outside = structs.replace(why, outside=_unreplayed_part(results[name], why.spans_s))
+    sentences_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
+    for name, explanation in explanations.items():
+        outside = structs.replace(
+            explanation, outside=_unreplayed_part(results[name], explanation.spans_s)
+        )
         sentences_by_axis[name] = add_sentences(outside, comparison.axes[name].axis.called, reasons)
     return sentences_by_axis
 
@@ -96,42 +98,47 @@ def _unreplayed_part(result: AxisComparison, spans: Spans) -> UnreplayedPart | N
     return UnreplayedPart(float(distance_m[largest]), float(times[largest]))
 
 
-def add_sentences(why: Why, axis_label: str, reasons: dict[str, str]) -> Why:
+def add_sentences(
+    explanation: DifferenceExplanation, axis_label: str, reasons: dict[str, str]
+) -> DifferenceExplanation:
     """Add sentences: the steps that explain the difference along an axis, largest first.
 
     Parameters
     ----------
-    why : Why
+    explanation : DifferenceExplanation
     axis_label : str
         Name of the axis in a sentence.
     reasons : dict
         Behaviour of EKF2 and KF, by step.
     """
-    reasons = {**reasons, ways.GATE: f"{reasons[ways.GATE]}{_rejection_text(why)}"}
-    first, second, *_ = sorted(why.steps, key=lambda step: -step.position_mean_square_m2)
+    reasons = {**reasons, ways.GATE: f"{reasons[ways.GATE]}{_rejection_text(explanation)}"}
+    first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
     cause = (
         f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name} "
-        f"({_format_share(first, why)}). {reasons[first.name]}."
+        f"({_format_share(first, explanation)}). {reasons[first.name]}."
     )
     sentences = [f"{cause} {_moment_text(first)}"]
-    if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * why.position_mean_square_m2:
+    if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * explanation.position_mean_square_m2:
         sentences.append(
-            f"Second: {second.name} ({_format_share(second, why)}). {reasons[second.name]}. "
+            f"Second: {second.name} ({_format_share(second, explanation)}). "
+            f"{reasons[second.name]}. "
             f"{_moment_text(second)}"
         )
-    sentences += [_velocity_sentence(why), *_truth_sentences(why)]
-    far_m = max(MIN_ELSEWHERE_M, MIN_ELSEWHERE_RATIO * float(np.max(np.abs(why.kf_minus_ekf2_m))))
-    if why.outside is not None and why.outside.maximum_m > far_m:
+    sentences += [_velocity_sentence(explanation), *_truth_sentences(explanation)]
+    far_m = max(
+        MIN_ELSEWHERE_M, MIN_ELSEWHERE_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m)))
+    )
+    if explanation.outside is not None and explanation.outside.maximum_m > far_m:
         sentences.append(
             "Outside the replayed parts (EKF2 starting or not fusing the source) KF and "
-            f"EKF2 differ by up to {why.outside.maximum_m:.1f} m (at "
-            f"{why.outside.at_s:.0f} s)."
+            f"EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
+            f"{explanation.outside.at_s:.0f} s)."
         )
-    return structs.replace(why, sentences=tuple(sentences), cause=cause)
+    return structs.replace(explanation, sentences=tuple(sentences), cause=cause)
 
 
-def _format_share(step: Step, why: Why) -> str:
-    share = step.position_mean_square_m2 / why.position_mean_square_m2
+def _format_share(step: Step, explanation: DifferenceExplanation) -> str:
+    share = step.position_mean_square_m2 / explanation.position_mean_square_m2
     if share > 1.0:  # the shares add up to 100 %, and some are negative
         return "more than the whole mean square; other steps reduce it"
     return f"{100 * share:.0f} % of the mean square"
@@ -141,9 +148,9 @@ def _moment_text(step: Step) -> str:
     return f"Largest effect at {step.moved_at_s:.1f} s ({step.position_moved_m:.2f} m)."
 
 
-def _rejection_text(why: Why) -> str:
+def _rejection_text(explanation: DifferenceExplanation) -> str:
     """Format the longest run of rejected samples as a sentence; empty without one."""
-    run = why.coast
+    run = explanation.longest_rejection
     if run is None:
         return ""
     samples = f"{run.samples} samples in a row" if run.samples > 1 else "a sample"
@@ -171,7 +178,7 @@ def _step_reasons(
     delay = (
         f"EKF2 assumes positions are {flown[aid.delay]:g} ms old ({aid.delay}), KF {age_ms:.0f} ms"
     )
-    if isinstance(clock, ClockOffset) and clock.determinable:
+    if isinstance(clock, ClockOffset) and clock.is_determinable:
         ends_s = (clock.offset_s, *clock.interval_s[::-1])
         ml_delay_ms, low, high = (1e3 * (source.age_s - at) for at in ends_s)
         delay += (
@@ -205,7 +212,7 @@ def _step_reasons(
         ways.FLOW_STEP: "EKF2 also fuses optical flow; KF only positions",
         ways.VISION_STEP: "EKF2 fuses external vision and GNSS; KF only one of them",
         ways.GATE: (
-            f"EKF2 rejects {100 * model.agreement.rejected_share_logged:.1f} % of the samples; "
+            f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the samples; "
             "KF has no gate"
         ),
         ways.OUTPUT: (
@@ -215,9 +222,9 @@ def _step_reasons(
     }
 
 
-def _velocity_sentence(why: Why) -> str:
-    position, total = why.position_mean_square_m2, why.velocity_mean_square_m2_s2
-    first = max(why.steps, key=lambda part: part.velocity_mean_square_m2_s2)
+def _velocity_sentence(explanation: DifferenceExplanation) -> str:
+    position, total = explanation.position_mean_square_m2, explanation.velocity_mean_square_m2_s2
+    first = max(explanation.steps, key=lambda part: part.velocity_mean_square_m2_s2)
     share = first.velocity_mean_square_m2_s2 / total
     # a share above 1 compensates an earlier step, so it is not a contribution by itself
     largest = (
@@ -225,11 +232,11 @@ def _velocity_sentence(why: Why) -> str:
         if share <= 1.0
         else ""
     )
-    velocity_left_share = why.velocity_left_mean_square_m2_s2 / total
+    velocity_left_share = explanation.unexplained_velocity_mean_square_m2_s2 / total
     return (
         f"RMS difference KF - EKF2 over the replayed parts: {np.sqrt(position):.3f} m and "
         f"{np.sqrt(total):.3f} m/s.{largest} Share of the mean square that the replay does not "
-        f"explain: {_unexplained_text(why.position_left_share)} in position, "
+        f"explain: {_unexplained_text(explanation.unexplained_fraction)} in position, "
         f"{_unexplained_text(velocity_left_share)} in velocity."
     )
 
@@ -243,8 +250,8 @@ def _unexplained_text(share: float) -> str:
     return f"{100 * share:.1f} %" if share <= 1.0 else "all"
 
 
-def _truth_sentences(why: Why) -> list[str]:
-    kf_rmse_m, ekf2_rmse_m = (why.position_rmse_to_truth_m[name] for name in ("kf", "ekf2"))
+def _truth_sentences(explanation: DifferenceExplanation) -> list[str]:
+    kf_rmse_m, ekf2_rmse_m = (explanation.position_rmse_to_truth_m[name] for name in ("kf", "ekf2"))
     if isinstance(kf_rmse_m, Unavailable) or isinstance(ekf2_rmse_m, Unavailable):
         return []
     if abs(kf_rmse_m - ekf2_rmse_m) <= EQUAL_RMSE_TOLERANCE * max(kf_rmse_m, ekf2_rmse_m):
@@ -252,8 +259,11 @@ def _truth_sentences(why: Why) -> list[str]:
             f"KF and EKF2 have the same position RMSE (within {100 * EQUAL_RMSE_TOLERANCE:.0f} %): "
             f"KF {kf_rmse_m:.3f} m, EKF2 {ekf2_rmse_m:.3f} m."
         ]
-    rmse_by_step = [kf_rmse_m, *(step.position_rmse_to_truth_m or 0.0 for step in why.steps)]
-    changes, names = np.diff(np.square(rmse_by_step)), [step.name for step in why.steps]
+    rmse_by_step = [
+        kf_rmse_m,
+        *(step.position_rmse_to_truth_m or 0.0 for step in explanation.steps),
+    ]
+    changes, names = np.diff(np.square(rmse_by_step)), [step.name for step in explanation.steps]
     step_index = int(np.argmin(changes) if ekf2_rmse_m < kf_rmse_m else np.argmax(changes))
     before_m, after_m = rmse_by_step[step_index : step_index + 2]
     return [

@@ -40,7 +40,7 @@ Progress = Callable[[str], None]
 Tuning = Mapping[str, AxisTuning | Unavailable]
 
 
-def silent(_: str) -> None:
+def ignore_progress(_: str) -> None:
     """Ignore progress messages."""
 
 
@@ -61,7 +61,7 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 def tuned(
     comparison: Comparison,
     names: tuple[str, ...] | None = None,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
     cache: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Estimate the noises of a comparison's axes; without biases if the IMU rate is too low.
@@ -88,9 +88,9 @@ def tuned(
     )
 
 
-def noises_and_clock(
+def estimate_noises_and_clock(
     comparison: Comparison,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
     names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
     """Estimate the noises and the time offset that remains after the applied one.
@@ -120,7 +120,7 @@ def estimate_frame_rotation(
     comparison: Comparison,
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> HeadingError | Unavailable:
     """Estimate the frame misalignment in yaw with the estimated noise and time offset."""
     progress("heading")
@@ -128,7 +128,7 @@ def estimate_frame_rotation(
     if axis_tuning is not None:
         sigma_z_m = value_or_bound(axis_tuning.sigma_z, sigma_z_m)
     offset_s = 0.0
-    if isinstance(clock, ClockOffset) and clock.determinable:
+    if isinstance(clock, ClockOffset) and clock.is_determinable:
         offset_s = clock.remaining_s
     return estimate_heading_error(
         comparison.flight,
@@ -177,7 +177,7 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     offset = np.array([part.offset_s for part in clock.parts])
     weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
     if len(offset) <= MIN_PARTS:
-        return structs.replace(clock, change_p=None, drift_ppm=None, drift_sigma_ppm=None)
+        return structs.replace(clock, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None)
     scatter = np.sqrt(max(1.0, _weighted_square_sum(offset, weight) / (len(offset) - 1)))
     low, high = (clock.offset_s + scatter * (end - clock.offset_s) for end in clock.interval_s)
     reason = clock.reason
@@ -190,11 +190,11 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
         clock,
         interval_s=(float(low), float(high)),
         sigma_s=float(clock.sigma_s * scatter),
-        determinable=not reason,
+        is_determinable=not reason,
         reason=reason,
         drift_ppm=None,
         drift_sigma_ppm=None,
-        change_p=_largest_step_p_value(offset, weight),
+        change_p_value=_largest_step_p_value(offset, weight),
     )
 
 

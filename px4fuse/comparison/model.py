@@ -78,10 +78,10 @@ class Difference(Record, frozen=True, kw_only=True):
     """KF - EKF2 at EKF2's sample times."""
 
     count: Count
-    position_rmse_m: NotNegative
+    position_rms_m: NotNegative
     position_mean_m: float
     position_maximum_m: NotNegative
-    velocity_rmse_m_s: NotNegative
+    velocity_rms_m_s: NotNegative
     velocity_mean_m_s: float
     velocity_maximum_m_s: NotNegative
 
@@ -108,7 +108,7 @@ class AxisResult(Record, frozen=True, kw_only=True):
     updates : Updates
     filters : mapping from "kf" and "ekf2" to FilterSummary or UnjudgedFilter
     difference : Difference or Unavailable
-    rejected_share : float or None
+    rejected_fraction : float or None
         Share of the source's samples that EKF2 rejected; None if not logged.
     """
 
@@ -118,7 +118,7 @@ class AxisResult(Record, frozen=True, kw_only=True):
     updates: Updates
     filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UnjudgedFilter]]
     difference: OrUnavailable[Difference]
-    rejected_share: Share | None = None
+    rejected_fraction: Share | None = None
 
 
 class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):

@@ -97,7 +97,7 @@ def ml_delay_change(
     comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
     """Return EKF2's maximum-likelihood delay; empty without an estimate or if it is as flown."""
-    if isinstance(clock, Unavailable) or not clock.determinable:
+    if isinstance(clock, Unavailable) or not clock.is_determinable:
         return {}
     age_s, flown = comparison.source.age_s, inputs.settings[inputs.aid.delay]
     high, low = (1e3 * (age_s - end) for end in clock.interval_s)
@@ -147,7 +147,7 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
     """
     delay = inputs.aid.delay
     parameter = PARAMETERS[delay]
-    if delay_ms > parameter.maximum or inputs.received.has_measurement_times:
+    if delay_ms > parameter.maximum or inputs.received.uses_sender_times:
         return {}
     changes = {delay: max(float(round(delay_ms)), parameter.minimum)}
     needed, flown = changes[delay] + ARRIVAL_MS, inputs.settings
@@ -166,9 +166,10 @@ def noise_used_m(model: Model) -> float:
 def format_whatif_effect(before: Summary, after: Summary) -> str:
     """Format the effect of changed EKF2 parameters from replays without and with the change."""
     texts = []
-    if max(before.rejected_share, after.rejected_share) >= REJECTED_SHOWN:
+    if max(before.rejected_fraction, after.rejected_fraction) >= REJECTED_SHOWN:
         texts.append(
-            f"rejected {100 * before.rejected_share:.0f} % → {100 * after.rejected_share:.0f} %"
+            f"rejected {100 * before.rejected_fraction:.0f} % → "
+            f"{100 * after.rejected_fraction:.0f} %"
         )
     texts.append(f"mean NIS {_format_nis(before.nis_mean)} → {_format_nis(after.nis_mean)}")
     flown_rmse, changed_rmse = before.position_rmse_to_truth_m, after.position_rmse_to_truth_m
@@ -209,7 +210,7 @@ def format_ekf2_remedy(
     if isinstance(replays, Unavailable):
         return f"{capitalise_first(setting)}. {format_not_replayed(replays)}"
     before, (after,) = replays.replayed, replays.whatif
-    if not after.steady:
+    if not after.is_predictable:
         return (
             f"{fallback_remedy} The effect of setting {format_settings(changes)} is not "
             "predictable: single rejections decide."
@@ -309,7 +310,7 @@ def format_settings(changes: Mapping[str, float]) -> str:
 def noise_helps(before: Summary, after: Summary) -> bool:
     """Return True if the mean NIS is nearer to 1, without more rejections or a larger RMSE."""
     is_nearer = abs(math.log(after.nis_mean)) < MAX_LOG_NIS_RATIO * abs(math.log(before.nis_mean))
-    is_worse = after.rejected_share > before.rejected_share or _increases_error(
+    is_worse = after.rejected_fraction > before.rejected_fraction or _increases_error(
         before, after, MAX_ERROR_RATIO
     )
     return is_nearer and not is_worse
@@ -317,7 +318,7 @@ def noise_helps(before: Summary, after: Summary) -> bool:
 
 def rejects_less(before: Summary, after: Summary) -> bool:
     """Return True if the rejected share is less than half, without a larger position RMSE."""
-    rejects_fewer = after.rejected_share < MAX_REJECTED_RATIO * before.rejected_share
+    rejects_fewer = after.rejected_fraction < MAX_REJECTED_RATIO * before.rejected_fraction
     return rejects_fewer and not _increases_error(before, after, MAX_ERROR_RATIO)
 
 
@@ -325,7 +326,7 @@ def delay_helps(before: Summary, after: Summary) -> bool:
     """Return True if the innovations are smaller, without more rejections or a larger RMSE."""
     is_smaller = (
         _innovation_std_m(after) < _innovation_std_m(before)
-        and after.rejected_share <= before.rejected_share
+        and after.rejected_fraction <= before.rejected_fraction
     )
     return is_smaller and not _increases_error(before, after, 1.0)
 

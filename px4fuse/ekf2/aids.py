@@ -19,11 +19,11 @@ from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Sh
 
 AidVerdict = Literal[
     "consistent",
-    "variance overstated",
-    "variance understated",
+    "underconfident",
+    "overconfident",
     "biased",
-    "starved",
-    "idle",
+    "not_fused",
+    "disabled",
     "too few samples",
 ]
 # Limits for a biased aid: |mean ν| / RMS ν, and |mean ν| / √S. Above both limits the mean does not
@@ -60,9 +60,9 @@ class AidAxis(Record, frozen=True, kw_only=True):
     innovation_mean, innovation_std : float
     s_sqrt_median : float
         Median of √S.
-    nis_mean, nis_band, sigma_factor
+    nis_mean, nis_band, sigma_ratio
         As in :class:`~px4fuse.filter.consistency.NisVerdict`.
-    rejected_share : float
+    rejected_fraction : float
         Share of samples outside the gate along this axis.
     lag1_autocorrelation, ljung_box_p, bias_p : float
         As in :class:`~px4fuse.filter.consistency.Consistency`.
@@ -76,8 +76,8 @@ class AidAxis(Record, frozen=True, kw_only=True):
     s_sqrt_median: Positive
     nis_mean: Positive
     nis_band: tuple[NotNegative, NotNegative]
-    sigma_factor: Positive
-    rejected_share: Share
+    sigma_ratio: Positive
+    rejected_fraction: Share
     lag1_autocorrelation: Correlation
     ljung_box_p: Share
     bias_p: Share
@@ -95,16 +95,16 @@ class AidResult(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     label, unit, topic : str
-    intended_share : float or None
+    enabled_fraction : float or None
         Share of the flight in which EKF2 enabled the aid; None if not logged.
-    fused_share : float
+    fused_fraction : float
         Fused share of the samples received while the aid was enabled.
     fused_logged : bool
         True if the log contains for each sample whether EKF2 fused it; False if px4fuse applies the
         gate instead.
-    rejected_share : float
+    rejected_fraction : float
         Share of the samples received while the aid was enabled that were rejected along any axis.
-    longest_without_s : (float, float)
+    longest_gap_s : (float, float)
         Start and end of the longest time without a fused sample that began while the aid was
         enabled.
     resets : int
@@ -123,11 +123,11 @@ class AidResult(Record, frozen=True, kw_only=True):
     label: str
     unit: str
     topic: str
-    intended_share: Share | None = None
-    fused_share: Share
+    enabled_fraction: Share | None = None
+    fused_fraction: Share
     fused_logged: bool
-    rejected_share: Share
-    longest_without_s: Span
+    rejected_fraction: Share
+    longest_gap_s: Span
     resets: Count
     gate: Positive
     noise: Positive | None = None
@@ -136,17 +136,17 @@ class AidResult(Record, frozen=True, kw_only=True):
     axes: dict[str, AidAxis]
 
     @property
-    def longest_without(self) -> float:
+    def longest_gap_duration_s(self) -> float:
         """Longest time without a fused sample (s)."""
-        return self.longest_without_s[1] - self.longest_without_s[0]
+        return self.longest_gap_s[1] - self.longest_gap_s[0]
 
     @property
-    def is_bad(self) -> bool:
+    def is_faulty(self) -> bool:
         """Return True for an aid that is not fused although enabled, biased or overconfident.
 
         An underconfident aid is not a fault: PX4's default settings are underconfident.
         """
-        return self.verdict in ("starved", "biased", "variance understated")
+        return self.verdict in ("not_fused", "biased", "overconfident")
 
     @property
     def nis_mean(self) -> float:
@@ -204,11 +204,11 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
         for quantity in ("innovation", "variance")
     )
     enabled = np.ones(len(samples), bool)
-    intended_share = None
+    enabled_fraction = None
     if log.enabled is not None:
         enabled = np.asarray(step_values_at(log.enabled, samples.index) > 0.0)
         grid = pd.Index(np.arange(start_s, end_s, 0.1))
-        intended_share = (
+        enabled_fraction = (
             float(np.mean(step_values_at(log.enabled, grid) > 0.0)) if len(grid) else 0.0
         )
     fused_logged = "fused" in samples
@@ -236,8 +236,8 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
                 s_sqrt_median=assessment.sqrt_s_median_m,
                 nis_mean=assessment.nis_mean,
                 nis_band=assessment.nis_band,
-                sigma_factor=assessment.sigma_factor,
-                rejected_share=assessment.outside_gate,
+                sigma_ratio=assessment.sigma_ratio,
+                rejected_fraction=assessment.fraction_outside_gate,
                 bias_p=assessment.bias_p,
                 lag1_autocorrelation=assessment.lag1_autocorrelation,
                 ljung_box_p=assessment.ljung_box_p,
@@ -251,17 +251,17 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
         label=aid.label,
         unit=aid.unit,
         topic=log.topics[0],
-        intended_share=intended_share,
-        fused_share=_fraction(fused & enabled, enabled),
+        enabled_fraction=enabled_fraction,
+        fused_fraction=_fraction(fused & enabled, enabled),
         fused_logged=fused_logged,
-        rejected_share=_fraction(rejected & enabled, enabled),
-        longest_without_s=unfused_span_s,
+        rejected_fraction=_fraction(rejected & enabled, enabled),
+        longest_gap_s=unfused_span_s,
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_median,
         noise_from=_noise_origin(aid, log, noise_median),
         axes=axes,
-        verdict="idle"
+        verdict="disabled"
         if is_disabled
         else _verdict(
             axes, unfused_span_s[1] - unfused_span_s[0], times[fused & (not fused_logged)]
@@ -347,12 +347,12 @@ def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, en
     return float(ends[longest]), float(ends[longest + 1])
 
 
-def _verdict(axes: dict[str, AidAxis], longest_without: float, fused_s: Array) -> AidVerdict:
+def _verdict(axes: dict[str, AidAxis], longest_gap_duration_s: float, fused_s: Array) -> AidVerdict:
     # topics of old releases repeat samples at a reduced rate and are zero between fusions, so the
     # limit follows from the logged rate
     interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
-    if longest_without > max(NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s):
-        return "starved"
+    if longest_gap_duration_s > max(NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s):
+        return "not_fused"
     if not axes:
         return "too few samples"
     if any(_is_biased(axis) for axis in axes.values()):

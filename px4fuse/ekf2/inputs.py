@@ -49,7 +49,7 @@ from px4fuse.flight import (
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
-from px4fuse.readers.px4_positions import MAX_THINNED_HZ
+from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
 
@@ -100,7 +100,7 @@ class ReceivedPositions:
         True if EKF2 reset its position to the sample; False if rejections are not logged.
     source : str
         Name of the position track.
-    has_measurement_times : bool
+    uses_sender_times : bool
         True if EKF2 uses the measurement times of the sender instead of the delay parameter.
     correction_m : ndarray, shape (m, 2), or None
         Position correction of EKF2 at each sample (m, north and east), estimated from the published
@@ -116,7 +116,7 @@ class ReceivedPositions:
     source: str
     velocity_m_s: Array | None = None
     velocity_variance_m2_s2: Array | None = None
-    has_measurement_times: bool = False
+    uses_sender_times: bool = False
     correction_m: Array | None = None
 
     __repr__ = one_line_repr
@@ -336,13 +336,15 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
     regular_intervals = intervals[intervals <= IMU_GAP_S]
-    lost_share = float((np.rint(regular_intervals / interval) - 1.0).clip(0.0).sum() / len(time_s))
+    lost_fraction = float(
+        (np.rint(regular_intervals / interval) - 1.0).clip(0.0).sum() / len(time_s)
+    )
     return (
         None
-        if lost_share <= MAX_LOST_SHARE
+        if lost_fraction <= MAX_LOST_SHARE
         else Unavailable(
             "EKF2 replay",
-            f"{lost_share:.0%} of the IMU samples are missing from the log",
+            f"{lost_fraction:.0%} of the IMU samples are missing from the log",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
         )
     )
@@ -398,7 +400,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     track = _gnss_track(flight)
     if track is None or track.velocity is None:
         return Unavailable(ANALYSIS_NAME, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
-    if track.rate_hz < MAX_THINNED_HZ:
+    if track.rate_hz < MAX_DOWNSAMPLED_HZ:
         return Unavailable(
             "EKF2 replay",
             f"GNSS is logged at {track.rate_hz:.1f} Hz, below the rate that EKF2 fused",
@@ -432,7 +434,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         track.name,
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
-        has_measurement_times=track.age_s == 0.0 != flown_s,
+        uses_sender_times=track.age_s == 0.0 != flown_s,
         correction_m=_position_corrections(
             ekf2, samples.index.to_numpy(), decisions[0], flown["EKF2_TAU_POS"]
         ),

@@ -152,7 +152,7 @@ def _open_without_aids(
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    rejected_share = max(agreement.rejected_share_logged, agreement.rejected_share_replayed)
+    rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
     if rejected_share > MANY_REJECTIONS_SHARE and np.isfinite(inputs.received.rejected).any():
         logged_agreement = agreement_with_log(flight, _make_replay(inputs, runs, variants[1], {}))
         if isinstance(logged_agreement, Agreement):
@@ -219,7 +219,7 @@ def replay_settings(
         unused_parameters["EKF2_DELAY_MAX"] = (
             f"in {firmware} the fusion horizon follows from the largest delay parameter"
         )
-    if inputs.received.has_measurement_times:
+    if inputs.received.uses_sender_times:
         unused_parameters[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
     for name in [name for change in changes for name in change if name in unused_parameters]:
         raise SettingsError(f"{name} has no effect in this log: {unused_parameters[name]}.")

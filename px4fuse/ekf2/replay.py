@@ -106,7 +106,7 @@ class Agreement(Record, frozen=True, kw_only=True):
     samples : int
         Number of compared logged innovations, without the first seconds of each segment
         (:data:`~px4fuse.ekf2.replay_segments.SETTLING_S`).
-    rejected_share_logged, rejected_share_replayed : float
+    rejected_fraction_logged, rejected_fraction_replayed : float
         Share of these samples that EKF2 and the replay rejected.
     decisions_same : float
         Share of samples rejected in both or in neither.
@@ -134,8 +134,8 @@ class Agreement(Record, frozen=True, kw_only=True):
     gnss_hgt: Mapping[str, AxisAgreement] = {}
     baro_hgt: Mapping[str, AxisAgreement] = {}
     samples: Count
-    rejected_share_logged: Share
-    rejected_share_replayed: Share
+    rejected_fraction_logged: Share
+    rejected_fraction_replayed: Share
     decisions_same: Share
     published_rms_difference_m: NotNegative
     good: bool
@@ -221,7 +221,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     __repr__ = one_line_repr
 
     @property
-    def judged_s(self) -> Spans:
+    def evaluated_s(self) -> Spans:
         """Evaluated spans: each segment without its start and without flow-only times."""
         spans = []
         for start, end in self.stretches_s:
@@ -292,8 +292,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         **(position | other_agreements),
         doubtful=doubtful,
         samples=len(log),
-        rejected_share_logged=shares[0],
-        rejected_share_replayed=shares[1],
+        rejected_fraction_logged=shares[0],
+        rejected_fraction_replayed=shares[1],
         decisions_same=float(np.mean(rejected_in_log == rejected_in_model)),
         published_rms_difference_m=float(distance_m),
         good=good,
@@ -322,7 +322,7 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
     logged = ekf2.record.delayed
-    logged = logged[inside_spans(logged.index, replay.judged_s)]
+    logged = logged[inside_spans(logged.index, replay.evaluated_s)]
     if logged.empty:
         return None
     replayed_heading = replay.delayed["heading_rad"]
@@ -408,7 +408,7 @@ def _matched_samples(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the evaluated logged innovations and the updates of the same samples."""
     matched = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
-    is_used = (matched >= 0) & inside_spans(logged.index, replay.judged_s)
+    is_used = (matched >= 0) & inside_spans(logged.index, replay.evaluated_s)
     return logged[is_used], updates.iloc[matched[is_used]]
 
 
@@ -456,7 +456,7 @@ def _axis_agreement(
     nu, nu_log = (frame[f"innovation_{axis}_m"].to_numpy() for frame in (model, log))
     s, s_log = (frame[f"innovation_variance_{axis}_m2"].to_numpy() for frame in (model, log))
     low, middle, high = np.percentile(s / s_log, [5, 50, 95])
-    times = ekf2.state.index[inside_spans(ekf2.state.index, replay.judged_s)].to_numpy()
+    times = ekf2.state.index[inside_spans(ekf2.state.index, replay.evaluated_s)].to_numpy()
     direction = np.eye(3)[AXIS_NAMES.index(axis)]
     position, velocity = (
         along(replay.published, columns, direction, times)
@@ -566,7 +566,7 @@ def with_logged_rejections(
     )
     return replace(
         logged_rejections_agreement if has_all_decisions else agreement,
-        rejected_share_replayed=agreement.rejected_share_replayed,
+        rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
         good=good,
         reason=f"with EKF2's logged rejections: {reason}",

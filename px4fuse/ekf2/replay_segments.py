@@ -16,7 +16,7 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.notebook_display import one_line_repr
-from px4fuse.readers.px4_ekf2 import rows_of_stamps, samples_per_step
+from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
     from_vector,
@@ -434,7 +434,7 @@ def _make_segment(
     rows = slice(first_row, int(np.searchsorted(time, end_s, side="right")))
     time, imu = time[rows], imu.iloc[rows]
     interval = np.diff(time)
-    end_stamps = rows_of_stamps(time, record.delayed.index)
+    end_stamps = rows_of_timestamps(time, record.delayed.index)
     ends = step_ends(interval, end_stamps, predict_s(record))
     bias = np.asarray(start[Columns.ACCELEROMETER_BIAS])
     rate = imu[Columns.ANGULAR_RATE].to_numpy()[1:] - np.asarray(start[Columns.GYRO_BIAS])

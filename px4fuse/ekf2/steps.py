@@ -119,7 +119,7 @@ class UnreplayedPart(Record, frozen=True):
     at_s: float
 
 
-class WhySteps(Record, frozen=True, kw_only=True):
+class DifferenceSteps(Record, frozen=True, kw_only=True):
     """Difference KF - EKF2 along one axis, as the sum of the steps and a remainder.
 
     Attributes
@@ -129,12 +129,12 @@ class WhySteps(Record, frozen=True, kw_only=True):
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Mean square difference of KF to the logged EKF2.
     steps : tuple of Step
-    position_left_mean_square_m2, velocity_left_mean_square_m2_s2 : float
+    unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
         Unexplained remainder: mean square difference of the replay to the logged EKF2.
     position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
     spans_s : tuple of (float, float)
         Spans of the flight over which means are taken.
-    coast : RejectionRun or None
+    longest_rejection : RejectionRun or None
         Longest run of rejections; None without rejections.
     outside : UnreplayedPart or None
         None if the replay covers the analysed segment.
@@ -146,22 +146,22 @@ class WhySteps(Record, frozen=True, kw_only=True):
     position_mean_square_m2: NotNegative
     velocity_mean_square_m2_s2: NotNegative
     steps: tuple[Step, ...]
-    position_left_mean_square_m2: NotNegative
-    velocity_left_mean_square_m2_s2: NotNegative
+    unexplained_mean_square_m2: NotNegative
+    unexplained_velocity_mean_square_m2_s2: NotNegative
     position_rmse_to_truth_m: Mapping[str, NotNegative | Unavailable]
     spans_s: Spans
-    coast: RejectionRun | None = None
+    longest_rejection: RejectionRun | None = None
     outside: UnreplayedPart | None = None
     sentences: tuple[str, ...] = ()
 
     @property
-    def position_left_share(self) -> float:
+    def unexplained_fraction(self) -> float:
         """Unexplained share of the mean square difference."""
-        return self.position_left_mean_square_m2 / self.position_mean_square_m2
+        return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
-class Why(WhySteps, frozen=True, kw_only=True, eq=False):
-    """:class:`WhySteps` with the time series.
+class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False):
+    """:class:`DifferenceSteps` with the time series.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class Why(WhySteps, frozen=True, kw_only=True, eq=False):
         Sentence about the step with the largest contribution, without its time.
     """
 
-    schema_type = WhySteps
+    schema_type = DifferenceSteps
     times_s: Array
     kf_minus_ekf2_m: Array
     unexplained_m: Array
@@ -182,7 +182,7 @@ class Why(WhySteps, frozen=True, kw_only=True, eq=False):
 
 def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
-) -> dict[str, Why] | Unavailable:
+) -> dict[str, DifferenceExplanation] | Unavailable:
     """Compute the steps from KF to the logged EKF2, without explanatory sentences.
 
     Parameters
@@ -196,7 +196,7 @@ def explain_by_steps(
 
     Returns
     -------
-    dict from axis name to Why, or Unavailable
+    dict from axis name to DifferenceExplanation, or Unavailable
         Unavailable if the replay does not agree with the log.
     """
     if not model.agreement.good:
@@ -208,7 +208,7 @@ def explain_by_steps(
         delayed_variants(model, list(variants.values())),
         replay_with_logged_rejections(model),
     )
-    evaluated_spans, times = model.flown.judged_s, ekf2.state.index.to_numpy()
+    evaluated_spans, times = model.flown.evaluated_s, ekf2.state.index.to_numpy()
     is_inside = inside_spans(times, evaluated_spans)
     # only times that the replay and all KF runs cover
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
@@ -267,18 +267,18 @@ def explain_by_steps(
             for step_index, name in enumerate((*variants, OUTPUT), start=1)
         )
         filter_errors = {"kf": errors[0], "ekf2": errors[-1]}
-        steps_by_axis[axis] = Why(
+        steps_by_axis[axis] = DifferenceExplanation(
             count=len(times),
             position_mean_square_m2=position[0],
             velocity_mean_square_m2_s2=velocity[0],
             steps=steps,
-            position_left_mean_square_m2=position[-1],
-            velocity_left_mean_square_m2_s2=velocity[-1],
+            unexplained_mean_square_m2=position[-1],
+            unexplained_velocity_mean_square_m2_s2=velocity[-1],
             position_rmse_to_truth_m={
                 name: no_truth if error is None else error for name, error in filter_errors.items()
             },
             spans_s=spans,
-            coast=longest_rejection,
+            longest_rejection=longest_rejection,
             times_s=times,
             # copies: a view would keep all steps in memory
             kf_minus_ekf2_m=difference[0, 0].copy(),

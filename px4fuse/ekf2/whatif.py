@@ -107,24 +107,24 @@ class HeightSummary(Record, frozen=True):
     nis_mean : float
     nis_band : (float, float)
     innovation_std_m : float
-    rejected_share : float
+    rejected_fraction : float
     longest_without_fusion_s : float
     """
 
     nis_mean: NotNegative
     nis_band: tuple[NotNegative, NotNegative]
     innovation_std_m: NotNegative
-    rejected_share: Share
+    rejected_fraction: Share
     longest_without_fusion_s: NotNegative
 
     @property
-    def steady(self) -> bool:
+    def is_predictable(self) -> bool:
         """Return True if the result is predictable: no height reset and few rejections.
 
         The replay does not model a height reset.
         """
         is_without_reset = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
-        return is_without_reset and self.rejected_share <= MAX_REJECTED_SHARE
+        return is_without_reset and self.rejected_fraction <= MAX_REJECTED_SHARE
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
@@ -138,7 +138,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
         Time (s) from which the aid is not fused.
     north, east : AxisSummary
     samples : int
-    rejected_share : float
+    rejected_fraction : float
     longest_without_fusion_s : float or Unavailable
     resets : int
         Resets of horizontal position.
@@ -151,7 +151,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     height_rmse_to_truth_m : float or Unavailable
     late, lost : int
         Samples that arrived behind the fusion horizon: fused late, and never fused.
-    steady : bool
+    is_predictable : bool
         False if the result is not predictable: single rejections change it.
     """
 
@@ -159,7 +159,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     north: AxisSummary
     east: AxisSummary
     samples: Count
-    rejected_share: Share
+    rejected_fraction: Share
     longest_without_fusion_s: NotNegative | Unavailable
     resets: Count
     heading_error_mean_deg: float | Unavailable = HEADING_NOT_REPLAYED
@@ -168,7 +168,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     height_rmse_to_truth_m: NotNegative | Unavailable = HEIGHT_NOT_REPLAYED
     late: Count = 0
     lost: Count = 0
-    steady: bool = True
+    is_predictable: bool = True
     without: Mapping[str, float] = {}
 
     @property
@@ -249,7 +249,7 @@ def what_if(
         return model.agreement.as_unavailable(ANALYSIS_NAME)
     without = without or {}
     replays = replay_settings(model, settings, without=without)
-    flight, evaluated_s = model.flight, model.flown.judged_s
+    flight, evaluated_s = model.flight, model.flown.evaluated_s
     if without:
         disabled_s = min(without.values())
         # a later segment would start from a logged state into which the aid was fused
@@ -262,7 +262,7 @@ def what_if(
         if not evaluated_s:
             raise SettingsError(
                 f"--from {disabled_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
-                f"flight, which ends at {model.flown.judged_s[-1][1]:.0f} s. Choose an "
+                f"flight, which ends at {model.flown.evaluated_s[-1][1]:.0f} s. Choose an "
                 "earlier time."
             )
     gnss = model.inputs.aid == GNSS_POS
@@ -334,7 +334,7 @@ def _mark_unpredictable(
         repeated_runs
         for repeated_runs in runs
         if repeated_runs[0].changed
-        and MIN_REJECTED_SHARE < repeated_runs[0].rejected_share <= MAX_REJECTED_SHARE
+        and MIN_REJECTED_SHARE < repeated_runs[0].rejected_fraction <= MAX_REJECTED_SHARE
     ]
     for seed in range(DISTURBANCE_RUNS if uncertain_runs else 0):
         noisy_model = with_position_noise(model, DISTURBANCE_M, seed)
@@ -348,14 +348,14 @@ def _mark_unpredictable(
     return tuple(
         replace(
             summary,
-            steady=all(height.steady for height in summary.heights.values())
+            is_predictable=all(height.is_predictable for height in summary.heights.values())
             and all(
-                noisy_model.rejected_share <= MAX_REJECTED_SHARE
+                noisy_model.rejected_fraction <= MAX_REJECTED_SHARE
                 for noisy_model in summary.others.values()
             )
             and (
                 not summary.changed
-                or (summary.rejected_share <= MAX_REJECTED_SHARE and _agree(repeated_runs))
+                or (summary.rejected_fraction <= MAX_REJECTED_SHARE and _agree(repeated_runs))
             ),
             without=without,
         )
@@ -366,7 +366,7 @@ def _mark_unpredictable(
 def _agree(runs: Sequence[Summary]) -> bool:
     """Return True if consistency, rejections and RMSE of all runs agree within the limits."""
     rmse = [e for summary in runs if isinstance(e := summary.position_rmse_to_truth_m, float)]
-    shares = [summary.rejected_share for summary in runs]
+    shares = [summary.rejected_fraction for summary in runs]
     nis = [[summary.axes[axis].nis_mean for summary in runs] for axis in HORIZONTAL]
     return (
         all(max(values) <= MAX_NIS_RATIO * min(values) for values in nis)
@@ -500,7 +500,7 @@ def _make_summary(
         more["heights"], more["height_rmse_to_truth_m"] = heights, error_m(np.eye(3)[2])
     return Summary(
         samples=len(evaluated_updates),
-        rejected_share=float(evaluated_updates["rejected"].mean()),
+        rejected_fraction=float(evaluated_updates["rejected"].mean()),
         heading_error_mean_deg=_heading_error(flight, replay, heading, evaluated_s),
         **more,
     )

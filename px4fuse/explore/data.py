@@ -28,7 +28,7 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding, find, finding_title, group_by_root
 from px4fuse.findings.cause_grouping import NOISES
-from px4fuse.findings.summary import summarise_flight
+from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.text import capitalise_first
@@ -59,7 +59,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
         "source": analysis.source.name,
         # estimates from the innovations of a drifting source are not its noise
         "drifts": analysis.source.origin.may_drift,
-        "story": list(summarise_flight(analysis, findings)),
+        "summary": list(summarise(analysis, findings)),
         "settings": _settings_data(analysis.settings),
         "main": analysis.main.axis.name,
         **signals,
@@ -130,7 +130,7 @@ def _offset_data(request: ComparisonRequest, analysis: Analysis) -> dict[str, An
         return {"why": "the clock offset of a position file is used to align the file"}
     centre, clock = analysis.settings.clock_offset_s, analysis.clock
     likely = None
-    if isinstance(clock, ClockOffset) and clock.determinable:
+    if isinstance(clock, ClockOffset) and clock.is_determinable:
         likely = centre + clock.remaining_s
     return {"from": centre - OFFSET_REACH_S, "to": centre + OFFSET_REACH_S, "likely": likely}
 
@@ -267,7 +267,7 @@ def _summary(statement: Consistency | Unavailable) -> dict[str, Any]:
         "count": statement.count,
         "nis": statement.nis_mean,
         "band": list(statement.nis_band),
-        "outside": statement.outside_two_sigma,
+        "outside": statement.fraction_outside_two_sigma,
         "lag1": statement.lag1_autocorrelation,
     }
 
@@ -295,7 +295,7 @@ def _map_data(analysis: Analysis) -> dict[str, Any]:
         name: {
             "sigmaA": tuned.map.sigma_a_m_s2[[0, -1]].tolist(),
             "sigmaZ": tuned.map.sigma_z_m[[0, -1]].tolist(),
-            "likely": [tuned.filter_sigma_a.value, tuned.sigma_z.value],
+            "likely": [tuned.sigma_a_two_state.value, tuned.sigma_z.value],
             "count": tuned.count,
         }
         if isinstance(tuned, AxisTuning)

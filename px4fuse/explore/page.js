@@ -388,7 +388,7 @@ const Explore = (async () => {
       band.style.width = `${100 * (place(kf.band[1]) - place(kf.band[0]))}%`;
     }
     const values = [["KF", kf], ["EKF2", ekf2]].filter(([, one]) => one?.nis !== undefined)
-      .map(([name, one]) => `${name} ${Story.formatNumber(one.nis, 2)} (${Story.verdict(one)})`);
+      .map(([name, one]) => `${name} ${Summary.formatNumber(one.nis, 2)} (${Summary.verdict(one)})`);
     $("needle").ariaLabel = $("read").textContent = `mean NIS: ${values.join("; ") || "unknown"}`;
   }
   const rerun = (axis) => (changes) => {
@@ -401,8 +401,8 @@ const Explore = (async () => {
     const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["clock offset", "offset", likely]]
       .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
       .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
-    const text = Story.sentence(axis, kf, ekf2Of(axis))
-      + (Practice.hidden || flight.drifts ? "" : Story.remedy(kf, candidates, rerun(axis)));
+    const text = Summary.sentence(axis, kf, ekf2Of(axis))
+      + (Practice.hidden || flight.drifts ? "" : Summary.remedy(kf, candidates, rerun(axis)));
     for (const line of document.querySelectorAll(".changed-note")) {
       line.textContent = isChanged() ? `Settings changed since the report: ${text}` : "";
       line.parentElement.classList.toggle("stale", isChanged());
@@ -413,7 +413,7 @@ const Explore = (async () => {
   const ROWS = [
     ["Mean NIS (expected 1)", (x) => x.nis?.toFixed(2)],
     ["95 % band", (x) => x.band && `${x.band[0].toFixed(2)}–${x.band[1].toFixed(2)}`],
-    ["Verdict", Story.verdict],
+    ["Verdict", Summary.verdict],
     ["Outside ±2√S (expected 5 %)", (x) => x.outside === undefined ? undefined
       : `${(100 * x.outside).toFixed(1)} %`],
     ["Lag-1 autocorrelation of ν", (x) => x.lag1?.toFixed(2)],

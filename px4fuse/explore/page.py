@@ -13,7 +13,7 @@ from px4fuse.explore.packing import Packer
 from px4fuse.webpage.safe import clean_values, inert_json, part, policy_hash, template
 
 MAX_CHARACTERS = 2000  # longer texts from a log are shortened
-SCRIPTS = ("dom", "story", "step", "times", "tour")
+SCRIPTS = ("dom", "summary", "step", "times", "tour")
 PACKAGE = "px4fuse.explore"
 
 

@@ -102,13 +102,13 @@ const Times = (() => {
     // ------------------------------------------------------------------ summary and findings
     $("facts").textContent = `positions from ${flight.source}, ${ends.map((t) => t.toFixed(1)).join(" s to ")} s`;
     /* Show the summary and the findings of the report */
-    function recorded({ story, findings }) {
+    function recorded({ summary, findings }) {
       const { sigmaA, sigmaZ, dt, offset } = flight.settings;
       $("found").replaceChildren();
-      if (!story.length) { $("found").append(make("p", "Hidden until you answer.")); return; }
+      if (!summary.length) { $("found").append(make("p", "Hidden until you answer.")); return; }
       $("found").append(make("p", `Analysed with SIGMA_A ${sigmaA} m/s², SIGMA_Z ${sigmaZ} m, DT ${dt} s, clock `
         + `offset ${Number(offset.toPrecision(4))} s. The settings of this page do not change it.`, { className: "note" }),
-      make("p", story.join(" "), { dir: "auto", className: "story" }));
+      make("p", summary.join(" "), { dir: "auto", className: "summary" }));
       if (!findings.length) $("found").append(make("p", "Findings: none."));
       for (const finding of findings) $("found").append(findingBox(finding));
     }

@@ -1,7 +1,7 @@
 /* Tour of seven stations on this flight. Each sets the settings, describes the effect with the flight's
    numbers, and gives one task. The previous settings return at the end. */
 const Tour = (() => {
-  const { formatNumber: number, formatMetres: length } = Story;
+  const { formatNumber: number, formatMetres: length } = Summary;
 
   /* Each station returns title, sentence, task, observation, settings and view */
   const STATIONS = [

@@ -12,8 +12,8 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 from px4fuse.arrays import Array
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
 
-# "overstated": underconfident, σ too large; "understated": overconfident, σ too small
-Verdict = Literal["consistent", "variance overstated", "variance understated"]
+# underconfident: the reported σ is too large; overconfident: too small
+Verdict = Literal["consistent", "underconfident", "overconfident"]
 
 # With fewer innovations the 95 % band of the mean NIS is wider than 0.3 to 2.1
 MIN_INNOVATIONS = 10
@@ -35,15 +35,15 @@ class NisVerdict(Record, frozen=True, kw_only=True):
         Mean of ν²/S per degree of freedom; expected 1.
     nis_band : (float, float)
         Two-sided 95 % chi-square band of the mean NIS, for white innovations.
-    sigma_factor : float
-        Ratio of reported to actual σ, 1/√nis_mean: above 1, √S is too large.
+    sigma_ratio : float
+        Ratio of actual to reported σ, √nis_mean: above 1, the filter is overconfident.
     verdict : str
     """
 
     count: Count
     nis_mean: Positive
     nis_band: tuple[NotNegative, NotNegative]
-    sigma_factor: Positive
+    sigma_ratio: Positive
     verdict: Verdict
 
     @property
@@ -60,9 +60,9 @@ class Consistency(NisVerdict, frozen=True, kw_only=True):
     innovation_mean_m, innovation_std_m : float
     sqrt_s_median_m : float
         Median of √S, the standard deviation that the filter expects.
-    outside_two_sigma : float
+    fraction_outside_two_sigma : float
         Fraction outside ±2√S; expected 0.046.
-    outside_gate : float
+    fraction_outside_gate : float
         Fraction outside the gate.
     bias_t, bias_p : float
         Student's t of the mean against zero, and its two-sided p-value.
@@ -76,8 +76,8 @@ class Consistency(NisVerdict, frozen=True, kw_only=True):
     innovation_mean_m: float
     innovation_std_m: NotNegative
     sqrt_s_median_m: Positive
-    outside_two_sigma: Share
-    outside_gate: Share
+    fraction_outside_two_sigma: Share
+    fraction_outside_gate: Share
     bias_t: float
     bias_p: Share
     lag1_autocorrelation: Correlation
@@ -110,9 +110,9 @@ def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
 def classify_mean_nis(nis_mean: float, band: tuple[float, float]) -> Verdict:
     """Return the two-sided verdict on a mean NIS."""
     if nis_mean < band[0]:
-        return "variance overstated"
+        return "underconfident"
     if nis_mean > band[1]:
-        return "variance understated"
+        return "overconfident"
     return "consistent"
 
 
@@ -122,7 +122,7 @@ def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
         "count": len(nis),
         "nis_mean": mean,
         "nis_band": band,
-        "sigma_factor": float(np.sqrt(1.0 / mean)),
+        "sigma_ratio": float(np.sqrt(mean)),
         "verdict": classify_mean_nis(mean, band),
     }
 
@@ -180,8 +180,8 @@ def assess(
         innovation_mean_m=float(np.mean(nu)),
         innovation_std_m=std,
         sqrt_s_median_m=float(np.median(np.sqrt(s))),
-        outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
-        outside_gate=float(np.mean(np.abs(normalised) > gate)),
+        fraction_outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
+        fraction_outside_gate=float(np.mean(np.abs(normalised) > gate)),
         bias_t=bias_t,
         bias_p=float(2.0 * stdtr(count - 1, -abs(bias_t))),
         lag1_autocorrelation=float(r[0]),

@@ -70,7 +70,7 @@ class HeadingError(Record, frozen=True):
 
     Attributes
     ----------
-    turn_deg : float
+    misalignment_deg : float
         Mean over the flight.
     sigma_deg : float
         Standard deviation of the mean; not reduced by averaging, as errors are common to all parts.
@@ -84,7 +84,7 @@ class HeadingError(Record, frozen=True):
         Data from which the angle is estimated.
     """
 
-    turn_deg: float
+    misalignment_deg: float
     sigma_deg: NotNegative
     drifts: bool
     parts: tuple[HeadingPart, ...]
@@ -107,7 +107,7 @@ def combine_heading_parts(
     """Combine the parts of a flight into one result."""
     turns_deg = [heading_part.heading_error_deg for heading_part in parts]
     return HeadingError(
-        turn_deg=float(np.mean(turns_deg)),
+        misalignment_deg=float(np.mean(turns_deg)),
         sigma_deg=float(np.mean([heading_part.sigma_deg for heading_part in parts])),
         drifts=drift_p < MAX_DRIFT_P and max(turns_deg) - min(turns_deg) >= MIN_DRIFT_DEG,
         parts=parts,

@@ -77,7 +77,7 @@ class Clock(Record, frozen=True, kw_only=True):
         Standard deviation by the curvature at the maximum, widened likewise.
     applied_s : float
         Offset already added to the timestamps.
-    determinable : bool
+    is_determinable : bool
         True if the interval is closed and narrow enough.
     reason : str
         Reason if not determinable, else empty.
@@ -85,7 +85,7 @@ class Clock(Record, frozen=True, kw_only=True):
         Offsets of consecutive parts.
     drift_ppm, drift_sigma_ppm : float or None
         Drift of the source's clock relative to the autopilot's; None with fewer than three parts.
-    change_p : float or None
+    change_p_value : float or None
         p-value of a constant offset (likelihood ratio test); None with fewer than two parts.
     count : int
         Number of measurements.
@@ -95,11 +95,11 @@ class Clock(Record, frozen=True, kw_only=True):
     interval_s: Span
     sigma_s: NotNegative
     applied_s: float
-    determinable: bool
+    is_determinable: bool
     reason: str = ""
     drift_ppm: float | None = None
     drift_sigma_ppm: NotNegative | None = None
-    change_p: Share | None = None
+    change_p_value: Share | None = None
     parts: tuple[PartOffset, ...]
     count: Count
 
@@ -219,10 +219,10 @@ def estimate_time_offset(
         range_text = f"offsets from {low:+.2f} s to {high:+.2f} s have nearly the same likelihood"
         reason = f"{range_text}: too little acceleration, or too much position noise"
     parts: tuple[PartOffset, ...] = ()
-    change_p = None
+    change_p_value = None
     if not reason:
         progress("changes of the time offset")
-        parts, change_p = _offset_per_part(prepared_motion, offset, noises, factor)
+        parts, change_p_value = _offset_per_part(prepared_motion, offset, noises, factor)
     drift, drift_sigma = _clock_drift(parts)
     applied = settings.clock_offset_s
     return ClockOffset(
@@ -230,14 +230,14 @@ def estimate_time_offset(
         interval_s=(applied + low, applied + high),
         applied_s=applied,
         sigma_s=float(np.hypot(sigma * np.sqrt(factor), resolution)),
-        determinable=not reason,
+        is_determinable=not reason,
         reason=reason,
         curve_s=applied + curve,
         curve_drop=profile - profile.min(),
         parts=tuple(structs.replace(part, offset_s=applied + part.offset_s) for part in parts),
         drift_ppm=drift,
         drift_sigma_ppm=drift_sigma,
-        change_p=change_p,
+        change_p_value=change_p_value,
         sigma_a_m_s2=noises.sigma_a_m_s2,
         sigma_z_m=noises.sigma_z_m,
         count=len(prepared_motion.time_s),

@@ -104,7 +104,7 @@ class HeldOutCheck(Record, frozen=True):
         Estimates from the first half.
     count : int
         Measurements of the second half.
-    gain_nats : float
+    log_likelihood_gain_per_measurement : float
         Gain of log-likelihood per measurement of the second half over the chosen settings; positive
         if tuning improves data that were not used for it.
     """
@@ -112,7 +112,7 @@ class HeldOutCheck(Record, frozen=True):
     sigma_a_m_s2: NotNegative
     sigma_z_m: NotNegative
     count: Count
-    gain_nats: float
+    log_likelihood_gain_per_measurement: float
 
 
 class NoiseEstimate(Record, frozen=True, kw_only=True):
@@ -125,10 +125,10 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
     ----------
     sigma_a_m_s2, sigma_z_m : float or None
         Noise without biases and tilt, if the IMU data are sufficient to estimate these.
-    filter_sigma_a_m_s2 : float or None
+    sigma_a_two_state_m_s2 : float or None
         SIGMA_A that KF needs at this SIGMA_Z, since it has no states for biases.
-    gain_nats : float
-        Gain of log-likelihood per measurement of KF with ``filter_sigma_a`` and ``sigma_z`` over
+    log_likelihood_gain_per_measurement : float
+        Gain of log-likelihood per measurement of KF with ``sigma_a_two_state`` and ``sigma_z`` over
         the chosen settings.
     before, after : Consistency or Unavailable
         Consistency with the chosen and the estimated settings, without outliers; along the first
@@ -143,11 +143,11 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
 
     sigma_a_m_s2: NotNegative | None = None
     sigma_a_m_s2_interval: NoiseInterval | None = None
-    filter_sigma_a_m_s2: NotNegative | None = None
-    filter_sigma_a_m_s2_interval: NoiseInterval | None = None
+    sigma_a_two_state_m_s2: NotNegative | None = None
+    sigma_a_two_state_m_s2_interval: NoiseInterval | None = None
     sigma_z_m: NotNegative | None = None
     sigma_z_m_interval: NoiseInterval | None = None
-    gain_nats: float
+    log_likelihood_gain_per_measurement: float
     before: OrUnavailable[Consistency]
     after: OrUnavailable[Consistency]
     count: Count
@@ -161,9 +161,9 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
         return Noise.of(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
 
     @property
-    def filter_sigma_a(self) -> Noise:
+    def sigma_a_two_state(self) -> Noise:
         """SIGMA_A that KF needs (m/s²)."""
-        return Noise.of(self.filter_sigma_a_m_s2, self.filter_sigma_a_m_s2_interval)
+        return Noise.of(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
 
     @property
     def sigma_z(self) -> Noise:
@@ -327,8 +327,8 @@ def tune_axes(
         name=name,
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
-        **two_state_sigma_a.as_fields("filter_sigma_a_m_s2"),
-        gain_nats=gain / count,
+        **two_state_sigma_a.as_fields("sigma_a_two_state_m_s2"),
+        log_likelihood_gain_per_measurement=gain / count,
         before=_assess_innovations(intervals[0], chosen_noises, skip),
         after=_assess_innovations(intervals[0], after, skip),
         outlier_time_s=axes[0].measurement_time_s[-count:][skip],

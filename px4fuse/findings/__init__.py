@@ -32,11 +32,11 @@ from px4fuse.findings import (
     source_stamps,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import NAMES, Finding, Findings, Severity, group_by_root
+from px4fuse.findings.model import TITLES, Finding, Findings, Severity, group_by_root
 from px4fuse.loop.model import Loop
 
 __all__ = [
-    "NAMES",
+    "TITLES",
     "Finding",
     "Severity",
     "find",
@@ -95,4 +95,4 @@ def finding_title(finding: str) -> str:
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')
     """
-    return NAMES.get(finding, finding.replace("_", " "))
+    return TITLES.get(finding, finding.replace("_", " "))

@@ -9,7 +9,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
-from px4fuse.findings.model import Findings, format_percent, info, warning
+from px4fuse.findings.model import Findings, format_percent, note, warning
 from px4fuse.flight import Unavailable
 from px4fuse.text import format_factor, format_number
 
@@ -35,28 +35,28 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     not_fused: dict[str, list[AidResult]] = {}
     for name, aid in tested_aids.items():
-        if aid.verdict == "starved":
+        if aid.verdict == "not_fused":
             not_fused.setdefault(AIDS[name].switch or name, []).append(aid)
     for switch, aids_of_sensor in not_fused.items():
-        longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_without)
+        longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
         labels = ", ".join(_aid_label(aid) for aid in aids_of_sensor)
         has_change = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
         cause = _sensor_cause(switch, source_aid) or (CHANGE if has_change else "")
         yield warning(
-            "aid_starved",
-            f"EKF2 fused no sample of {labels} for {longest_unfused.longest_without:.0f} s, "
+            "aid_not_fused",
+            f"EKF2 fused no sample of {labels} for {longest_unfused.longest_gap_duration_s:.0f} s, "
             f"although fusion was enabled. The limit is {NOT_FUSED_LIMIT_S:g} s; "
-            f"{format_percent(longest_unfused.rejected_share, 1)} of the samples were rejected. "
+            f"{format_percent(longest_unfused.rejected_fraction, 1)} of the samples were rejected. "
             "EKF2 relied on its other aids and the IMU, so its error grew.",
             "Check the sensor at that time (reception, range, light). Check whether EKF2 rejected "
             "its samples.",
             {
                 "aid": labels,
-                "longest_without_s": longest_unfused.longest_without,
-                "rejected_share": longest_unfused.rejected_share,
+                "longest_gap_s": longest_unfused.longest_gap_duration_s,
+                "rejected_fraction": longest_unfused.rejected_fraction,
                 CAUSE: cause,
             },
-            (longest_unfused.longest_without_s,),
+            (longest_unfused.longest_gap_s,),
         )
     for name, aid in tested_aids.items():
         changes = {
@@ -68,7 +68,7 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
         if changes and not _sensor_cause(AIDS[name].switch, source_aid):
             axis, (time_s, shift) = max(changes.items(), key=lambda item: abs(item[1][1]))
             yield warning(
-                "aid_changed",
+                "aid_innovation_shift",
                 f"The mean innovation of {label} shifts by {abs(shift):.1f} √S at about "
                 f"{time_s:.0f} s ({axis}). From then on this aid and the other aids contradict "
                 "each other, until the EKF2 states absorb the difference.",
@@ -77,24 +77,25 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
                 ((time_s, time_s + WINDOW_S),),
             )
-        elif aid.verdict == "variance understated" and name != source_aid:
+        elif aid.verdict == "overconfident" and name != source_aid:
             # no value is proposed: innovations alone cannot separate noise from a wrong delay
             noise_parameter = AIDS[name].noise
             action = "correct the accuracy that the sensor reports"
             if noise_parameter:
                 action = f"increase {noise_parameter}"
             yield warning(
-                "aid_understated",
+                "aid_overconfident",
                 f"EKF2 is overconfident about {label}: σ is {format_factor(aid.nis_mean**0.5)} "
                 f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1); "
-                f"{format_percent(aid.rejected_share, 1)} of the samples were rejected. The errors "
-                f"of this aid are larger than R{_format_noise(aid)}, or another aid is wrong.",
+                f"{format_percent(aid.rejected_fraction, 1)} of the samples were rejected. The "
+                f"errors of this aid are larger than R{_format_noise(aid)}, or another aid is "
+                "wrong.",
                 "First check outliers, delay and mounting of the sensor, and the other aids. If "
                 f"the sensor is noisier than assumed, {action}.",
                 {
                     "aid": name,
                     "nis_mean": aid.nis_mean,
-                    "rejected_share": aid.rejected_share,
+                    "rejected_fraction": aid.rejected_fraction,
                     CAUSE: _sensor_cause(AIDS[name].switch, source_aid),
                 },
             )
@@ -102,8 +103,8 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
             axis, worst_axis = max(
                 aid.axes.items(), key=lambda item: abs(item[1].mean_normalised_innovation)
             )
-            yield info(
-                "aid_biased",
+            yield note(
+                "aid_innovation_bias",
                 f"The innovations of {label} have a mean of "
                 f"{format_number(worst_axis.innovation_mean)} {aid.unit} ({axis}; √S is "
                 f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aid and another one "

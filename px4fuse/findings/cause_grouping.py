@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from msgspec.structs import replace
 
-from px4fuse.findings.model import NAMES, SEVERITIES, Finding, group_by_root
+from px4fuse.findings.model import SEVERITIES, TITLES, Finding, group_by_root
 from px4fuse.record import table
 
 # Evidence key of findings about a variance: kind of the cause that the re-runs show
@@ -28,21 +28,23 @@ WHITE_RATIO = "white_over_assumed"
 # Kinds of cause of findings about an aid: the sensor of the position source, or a shift in flight
 SENSOR, CHANGE = "the source's sensor", "change"
 
-_KF_VARIANCES = frozenset({"kf_variance_overstated", "kf_variance_understated"})
-SETTINGS = frozenset({"sigma_a_large", "sigma_a_small", "sigma_z_large", "sigma_z_small"})
-VARIANCES = _KF_VARIANCES | {"ekf2_variance_overstated", "ekf2_variance_understated"}
-NOISES = SETTINGS | VARIANCES | {"process_noise_forgotten"}
+_KF_VARIANCES = frozenset({"kf_underconfident", "kf_overconfident"})
+SETTINGS = frozenset(
+    {"sigma_a_too_large", "sigma_a_too_small", "sigma_z_too_large", "sigma_z_too_small"}
+)
+VARIANCES = _KF_VARIANCES | {"ekf2_underconfident", "ekf2_overconfident"}
+NOISES = SETTINGS | VARIANCES | {"process_noise_near_zero"}
 CONSEQUENCES = table(__file__, "consequences.toml", dict[str, tuple[str, ...]])
 # Findings about the recording: listed before those about noises, which depend on the recording
 RECORDING = frozenset(
     {
         "autopilot_restarted",
         "imu_gap",
-        "input_unavailable",
+        "acceleration_not_logged",
         "log_damaged",
         "logger_dropouts",
-        "logging_rate_low",
-        "source_decimated",
+        "imu_rate_too_low",
+        "source_rate_limited_by_logger",
         "source_gap",
         "source_not_logged",
         "source_samples_lost",
@@ -54,10 +56,10 @@ RECORDING = frozenset(
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Sort findings in the order of correction, each cause followed by its consequences.
 
-    The order is that of the severities, then of :data:`NAMES`; findings about the recording precede
+    The order follows severity, then :data:`TITLES`; findings about the recording precede
     errors of noises. A cause is at least as severe as its consequences.
     """
-    ids = list(NAMES)
+    ids = list(TITLES)
     groups = sorted(group_by_root(findings), key=lambda group: ids.index(group[0].id))
     for cause, effect_ids in CONSEQUENCES.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
@@ -90,4 +92,4 @@ def _report_rank(group: list[Finding]) -> int:
         2 if group[0].id in NOISES else 0,
         1 if group[0].id in RECORDING else 3,
     )
-    return {"error": error_rank, "warning": warning_rank, "info": 4}[group[0].severity]
+    return {"error": error_rank, "warning": warning_rank, "note": 4}[group[0].severity]

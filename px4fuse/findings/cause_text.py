@@ -15,9 +15,9 @@ from px4fuse.text import capitalise_first, format_number
 # Findings that state the same fault as a re-run, by kind of cause; the summary omits them
 FINDINGS_OF_CAUSE: Mapping[str, frozenset[str]] = {
     kinds.OUTLIERS: frozenset(("source_outliers",)),
-    kinds.CLOCK: frozenset(("source_clock_offset", "ekf2_ev_delay_wrong")),
-    kinds.FRAME: frozenset(("source_frame_turned", "ekf2_heading_wrong")),
-    kinds.GATE: frozenset(("ekf2_gate_small",)),
+    kinds.CLOCK: frozenset(("source_time_offset", "ekf2_ev_delay_wrong")),
+    kinds.FRAME: frozenset(("source_frame_misaligned", "ekf2_heading_error")),
+    kinds.GATE: frozenset(("ekf2_gate_too_small",)),
     kinds.ACCELEROMETER: frozenset(("accelerometer_bias",)),
 }
 # Test of a re-run by kind of cause; for other kinds the mean NIS must be nearer to 1
@@ -61,13 +61,15 @@ def format_change(analysis: Analysis, cause: Intervention) -> str:
 
 def format_explained_share(cause: Intervention) -> str:
     """Format the share of a deviation that the re-run with a change explains."""
-    if cause.denied_by_truth:
+    if cause.contradicts_truth:
         return "contradicts ground truth"
-    if cause.brings_into_band:
+    if cause.is_sufficient:
         return "all"
-    if cause.explains > 1.0 and cause.of != "apart":
+    if cause.explained_fraction > 1.0 and cause.statistic != "difference":
         return "too much"
-    return f"{100.0 * cause.explains:.0f} %" if cause.explains > 0.0 else "nothing"
+    return (
+        f"{100.0 * cause.explained_fraction:.0f} %" if cause.explained_fraction > 0.0 else "nothing"
+    )
 
 
 def format_remedy(analysis: Analysis, cause: Intervention) -> str:
@@ -98,11 +100,11 @@ def format_remedy(analysis: Analysis, cause: Intervention) -> str:
 
 def format_effect(cause: Intervention) -> str:
     """Format the statistic before and after a re-run."""
-    if cause.of == "apart":
+    if cause.statistic == "difference":
         return f"difference KF - EKF2 {cause.before:.2f} → {cause.after:.2f} m RMS"
-    power = 1.0 if cause.of == "nis" else 0.5
+    power = 1.0 if cause.statistic == "nis" else 0.5
     before, after = (format_number(value**power, 2) for value in (cause.before, cause.after))
-    label = "mean NIS" if cause.of == "nis" else "RMS of error / reported σ"
+    label = "mean NIS" if cause.statistic == "nis" else "RMS of error / reported σ"
     return f"{label} {before} → {after} (expected 1)"
 
 

@@ -26,7 +26,7 @@ def detect(analysis: Comparison) -> Findings:
         return
     fusing = ekf2.fusing["horizontal"]
     share = fraction_on(fusing, segment)
-    evidence = {"fusing_share": share, "source_interval_s": 1.0 / source.rate_hz}
+    evidence = {"fused_fraction": share, "source_interval_s": 1.0 / source.rate_hz}
     if not source.origin.is_vision:
         if source.name == "vehicle_mocap_odometry" and share == 0.0:
             yield warning(
@@ -34,7 +34,7 @@ def detect(analysis: Comparison) -> Findings:
                 "EKF2 never fuses motion capture (ATT_POS_MOCAP), and received no other external "
                 "vision. Its track does not come from this source.",
                 "Send the position as VISION_POSITION_ESTIMATE, which EKF2 can fuse.",
-                {"fusing_share": share},
+                {"fused_fraction": share},
             )
     elif share < MIN_FUSING_SHARE_ERROR:
         reason, action = _reason_and_action(analysis, ekf2)

@@ -38,10 +38,10 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
         expected = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
         if expected >= REJECTED_SHARE_WARNING:
             aid = remedy.aid_of(analysis)
-            rejected = float(rejections[0].evidence["rejected_share"])
+            rejected = float(rejections[0].evidence["rejected_fraction"])
             yield finding(
                 rejections[0].severity,
-                "ekf2_gate_small",
+                "ekf2_gate_too_small",
                 f"{aid.gate} is {ekf2.gate:g}. This gate rejects {format_percent(expected)} of the "
                 "samples of a source with the assumed noise; in this flight EKF2 rejected "
                 f"{format_percent(rejected)}. Rejected samples do not correct EKF2.",
@@ -65,12 +65,12 @@ def _detect_rejections(analysis: Analysis) -> Findings:
             quantity = "height" if axis_name == "down" else "horizontal position"
             yield finding(
                 "error" if share >= REJECTED_SHARE_ERROR else "warning",
-                "ekf2_rejecting",
+                "ekf2_rejects_positions",
                 f"EKF2 rejected {format_percent(share, 1)} of the samples for {quantity} (beyond "
                 f"{ekf2.gate:g} √S). Possible causes: outliers, measurement noise set too small, "
                 "or late timestamps.",
                 _remedy(analysis, axis_name),
-                {"rejected_share": share, "count": len(frame), "axis": axis_name},
+                {"rejected_fraction": share, "count": len(frame), "axis": axis_name},
                 zero_length_spans(rejected_flags.index[rejected_flags > 0.0]),
             )
 

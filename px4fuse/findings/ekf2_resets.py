@@ -27,7 +27,7 @@ def detect(analysis: Analysis) -> Findings:
         if 0 < horizontal_count < len(resets):
             count_text += f" ({horizontal_count} horizontally)"
         yield finding(
-            "warning" if horizontal_count else "info",
+            "warning" if horizontal_count else "note",
             "ekf2_resets",
             f"EKF2 reset its {'position' if horizontal_count else 'height'} {count_text}, by up to "
             f"{max(sizes_m):.2f} m at {at_s:.1f} s. In the comparison: {treatment}.",

@@ -24,7 +24,7 @@ from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.cause_grouping import CAUSE
 from px4fuse.findings.cause_text import classify_cause, format_remedy, format_rerun
-from px4fuse.findings.model import Finding, Findings, finding, info
+from px4fuse.findings.model import Finding, Findings, finding, note
 from px4fuse.loop.model import Loop
 from px4fuse.text import capitalise_first, format_factor, format_number
 from px4fuse.trajectory.alignment import fit_alignment
@@ -140,7 +140,7 @@ def make_error_finding(
     )
     return finding(
         "error" if worst.nees >= MIN_NEES_ERROR else "warning",
-        "errors_larger_than_claimed",
+        "error_exceeds_reported_sigma",
         " ".join(sentences),
         remedy,
         evidence,
@@ -202,4 +202,4 @@ def make_drift_finding(analysis: Analysis) -> Finding:
         "Check the error with a loop (px4fuse loop LOG) or with ground truth (ATT_POS_MOCAP). If "
         "the source is motion capture, give --source-kind mocap."
     )
-    return info("source_may_drift", message, action, evidence)
+    return note("source_may_drift", message, action, evidence)

@@ -87,7 +87,7 @@ def detect_tumbling(analysis: Analysis) -> Findings:
     if spans := analysis.segment.cut(analysis.flight.tumble_spans):
         end_s = max(spans[0][0] - 1.0, 0.0)
         yield error(
-            "vehicle_tumbled",
+            "attitude_failure",
             "Roll or pitch exceeded the limits of PX4's failure detector (FD_FAIL_R, FD_FAIL_P) at "
             f"{spans[0][0]:.1f} s. Data after that time do not represent normal flight.",
             f"Analyse only the time before: --end {end_s:.1f}. Check the other findings for the "
@@ -108,7 +108,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
     if total_s > MAX_CLIPPED_S:
         bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1)
         yield warning(
-            "accelerometer_clipped",
+            "accelerometer_clipping",
             f"The accelerometer was clipped in {len(time_s)} samples ({total_s:.2f} s). Motion "
             "beyond its range is lost. Height and vertical velocity are affected first, and the "
             "error looks like a bias.",
@@ -171,7 +171,7 @@ def detect_low_rates(flight: Flight) -> Findings:
                         f"DEVICE -s {topic} -r {requested_hz:g}), or add the ULog (--mavlink)."
                     )
             yield warning(
-                "logging_rate_low",
+                "imu_rate_too_low",
                 f"{topic} was logged at {rate_hz:.1f} Hz, but the acceleration needs "
                 f"{needed_hz:g} Hz. Motion between samples is lost, and vibration is aliased.",
                 action,

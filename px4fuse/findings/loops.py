@@ -1,7 +1,7 @@
 """False or inconsistent loop closures, drift larger than stated, and assumptions about a loop."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Finding, Findings, error, info, warning
+from px4fuse.findings.model import Finding, Findings, error, note, warning
 from px4fuse.loop.model import LANDING, Closure, Loop
 from px4fuse.text import capitalise_first
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
@@ -30,7 +30,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
     drops_most = dropped_count > MAX_DROPPED_SHARE * len(weights)
     if drops_most:
         yield warning(
-            "loop_drift_understated",
+            "loop_drift_too_small",
             f"Robust optimisation drops {dropped_count} of {len(weights)} loop closures. An "
             "odometry drift larger than stated is more likely than that most closures are false.",
             "Increase --drift or --heading-drift.",
@@ -41,7 +41,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
             yield _false_closure(closure, loop.is_end_assumed)
         elif weight < MIN_KEPT_WEIGHT and not drops_most:
             yield warning(
-                "loop_closure_doubtful",
+                "loop_closure_inconsistent",
                 f"{capitalise_first(str(closure))} contradicts the other closures. Robust "
                 "optimisation drops this closure, although drift could explain the closure error.",
                 "Remove the closure, or use the robust solution (GNC).",
@@ -53,9 +53,9 @@ def detect_assumptions(loop: Loop) -> Findings:
     """Detect a loop on positions that do not drift, and a landing place that is assumed."""
     gap_m = loop.closure_error_m
     evidence = {} if gap_m is None else {"closure_error_m": gap_m}
-    if loop.absolute:
+    if loop.is_absolute_track:
         yield warning(
-            "loop_of_absolute_track",
+            "loop_on_absolute_positions",
             "This track follows an absolute positioning system and does not drift. Its closure "
             "error is the noise of one position. A correction with this closure error makes the "
             "path worse.",
@@ -63,8 +63,8 @@ def detect_assumptions(loop: Loop) -> Findings:
             evidence,
         )
     if evidence and loop.is_end_assumed:
-        yield info(
-            "loop_end_assumed",
+        yield note(
+            "loop_landing_assumed",
             "The landing place is unknown, so px4fuse assumes the take-off place. The distance "
             "between landing and take-off counts as closure error.",
             "Measure the landing place and give --landed-at FORWARD,RIGHT (m, along and to the "

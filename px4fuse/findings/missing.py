@@ -5,7 +5,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.findings.model import Findings, format_percent, info, warning
+from px4fuse.findings.model import Findings, format_percent, note, warning
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.position_source import RECEIVED
 
@@ -34,10 +34,10 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
     ekf2, acceleration = analysis.flight.ekf2, analysis.lines[0].acceleration
     if isinstance(ekf2, Unavailable):
         message = f"The log contains no EKF2 state: {ekf2.reason}. The report contains KF only."
-        yield warning("ekf2_unavailable", message, ekf2.remedy)
+        yield warning("ekf2_not_logged", message, ekf2.remedy)
     if isinstance(acceleration, Unavailable):
         yield warning(
-            "input_unavailable",
+            "acceleration_not_logged",
             f"The acceleration is missing ({acceleration.what}: {acceleration.reason}). KF assumes "
             "constant velocity.",
             acceleration.remedy,
@@ -77,7 +77,7 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
     for interval in LOGGER_INTERVALS_S.get(source.name, ()):
         if abs(1.0 / rate_hz / interval - 1.0) < LOGGER_TOLERANCE:
             yield warning(
-                "source_decimated",
+                "source_rate_limited_by_logger",
                 f"{source.name} is logged at {rate_hz:.1f} Hz, the logger's limit for this topic "
                 f"({1.0 / interval:g} Hz). If the source is faster, the log lacks its other "
                 "samples.",
@@ -102,7 +102,7 @@ def detect_missing_innovations(analysis: Comparison) -> Findings:
     if logged / count < MIN_INNOVATION_SHARE:
         is_barometer = analysis.source.aid(axis) == BAROMETER
         topic = (ekf2.aids[BAROMETER.name].topics if is_barometer else ekf2.innovation_topics)[0]
-        yield info(
+        yield note(
             "ekf2_innovations_decimated",
             f"The log contains {logged} EKF2 innovations for {count} measurements; "
             f"{format_percent(1.0 - logged / count)} are missing. Rejections between logged "

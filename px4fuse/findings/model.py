@@ -13,8 +13,8 @@ from msgspec import Meta
 from px4fuse.filter.signals import Segment
 from px4fuse.record import Record, Span, table
 
-Severity = Literal["error", "warning", "info"]
-SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "info")
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "note")
 MAX_LISTED_SPANS = 3  # more time spans are summarised as one range
 MIN_SPAN_S = 0.05  # s; a shorter span is printed as a single time
 
@@ -29,11 +29,14 @@ class CatalogueEntry(Record, frozen=True):
         Position source, time, IMU, tuning, EKF2, loops or logging.
     meaning : str
         Explanation for a reader who meets the finding for the first time.
+    formerly : str
+        Id before schema 4; empty if it is the same.
     """
 
     title: str
     group: str
     meaning: str
+    formerly: str = ""
 
 
 # By id; findings of equal rank are listed in this order
@@ -41,7 +44,11 @@ CATALOGUE: Mapping[str, CatalogueEntry] = table(
     __file__, "catalogue.toml", dict[str, CatalogueEntry]
 )
 GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
-NAMES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
+TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
+# Present id by the id before schema 4
+RENAMED_IDS: Mapping[str, str] = {
+    entry.formerly: name for name, entry in CATALOGUE.items() if entry.formerly
+}
 
 
 class Example(Record, frozen=True):
@@ -79,17 +86,17 @@ class Finding(Record, frozen=True, omit_defaults=False):
     ----------
     id : str
         Key of the catalogue, in snake case; it does not change between versions.
-    severity : {"error", "warning", "info"}
+    severity : {"error", "warning", "note"}
         error: the comparison or the flight is misleading; warning: a number is wrong or missing;
-        info: background for reading the report.
+        note: background for reading the report.
     message : str
         The fault, then its effect with numbers.
     remedy : str
         Action: a command, a parameter with its value, or a check.
     evidence : dict
         Numbers that the finding is based on, with units in their names.
-    headline : str
-        First sentence of the message, without full stop.
+    title : str
+        First sentence of the message, without full stop: the fault with its numbers.
     caused_by : str or None
         Id of the finding that causes this one: the nearest preceding finding with this id.
     spans_s : tuple of (float, float)
@@ -102,7 +109,7 @@ class Finding(Record, frozen=True, omit_defaults=False):
     message: str
     remedy: str
     evidence: Mapping[str, int | float | str] = {}
-    headline: str = ""
+    title: str = ""
     caused_by: str | None = None
     spans_s: tuple[Span, ...] = ()
 
@@ -136,12 +143,12 @@ def finding(
     evidence: Mapping[str, int | float | str] = {},
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
-    """Make a finding; its headline is the first sentence of the message."""
-    headline = message.partition(". ")[0].removesuffix(".")
-    return Finding(name, severity, message, remedy, evidence, headline, spans_s=spans_s)
+    """Make a finding; its title is the first sentence of the message."""
+    title = message.partition(". ")[0].removesuffix(".")
+    return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
 
 
-error, warning, info = (partial(finding, severity) for severity in SEVERITIES)
+error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
@@ -161,7 +168,7 @@ def zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
 
 def lower_severity(severity: Severity) -> Severity:
     """Lower a severity by one level, for default settings that the user did not choose."""
-    return "warning" if severity == "error" else "info"
+    return "warning" if severity == "error" else "note"
 
 
 def format_count(count: int) -> str:

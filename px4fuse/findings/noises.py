@@ -128,7 +128,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     if axis_tuning is None:
         return
     chosen = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
-    ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.filter_sigma_a}
+    ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
     if hardly_moved(analysis):  # without motion SIGMA_A cannot be estimated
         del ml_noises[SIGMA_A]
     deviations = {
@@ -148,7 +148,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         wrong_settings = {
             name: deviation
             for name, deviation in wrong_settings.items()
-            if chosen[name] < deviation.value and not (may_drift and deviation.severity == "info")
+            if chosen[name] < deviation.value and not (may_drift and deviation.severity == "note")
         }
     if not wrong_settings:
         return
@@ -157,7 +157,9 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     if SIGMA_Z in values and axis_tuning.sigma_z.value is None:
         values[SIGMA_Z] = max(values[SIGMA_Z], SMALLEST_SIGMA_Z_M)
     held_out_gain = (
-        None if isinstance(axis_tuning.held_out, Unavailable) else axis_tuning.held_out.gain_nats
+        None
+        if isinstance(axis_tuning.held_out, Unavailable)
+        else axis_tuning.held_out.log_likelihood_gain_per_measurement
     )
     remedy_text, first_id = (
         remedy.format_kf_remedy(analysis, values, unseen_nats=held_out_gain),
@@ -170,7 +172,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         interval = f"; 95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit}" if noise.high else ""
         setting_finding = finding(
             severity,
-            f"{name[:7]}_{direction}",
+            f"{name[:7]}_too_{direction}",
             f"{name[:7].upper()} {chosen[name]:g} {unit} is {'at least ' if is_bound else ''}"
             f"{format_factor(size)} times too {direction}. The maximum-likelihood estimate is "
             f"{'at most ' if is_bound else ''}{value:.3g} {unit} ({axis_tuning.name}"
@@ -215,7 +217,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """
     for name, result in analysis.axes.items():
         updates, summary = result.replay.updates, result.filters["kf"]
-        if isinstance(summary, Unavailable) or summary.verdict != "variance understated":
+        if isinstance(summary, Unavailable) or summary.verdict != "overconfident":
             continue
         if summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION:
             continue
@@ -231,7 +233,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             np.median((variance_before[1:] / variance_after[:-1] - 1.0)[len(variance_after) // 2 :])
         )
         axis_tuning = tuning_of_axis(analysis.tuning, name)
-        ml_sigma_a = None if axis_tuning is None else axis_tuning.filter_sigma_a.value
+        ml_sigma_a = None if axis_tuning is None else axis_tuning.sigma_a_two_state.value
         remedy_text = (
             ""
             if ml_sigma_a is None
@@ -239,7 +241,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         )
         sigma_a = analysis.settings.sigma_a_m_s2
         yield error(
-            "process_noise_forgotten",
+            "process_noise_near_zero",
             f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero. The position variance grows by only "
             f"{format_percent(growth, 1)} between updates, and the gain falls to {gain:.3f}. KF "
             f"needs {response_s:.0f} s to follow a change (along {result.axis.called}).",
@@ -263,7 +265,7 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
                 members = [
                     pair
                     for pair in inconsistent
-                    if (pair[1].sigma_factor > 1.0) == is_underconfident
+                    if (pair[1].sigma_ratio < 1.0) == is_underconfident
                 ]
                 if members:
                     variance_finding = _variance_finding(analysis, filter_name, group, members)
@@ -276,14 +278,14 @@ def _variance_finding(
 ) -> Finding:
     """Make the finding of a group of axes, with numbers of the axis with the worst mean NIS."""
     result, summary = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
-    is_underconfident, factor = summary.sigma_factor > 1.0, summary.sigma_error_factor
+    is_underconfident, factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
     severity: Severity = "error" if factor >= MIN_SIGMA_RATIO_ERROR else "warning"
     if _has_default_noises(analysis, filter_name, result):
         severity = lower_severity(severity)
     axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
-    id_suffix = "overstated" if is_underconfident else "understated"
+    confidence = "underconfident" if is_underconfident else "overconfident"
     if is_underconfident and analysis.source.origin.may_drift:
-        severity, remedy_text, cause = "info", KEEP_NOISES_DRIFT, ELSEWHERE
+        severity, remedy_text, cause = "note", KEEP_NOISES_DRIFT, ELSEWHERE
     elif is_underconfident and analysis.source.origin.is_gnss:
         is_barometer = analysis.source.aid(result.axis.name) == BAROMETER
         remedy_text = (
@@ -291,7 +293,7 @@ def _variance_finding(
         )
         cause = NOISE if remedy_text else ELSEWHERE
         fallback = KEEP_NOISES_CORRELATED.format("a barometer" if is_barometer else "GNSS")
-        severity, remedy_text = severity if remedy_text else "info", remedy_text or fallback
+        severity, remedy_text = severity if remedy_text else "note", remedy_text or fallback
     elif is_underconfident and any(
         name_with_error == filter_name for name_with_error, *_ in find_hidden_errors(analysis)
     ):
@@ -302,12 +304,12 @@ def _variance_finding(
             classify_cause(analysis, rerun),
             _remedy(analysis, filter_name, result, axis_tuning, rerun),
         )
-        severity = "info" if remedy_text == KEEP_NOISES_TRUTH else severity
+        severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
-        "sigma_factor": summary.sigma_factor,
+        "sigma_ratio": summary.sigma_ratio,
         "nis_mean": summary.nis_mean,
-        "outside_gate": summary.outside_gate,
+        "fraction_outside_gate": summary.fraction_outside_gate,
         CAUSE: cause,
     }
     if axis_tuning is not None and (ml_sigma_z := _value_or_bound(axis_tuning.sigma_z)) is not None:
@@ -322,8 +324,8 @@ def _variance_finding(
         gate_effect = f" The gate of EKF2 may then {accepted}."
     return finding(
         severity,
-        f"{filter_name}_variance_{id_suffix}",
-        f"{filter_label} is {'under' if is_underconfident else 'over'}confident along "
+        f"{filter_name}_{confidence}",
+        f"{filter_label} is {confidence} along "
         f"{result.axis.called}: σ is {format_factor(factor)} times too "
         f"{'large' if is_underconfident else 'small'}. The mean NIS is "
         f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
@@ -410,10 +412,10 @@ def _remedy_without_cause(
 ) -> str:
     """Format the action if no re-run explains the deviation, with the closest re-run."""
     reruns = interventions_on(analysis.causes, filter_name, result.axis.name)
-    if any(rerun.denied_by_truth for rerun in reruns):
+    if any(rerun.contradicts_truth for rerun in reruns):
         return KEEP_NOISES_TRUTH
     if reruns:
-        closest = min(reruns, key=lambda rerun: abs(rerun.explains - 1.0))
+        closest = min(reruns, key=lambda rerun: abs(rerun.explained_fraction - 1.0))
         return f"{NOT_EXPLAINED} Closest: {format_rerun(analysis, closest)}."
     if filter_name == "ekf2":
         return _remedy_without_replay(analysis, result, axis_tuning)
@@ -440,7 +442,7 @@ def _remedy_without_replay(
     ratio = noise_m / ekf2_m
     if not (
         ratio < 1.0 / NOISE_RATIO_TOLERANCE
-        if summary.sigma_factor > 1.0
+        if summary.sigma_ratio < 1.0
         else ratio > NOISE_RATIO_TOLERANCE
     ):
         return (

@@ -5,7 +5,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
-from px4fuse.findings.model import Findings, finding, format_count, info, warning
+from px4fuse.findings.model import Findings, finding, format_count, note, warning
 from px4fuse.flight import Ekf2, Flight
 from px4fuse.text import capitalise_first
 
@@ -53,7 +53,7 @@ def detect_lost_data(flight: Flight) -> Findings:
         elif log.format.startswith("MAVLink"):
             action = "Record on a link that loses no bytes: by cable, or on the companion computer."
         yield finding(
-            "warning" if log.damage else "info",
+            "warning" if log.damage else "note",
             "log_damaged",
             "".join(f"{_sentence(note)}. " for note in notes).rstrip(),
             action,
@@ -66,8 +66,8 @@ def detect_lost_data(flight: Flight) -> Findings:
             if other_count
             else ""
         )
-        yield info(
-            "samples_dropped",
+        yield note(
+            "samples_out_of_order",
             f"{count} samples of {topic} were dropped: their timestamps are zero or go "
             f"back{other_topics}.",
             "The file is complete: a clock was set back, or messages overtook each other. If this "
@@ -87,9 +87,9 @@ def detect_clocks_set_back(flight: Flight) -> Findings:
             "Record each flight in a separate file.",
             {"count": log.restarts},
         )
-    if reversals := log.receipt_went_back:
-        yield info(
-            "receipt_out_of_order",
+    if reversals := log.receive_time_reversals:
+        yield note(
+            "receive_time_went_back",
             f"The receive time went back {format_count(reversals)}: the recording computer's clock "
             "was set, or recordings were joined. The senders' timestamps are not affected.",
             "Switch off time synchronisation of the recording computer while recording.",
@@ -101,15 +101,15 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     """Detect EKF2 data of a model or of another estimator, or without innovations."""
     log, ekf2 = analysis.flight.log, analysis.flight.ekf2
     if MODEL_NOTE in log.notes:
-        yield info(
-            "ekf2_is_a_model",
+        yield note(
+            "ekf2_simulated",
             f"{MODEL_NOTE}.",
             "Use a real flight to assess PX4's EKF2.",
         )
     if not isinstance(ekf2, Ekf2):
         return
     if log.autopilot != "PX4":
-        yield info(
+        yield note(
             "not_px4",
             f"This log is from {log.autopilot}. EKF2 in this report means the estimator of "
             f"{log.autopilot}. The PX4 parameters named do not exist there.",
@@ -118,7 +118,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
         )
     if log.format.startswith("MAVLink"):
         variances = " and variances" if isinstance(ekf2.variance, pd.DataFrame) else ""
-        yield info(
+        yield note(
             "innovations_need_ulog",
             f"A MAVLink recording contains EKF2's states{variances}, but no innovations. The "
             "consistency of EKF2 cannot be tested.",

@@ -21,7 +21,7 @@ CORRECT_AT_SENDER = "Correct the timestamps at the sender."
 def detect(analysis: Analysis) -> Findings:
     """Detect a wrong time offset or delay; positions rebuilt from EKF2 output are not tested."""
     clock, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
-    if isinstance(clock, ClockOffset) and clock.determinable and not is_reconstructed:
+    if isinstance(clock, ClockOffset) and clock.is_determinable and not is_reconstructed:
         yield from detect_offset(analysis, clock)
         yield from detect_wrong_delay(analysis, clock)
 
@@ -33,17 +33,17 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
-    if clock.change_p is not None and clock.change_p < MAX_CHANGE_P:
+    if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
         first_part, last_part = clock.parts[0], clock.parts[-1]
         yield error(
-            "source_clock_changes",
+            "source_time_offset_changes",
             f"The time offset of {source.name} changes from {first_part.offset_s:+.2f} s at the "
-            f"beginning to {last_part.offset_s:+.2f} s at the end (p {clock.change_p:.1g}). No "
-            "single --clock-offset corrects it. PX4 uses arrival times until 500 TIMESYNC answers "
-            "have come.",
+            f"beginning to {last_part.offset_s:+.2f} s at the end (p {clock.change_p_value:.1g}). "
+            "No single --clock-offset corrects it. PX4 uses arrival times until 500 TIMESYNC "
+            "answers have come.",
             "Let the clocks synchronise for one minute before take-off. Analyse one side of the "
             "change (--start, --end).",
-            {**evidence, "change_p": clock.change_p},
+            {**evidence, "change_p_value": clock.change_p_value},
         )
         return
     size_s = abs(clock.remaining_s)
@@ -65,7 +65,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     first_s, last_s = (-interval_s[1], -interval_s[0]) if is_late else interval_s
     yield finding(
         "error" if size_s > MIN_OFFSET_ERROR_S else "warning",
-        "source_clock_offset",
+        "source_time_offset",
         f"The timestamps of {source.name} are {size_s:.3f} s {'late' if is_late else 'early'} "
         f"relative to the IMU (95 % {first_s:.3f} to {last_s:.3f} s). At 1 m/s this is a position "
         f"error of {size_s:.2f} m. Innovations hardly show it.",

@@ -3,7 +3,7 @@
 from px4fuse.analysis import Analysis
 from px4fuse.filter.frame_rotation import MAX_DRIFT_P, HeadingError
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
-from px4fuse.findings.model import Finding, Findings, Severity, finding, fraction_on, info, warning
+from px4fuse.findings.model import Finding, Findings, Severity, finding, fraction_on, note, warning
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.text import capitalise_first
 
@@ -36,13 +36,13 @@ def make_frame_finding(analysis: Analysis) -> Finding:
     if isinstance(fusing, Unavailable):
         if log.has_ulog:
             action += " The ULog shows whether EKF2 uses the same frame."
-        note = "The recording does not show whether EKF2 fused its yaw."
-        return info("source_frame_not_north", f"{fault} {note}", action)
+        detail = "The recording does not show whether EKF2 fused its yaw."
+        return note("source_frame_frd", f"{fault} {detail}", action)
     if fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR:
-        note = "EKF2 fused its yaw, so EKF2 uses the same frame."
-        return info("source_frame_not_north", f"{fault} {note}", action)
+        detail = "EKF2 fused its yaw, so EKF2 uses the same frame."
+        return note("source_frame_frd", f"{fault} {detail}", action)
     return warning(
-        "source_frame_not_north",
+        "source_frame_frd",
         f"{fault} The IMU is rotated into NED, so the axes of positions and IMU may differ.",
         "Send the position in NED, or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3).",
     )
@@ -50,7 +50,7 @@ def make_frame_finding(analysis: Analysis) -> Finding:
 
 def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     """Detect a rotation between the motion measured by the IMU and by the positions."""
-    name, turn_deg, sigma_deg = analysis.source.name, heading.turn_deg, heading.sigma_deg
+    name, turn_deg, sigma_deg = analysis.source.name, heading.misalignment_deg, heading.sigma_deg
     is_gnss = analysis.source.origin.is_gnss
     if heading.drifts:
         yield _drift_finding(analysis, heading)
@@ -59,7 +59,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     if abs(turn_deg) < limit_deg or _is_explained_by_bias(analysis):
         return
     rotation = f"rotated by {turn_deg:+.0f}° ± {1.96 * sigma_deg:.0f}° (clockwise from above)"
-    finding_id = "ekf2_heading_wrong"
+    finding_id = "ekf2_heading_error"
     if is_gnss:
         message = (
             f"GNSS positions are {rotation} relative to EKF2's heading, constant over the flight. "
@@ -76,7 +76,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
             f"and motors. {_format_yaw_fusion(analysis.flight.log.has_ulog)}"
         )
     else:
-        finding_id = "source_frame_turned"
+        finding_id = "source_frame_misaligned"
         message = (
             f"The frame of {name} is {rotation} relative to the vehicle's heading. Either the "
             "positioning frame is not aligned with north, or the heading is wrong (magnetometer)."
@@ -90,7 +90,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         finding_id,
         message,
         action,
-        {"turn_deg": turn_deg, "sigma_deg": sigma_deg},
+        {"misalignment_deg": turn_deg, "sigma_deg": sigma_deg},
     )
 
 
@@ -123,7 +123,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         action = f"{CALIBRATE} Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
-        "ekf2_heading_wrong",
+        "ekf2_heading_error",
         f"EKF2's heading drifts relative to {analysis.source.name}: "
         f"{first.heading_error_deg:+.0f}° from {first.start_s:.0f} to {first.end_s:.0f} s, "
         f"{last.heading_error_deg:+.0f}° from {last.start_s:.0f} to {last.end_s:.0f} s (clockwise "
@@ -151,7 +151,7 @@ def detect_uncertain_alignment(analysis: Analysis) -> Findings:
         for sentence in sentences:
             yield finding(
                 severity,
-                "position_file_placement",
+                "position_file_alignment",
                 f"{analysis.source.name}: {capitalise_first(sentence.rstrip('.'))}.",
                 "Give --clock-offset, --position-frame and --position-yaw if you know them.",
             )

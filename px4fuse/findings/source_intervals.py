@@ -11,7 +11,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.flight_events import longest_s, source_gaps
 from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
-from px4fuse.findings.model import Findings, finding, format_percent, info, warning
+from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.position_source import ALIGNED
 
 MIN_LOST_SHARE = 0.02  # of the source's samples; flights have 0 to 0.3 %, v1.13 has 8 to 9 %
@@ -67,13 +67,13 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.has_ulog:
             action += " The ULog contains the samples that PX4 received (SDLOG_PROFILE 129)."
-        yield info(
+        yield note(
             "source_samples_lost",
             f"About {format_percent(lost_count / sent_count)} of {source.name} is missing from the "
             f"recording ({lost_count} of {sent_count} samples, one per {typical_s:.2f} s). EKF2 "
             "may have received them.",
             action,
-            {"lost": lost_count, "lost_share": lost_count / sent_count},
+            {"lost": lost_count, "lost_fraction": lost_count / sent_count},
         )
 
 
@@ -111,11 +111,11 @@ def detect_downsampling(analysis: Analysis) -> Findings:
         )
     yield finding(
         "error" if is_too_slow else "warning",
-        "source_thinned",
+        "source_downsampled",
         message,
         "Increase the rate of the stream at the sender (MAVROS, bridge, link) and remove any rate "
         "limit.",
-        {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base_s, "lost_share": lost_share},
+        {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base_s, "lost_fraction": lost_share},
     )
 
 

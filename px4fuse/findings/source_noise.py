@@ -15,7 +15,7 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.findings.cause_grouping import WHITE_RATIO
-from px4fuse.findings.model import Findings, error, format_percent, info, warning
+from px4fuse.findings.model import Findings, error, format_percent, note, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight import Columns, Unavailable
@@ -65,9 +65,9 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
             "Check multipath, anchor geometry and filters in the sender, or use positions at "
             "intervals longer than the correlation time."
         )
-    make_finding = info if is_gnss else warning
+    make_finding = note if is_gnss else warning
     yield make_finding(
-        "source_coloured",
+        "source_noise_time_correlated",
         f"The errors of {analysis.source.name} are correlated over {correlation_time}. A "
         f"time-correlated part of {noise.slow_m:.2g} m (1 σ) adds to white noise of "
         f"{noise.white_m:.2g} m. KF and EKF2 assume independent errors: they follow the correlated "
@@ -90,7 +90,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
         return
     make_finding = error if share >= MIN_REPEAT_SHARE_ERROR else warning
     yield make_finding(
-        "source_repeats",
+        "source_samples_repeated",
         f"{count} of {len(is_repeated)} positions of {analysis.source.name} "
         f"({format_percent(share)}) repeat the previous one. KF and EKF2 use each repetition as a "
         "new, independent measurement, although nothing was measured at that time.",
@@ -127,7 +127,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     if large < MIN_AXIS_RATIO * small or large_low <= small_high:
         return
     yield warning(
-        "source_axes_unequal",
+        "source_noise_unequal_axes",
         f"The noise of {analysis.source.name} is {large:.2g} m along {noisier_axis} and "
         f"{small:.2g} m along {quieter_axis}. One SIGMA_Z, or one EKF2 measurement noise, does not "
         "fit both axes.",
@@ -147,7 +147,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
     if isinstance(axis_tuning, AxisTuning):
-        sigma_a, sigma_z = axis_tuning.filter_sigma_a.value, axis_tuning.sigma_z.value
+        sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
     lines = [analysis.axes[name].axis for name in ("north", "east") if name in analysis.axes]
     if sigma_a is None or sigma_z is None or len(lines) < 2:
@@ -193,7 +193,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if analysis.source.origin.is_gnss:
         check = "satellites in view, walls, trees and radio interference"
     yield (error if ratio >= MIN_PART_RATIO_ERROR else warning)(
-        "source_noise_changes",
+        "source_noise_varies",
         f"The noise of {analysis.source.name} is {ratio:.1f} times larger from {start:.0f} s to "
         f"{end:.0f} s than in the rest of the flight. Most samples are affected, not single "
         "outliers. No single SIGMA_Z fits the whole flight.",

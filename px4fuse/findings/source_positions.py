@@ -95,7 +95,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
     if low_pass is not None:
         make_finding = error if low_pass.lag_s >= MIN_LAG_ERROR_S else warning
         yield make_finding(
-            "source_smoothed",
+            "source_low_pass_filtered",
             f"{analysis.source.name} is low-pass filtered before it is sent. Successive errors "
             f"correlate by {low_pass.correlation:.1f}, and positions lag the motion by "
             f"{low_pass.lag_s:.2f} s. The noise before filtering is {low_pass.sigma_z_m:.2g} m. KF "
@@ -128,7 +128,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
             action = "Wait for a steady fix (RTK) before take-off and keep the antenna uncovered."
         yield finding(
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
-            "source_jumps",
+            "source_position_jump",
             f"{analysis.source.name} jumps {format_count(len(large))} and stays there, by "
             f"{size_m:.2f} m (± {1.96 * sigma:.2f} m) at {at_s:.1f} s. The IMU measures no such "
             f"motion. Possible causes: {causes}. After the jump KF and EKF2 are wrong by its size, "
@@ -156,7 +156,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
     if abs(excess) >= max(MIN_SCALE, MIN_SCALE_SIGMAS * sigma):
         yield finding(
             "error" if abs(excess) >= MIN_SCALE_ERROR else "warning",
-            "source_scale_wrong",
+            "source_scale_error",
             f"Distances of {analysis.source.name} are {format_percent(abs(excess))} too "
             f"{'long' if excess > 0 else 'short'} (± {format_percent(1.96 * sigma)}) compared with "
             "the IMU. Innovations do not show a scale factor error.",
@@ -239,7 +239,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
                 direction += ", unless it covers time-correlated errors"
         yield finding(
             "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning",
-            "source_variance_wrong",
+            "source_reported_variance_wrong",
             f"{source.name} reports σ {reported_m:.3g} m, but its noise is {noise_m:.3g} m (95 % "
             f"{low:.3g} to {high:.3g} m). The reported variance is {format_factor(ratio)} times "
             f"too {direction}. EKF2 takes R from it (EKF2_EV_NOISE_MD 0), but not less than "

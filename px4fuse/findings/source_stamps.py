@@ -44,7 +44,7 @@ def detect(analysis: Analysis) -> Findings:
 def detect_constant_timestamps(name: str, clock: ClockMap, distinct_count: int) -> Findings:
     """Make the findings of constant timestamps and of the jitter of the receive times."""
     yield error(
-        "source_stamps_constant",
+        "source_timestamps_constant",
         f"The {clock.pairs} timestamps of {name} have only {distinct_count} distinct "
         f"value{'s' if distinct_count > 1 else ''}. The time of measurement is unknown; px4fuse "
         "uses the receive time instead.",
@@ -54,7 +54,7 @@ def detect_constant_timestamps(name: str, clock: ClockMap, distinct_count: int) 
     )
     if (jitter_s := clock.jitter_s) > MAX_RECEIPT_JITTER_S:
         yield warning(
-            "source_receipt_jitter",
+            "source_timestamp_jitter",
             f"The receive times of {name}, used instead of its timestamps, jitter by "
             f"{jitter_s * 1e3:.0f} ms (1 σ). At 1 m/s this is a position error of "
             f"{jitter_s:.3f} m.",
@@ -77,7 +77,7 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
         until_s, latency_s = synchronisation
         make_finding = error if latency_s >= MIN_LATENCY_ERROR_S else warning
         yield make_finding(
-            "source_stamps_of_arrival",
+            "source_timestamps_are_arrival_times",
             f"The timestamps of {name} are arrival times until {until_s:.1f} s: until then "
             "TIMESYNC had not converged (PX4 needs 500 answers). Later timestamps are times of "
             f"measurement, {latency_s:.3f} s before arrival. One time offset cannot correct both "
@@ -89,7 +89,7 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
         )
     elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_SHARE:
         yield warning(
-            "source_stamps_of_arrival",
+            "source_timestamps_are_arrival_times",
             f"The timestamps of {name} are arrival times. The sender was never synchronised with "
             "the autopilot (TIMESYNC), so every position is late by its latency.",
             ANSWER_TIMESYNC,

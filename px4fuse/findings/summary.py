@@ -11,9 +11,9 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import causal_replays
-from px4fuse.comparison.causal_replays import Intervention, Of, cause_of, interventions_on
+from px4fuse.comparison.causal_replays import Intervention, Statistic, cause_of, interventions_on
 from px4fuse.comparison.model import FILTERS, AgainstTruth, Difference, FilterName
-from px4fuse.ekf2.steps import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at
 from px4fuse.findings.cause_grouping import CLOCK, FRAME, PROCESS, SETTINGS, VARIANCES
@@ -27,28 +27,28 @@ from px4fuse.text import capitalise_first, format_factor
 
 MAX_PARAGRAPHS = 3  # paragraphs of the summary
 # Findings whose content is in the first paragraph
-IN_FIRST_PARAGRAPH = VARIANCES | {"errors_larger_than_claimed", "ekf2_unavailable"}
+IN_FIRST_PARAGRAPH = VARIANCES | {"error_exceeds_reported_sigma", "ekf2_not_logged"}
 # Faults of the source that no noise setting and no outlier removal corrects
 NOISE_SHAPE_FINDINGS = frozenset(
     (
-        "source_axes_unequal",
-        "source_clock_changes",
-        "source_coloured",
-        "source_jumps",
-        "source_noise_changes",
-        "source_repeats",
-        "source_scale_wrong",
-        "source_smoothed",
+        "source_noise_unequal_axes",
+        "source_time_offset_changes",
+        "source_noise_time_correlated",
+        "source_position_jump",
+        "source_noise_varies",
+        "source_samples_repeated",
+        "source_scale_error",
+        "source_low_pass_filtered",
     )
 )
 # Faults that rotate the measured acceleration, with the effect of process noise
-MISALIGNMENT_FINDINGS = frozenset(("ekf2_heading_wrong", "source_frame_turned"))
+MISALIGNMENT_FINDINGS = frozenset(("ekf2_heading_error", "source_frame_misaligned"))
 # Findings listed after the explanation of the difference KF - EKF2
-EFFECT_FINDINGS = frozenset({"ekf2_resets", "ekf2_rejecting", "ekf2_fusion_interrupted"})
+EFFECT_FINDINGS = frozenset({"ekf2_resets", "ekf2_rejects_positions", "ekf2_fusion_interrupted"})
 NAMES: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
 
 
-def summarise_flight(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
+def summarise(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, ...]:
     """Summarise a flight in paragraphs, the most important first.
 
     Parameters
@@ -72,12 +72,12 @@ def summarise_flight(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple
     noise_shape_ids = {
         finding.id
         for finding in findings
-        if finding.id in NOISE_SHAPE_FINDINGS and finding.severity != "info"
+        if finding.id in NOISE_SHAPE_FINDINGS and finding.severity != "note"
     }
     # a low-pass filter delays the positions, so the time offset is not a separate cause
-    allowed_kinds = (FRAME,) if "source_smoothed" in noise_shape_ids else (CLOCK, FRAME)
+    allowed_kinds = (FRAME,) if "source_low_pass_filtered" in noise_shape_ids else (CLOCK, FRAME)
     is_misaligned = any(
-        finding.id in MISALIGNMENT_FINDINGS and finding.severity != "info" for finding in findings
+        finding.id in MISALIGNMENT_FINDINGS and finding.severity != "note" for finding in findings
     )
     for filter_name, cause in cause_by_filter.items():
         kind = classify_cause(analysis, cause)
@@ -93,10 +93,10 @@ def summarise_flight(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple
     findings_to_state = [
         finding
         for finding in findings
-        if finding.caused_by is None and finding.severity != "info" and finding.id not in stated_ids
+        if finding.caused_by is None and finding.severity != "note" and finding.id not in stated_ids
     ]
     has_explanation = bool(noise_shape_ids) or any(
-        finding.id == "errors_larger_than_claimed" and finding.caused_by for finding in findings
+        finding.id == "error_exceeds_reported_sigma" and finding.caused_by for finding in findings
     )
     sentences = [
         _verdict_paragraph(analysis, cause_by_filter, has_explanation),
@@ -116,7 +116,7 @@ def summarise_flight(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple
     return tuple(sentences[:MAX_PARAGRAPHS])
 
 
-def _statistic_to_explain(analysis: Analysis, filter_name: FilterName) -> Of:
+def _statistic_to_explain(analysis: Analysis, filter_name: FilterName) -> Statistic:
     """Return the statistic that a cause explains: mean NEES if the error exceeds σ, else NIS."""
     return (
         "nees"
@@ -149,7 +149,7 @@ def _verdict_paragraph(
     ):
         difference_text = f"{along} KF and EKF2 are compared"
         if isinstance(result.difference, Difference):
-            difference_m = format_metres(result.difference.position_rmse_m)
+            difference_m = format_metres(result.difference.position_rms_m)
             difference_text = f"{along} KF and EKF2 differ by {difference_m} RMS"
         sentences.append(f"{difference_text}. The log contains no ground truth.")
         if source.origin.may_drift:
@@ -182,13 +182,9 @@ def _filter_sentence(analysis: Analysis, filter_name: FilterName) -> str:
     elif summary.verdict == "consistent":
         verdict = "is consistent"
     else:
-        confidence, size = (
-            ("underconfident", "large")
-            if summary.sigma_factor > 1.0
-            else ("overconfident", "small")
-        )
+        size = "large" if summary.verdict == "underconfident" else "small"
         factor = format_factor(summary.sigma_error_factor)
-        verdict = f"is {confidence}: σ is {factor} times too {size}"
+        verdict = f"is {summary.verdict}: σ is {factor} times too {size}"
     if not isinstance(summary.truth, AgainstTruth):
         return f"By its innovations along {axis_label} {name} {verdict}."
     rmse = format_metres(summary.truth.position_rmse_m)
@@ -211,7 +207,7 @@ def _explanation(
     reruns = interventions_on(
         analysis.causes, filter_name, axis, _statistic_to_explain(analysis, filter_name)
     )
-    if any(intervention.denied_by_truth for intervention in reruns):
+    if any(intervention.contradicts_truth for intervention in reruns):
         return "A smaller σ would be below the errors against ground truth."
     # drift and faults of the source are listed as findings
     is_explained_elsewhere = has_explanation or analysis.source.origin.may_drift
@@ -223,7 +219,7 @@ def _finding_sentence(analysis: Analysis, finding: Finding) -> str:
     if finding.id == "source_gap":
         return _gap_sentence(analysis, finding)
     when = finding.when if finding.when and not finding.has_time_in_message else ""
-    return f"{finding.headline}{f' ({when})' if when else ''}."
+    return f"{finding.title}{f' ({when})' if when else ''}."
 
 
 def _gap_sentence(analysis: Analysis, finding: Finding) -> str:
@@ -281,12 +277,13 @@ def _difference_after_change(
         intervention
         for filter_name, cause in causes.items()
         for intervention in interventions_on(
-            analysis.causes, filter_name, analysis.main.axis.name, "apart"
+            analysis.causes, filter_name, analysis.main.axis.name, "difference"
         )
-        if cause is not None and intervention.explains >= causal_replays.MIN_EXPLAINED_SHARE
+        if cause is not None
+        and intervention.explained_fraction >= causal_replays.MIN_EXPLAINED_SHARE
     ]
     if reductions:
-        largest = max(reductions, key=lambda intervention: intervention.explains)
+        largest = max(reductions, key=lambda intervention: intervention.explained_fraction)
         yield (
             f"Re-run of {NAMES[largest.filter]} with this correction: difference KF - EKF2 "
             f"{largest.before:.2f} → {largest.after:.2f} m RMS."
@@ -295,12 +292,12 @@ def _difference_after_change(
 
 def _closing_sentences(analysis: Analysis, *, has_difference_text: bool) -> Iterator[str]:
     """Yield the loop closure error, and the explanation of the difference KF - EKF2."""
-    loop, why = analysis.loop, analysis.why.get(analysis.main.axis.name)
+    loop, why = analysis.loop, analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(loop, Loop) and (error_m := loop.closure_error_m) is not None:
         length_m = loop.path_length_m
         yield (
             f"The odometry has a loop closure error of {format_metres(error_m)} after "
             f"{length_m:.0f} m ({format_percent(error_m / length_m, 1)})."
         )
-    if isinstance(why, Why) and not has_difference_text:
+    if isinstance(why, DifferenceExplanation) and not has_difference_text:
         yield why.cause

@@ -15,7 +15,7 @@ from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 MEASURES = read_rows("measures.csv")
 # Numbers within either tolerance are equal: computers differ in the last digits
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.01, 0.001
-_REJECTED = "axes.*.rejected_share"
+_REJECTED = "axes.*.rejected_fraction"
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def numbers(results: ComparisonResults | AidsResults) -> dict[str, Number]:
             parent, _, field = path.rpartition(".")
             record, first_name = at(results, parent), names[0] if names else ""
             value = getattr(record, field, None)
-            unclear = isinstance(record, Clock) and not record.determinable
+            unclear = isinstance(record, Clock) and not record.is_determinable
             unclear |= isinstance(record, HeadingError) and record.drifts
             is_duplicate = kind == _REJECTED and first_name not in (level, "down")
             is_duplicate |= kind.startswith("aids.") and first_name in own

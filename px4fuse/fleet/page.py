@@ -28,7 +28,7 @@ LOG_COLUMNS = [
         "status",
         "reason",
         "remedy",
-        "story",
+        "summary",
         "findings",
         "results",
         "report",
@@ -46,10 +46,10 @@ CONSISTENT_RATIO = 1.25
 # Axes that represent a log: the aisle if known, else north and east, else down
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
-#: One log: the non-empty columns of its rows (main axes first), and ``factors`` ("kf" and "ekf2":
-#: reported √S over actual, from the mean NIS of the main axes), ``status`` (the best of its axes),
-#: ``lacking`` (reasons and actions for missing results), ``axes`` (their rows), ``findings`` (ids)
-#: and ``tags`` (filter values with their labels)
+#: One log: the non-empty columns of its rows (main axes first), and ``sigma_ratios`` ("kf" and
+#: "ekf2": actual σ over reported σ, from the mean NIS of the main axes), ``status``
+#: (the best of its axes), ``lacking`` (reasons and actions for missing results), ``axes`` (their
+#: rows), ``findings`` (ids) and ``tags`` (filter values with their labels)
 Log = Mapping[str, Any]
 
 
@@ -82,12 +82,12 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             frame.text_cell(log.get("firmware", "")),
             Cell(log["status"], log["status"], style_class=STATUS_STYLES[log["status"]]),
             *(
-                _figure(log["factors"].get(filter_name), describe_sigma_ratio)
+                _figure(log["sigma_ratios"].get(filter_name), describe_sigma_ratio)
                 for filter_name in ("kf", "ekf2")
             ),
             *(
                 _figure(log.get(name), format_number)
-                for name in ("sigma_z_m", "clock_offset_s", "position_rmse_m")
+                for name in ("sigma_z_m", "clock_offset_s", "position_rms_m")
             ),
             Cell()
             if log["status"] == FAILED
@@ -134,7 +134,7 @@ def _details(log: Log) -> tuple[Part, ...]:
             "Missing results", [reason for reason, _ in log["lacking"] if reason], warn=True
         ),
         frame.list_part("Actions", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
-        frame.list_part("Summary", list(filter(None, log.get("story", "").splitlines()))),
+        frame.list_part("Summary", list(filter(None, log.get("summary", "").splitlines()))),
         frame.list_part("Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]),
         frame.table_part("Axes", heads if axes else (), axes, range(1, len(heads))),
     )
@@ -199,10 +199,10 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     log |= {
         "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
-        "factors": {
-            filter_name: factor
+        "sigma_ratios": {
+            filter_name: ratio
             for filter_name in ("kf", "ekf2")
-            if (factor := _mean_sigma_ratio(main, f"{filter_name}_nis_mean")) is not None
+            if (ratio := _mean_sigma_ratio(main, f"{filter_name}_nis_mean")) is not None
         },
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
         "lacking": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
@@ -215,11 +215,8 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
 def _mean_sigma_ratio(axes: Sequence[Mapping[str, Any]], name: str) -> float | None:
     nis_and_updates = [(row[name], row.get("updates", 1)) for row in axes if name in row]
     total = sum(nis * updates for nis, updates in nis_and_updates)
-    return (
-        float(sum(updates for _, updates in nis_and_updates) / total) ** 0.5
-        if total > 0.0
-        else None
-    )
+    updates_total = sum(updates for _, updates in nis_and_updates)
+    return float(total / updates_total) ** 0.5 if total > 0.0 else None
 
 
 def _tags(log: Log) -> dict[str, str]:
@@ -237,13 +234,13 @@ def short_names(logs: Sequence[Log]) -> dict[str, str]:
     return short_ids if len(set(short_ids.values())) == len(short_ids) else {}
 
 
-def describe_sigma_ratio(factor: float) -> str:
-    """Describe the reported σ of a filter, from its ratio to the actual one.
+def describe_sigma_ratio(ratio: float) -> str:
+    """Describe the reported σ of a filter, from the ratio of actual to reported σ.
 
-    >>> [describe_sigma_ratio(factor) for factor in (1.2, 3.2, 0.25)]
-    ['consistent', '3.2 × too large', '4 × too small']
+    >>> [describe_sigma_ratio(ratio) for ratio in (1.2, 3.2, 0.25)]
+    ['consistent', '3.2 × too small', '4 × too large']
     """
-    ratio = max(factor, 1.0 / factor)
-    if ratio <= CONSISTENT_RATIO:
+    factor = max(ratio, 1.0 / ratio)
+    if factor <= CONSISTENT_RATIO:
         return "consistent"
-    return f"{format_factor(ratio)} × too {'large' if factor > 1.0 else 'small'}"
+    return f"{format_factor(factor)} × too {'small' if ratio > 1.0 else 'large'}"

@@ -50,13 +50,13 @@ def at(results: object, path: str) -> Any:
 def axis_rows(results: ComparisonResults) -> list[Row]:
     """Return the rows of one log, one per axis; columns without a value are absent.
 
-    A factor is reported σ over actual σ, as ``sigma_factor`` in the results: above 1 the filter is
-    underconfident. SIGMA_Z and SIGMA_A are the maximum-likelihood estimates, for north and east
-    together. The clock offset is present if it is determinable.
+    A σ ratio is actual σ over reported σ: above 1 the filter is overconfident. SIGMA_Z and
+    SIGMA_A are the maximum-likelihood estimates, for north and east together. The clock
+    offset is present if it is determinable.
     """
     common = log_columns(results.log) | finding_columns(results.findings, results.aids)
-    common["story"] = "\n".join(results.story)
-    clock = bool(at(results, "clock.determinable"))
+    common["summary"] = "\n".join(results.summary)
+    clock = bool(at(results, "clock.is_determinable"))
     rows = []
     for name, axis in results.axes.items():
         unavailable = next((f for f in axis.filters.values() if isinstance(f, Unavailable)), None)
@@ -77,7 +77,7 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
     """Return the findings that are causes, and the verdict on each aid that EKF2 fused."""
     causes = [finding for finding in findings if finding.caused_by is None]
-    fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "idle"]
+    fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"]
     return {
         "aids": FINDING_SEPARATOR.join(fused),
         "findings": FINDING_SEPARATOR.join(finding.id for finding in causes),

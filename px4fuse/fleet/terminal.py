@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from px4fuse.findings import finding_title
 from px4fuse.fleet.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
 from px4fuse.fleet.rows import FAILED, FINDING_SEPARATOR
-from px4fuse.report.page import Page, words
+from px4fuse.report.page import Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval
 from px4fuse.text import format_factor, format_number
@@ -37,18 +37,18 @@ def summary(fleet: Fleet) -> Page:
         f"{filter_name}\
 {title}"
         for filter_name in ("KF", "EKF2")
-        for title in ("logs", "factor")
+        for title in ("logs", "σ ratio")
     ]
     lines = []
     for axis, rows in fleet.table[fleet.table["axis"] != ""].groupby("axis", sort=False):
         cells = []
-        for factors in (rows["kf_factor"].dropna(), rows["ekf2_factor"].dropna()):
-            cells += [f"{len(factors)}", format_factor(factors.median()) if len(factors) else "–"]
+        for ratios in (rows["kf_sigma_ratio"].dropna(), rows["ekf2_sigma_ratio"].dropna()):
+            cells += [f"{len(ratios)}", format_factor(ratios.median()) if len(ratios) else "–"]
         lines.append((str(axis), *cells))
     if lines:
         page.table(("axis", *heads), lines, right=(1, 2, 3, 4))
-        factor_note = "factor: median of reported σ / actual σ (above 1: underconfident)"
-        page.write(factor_note, colour=MUTED_COLOUR)
+        ratio_note = "σ ratio: median of actual σ / reported σ (above 1: overconfident)"
+        page.write(ratio_note, colour=MUTED_COLOUR)
     finding_ids = logs["findings"].str.split(FINDING_SEPARATOR).explode()
     for finding, count in finding_ids[finding_ids != ""].value_counts().head(MAX_SHOWN).items():
         page.write(f"{count} × {finding_title(str(finding))}")
@@ -87,12 +87,12 @@ def differences(results: ChangeResults) -> Page:
     least = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(f"Numbers that differ by less than {least} are not listed.", colour=MUTED_COLOUR)
     for finding in results.findings:
-        styled = words(
+        styled = styled_text(
             f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
         )
         page.labelled(f"Only {finding.only_in}", styled)
     for text in results.worse:
-        page.labelled("Worse", words(text, 8.0, RED))
+        page.labelled("Worse", styled_text(text, 8.0, RED))
     if not results.worse:
         page.write("No verdict is worse in B.")
     return page

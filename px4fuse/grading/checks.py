@@ -314,7 +314,7 @@ class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):
 
 
 # findings on timestamps that no constant offset corrects
-CHANGING_CLOCK_FINDINGS = ("source_clock_changes", "source_stamps_of_arrival")
+CHANGING_CLOCK_FINDINGS = ("source_time_offset_changes", "source_timestamps_are_arrival_times")
 Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
 # name in messages, unit and option of each noise
 NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
@@ -416,7 +416,7 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
         if evidence.comparison is None:
             return NO_COMPARISON
         clock = evidence.comparison.clock
-        if not isinstance(clock, Clock) or not clock.determinable:
+        if not isinstance(clock, Clock) or not clock.is_determinable:
             share = self.undeterminable if isinstance(clock, Clock) else 0.0
             why = in_brackets(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{why}."
@@ -461,10 +461,10 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
             landed = format_length(landed_m)
             return 1.0, f"Your vehicle landed {landed} from take-off: no correction is right."
         if not isinstance(loop, LoopResult) or loop.closure_error_m is None:
-            missing = loop.known_end if isinstance(loop, LoopResult) else loop
+            missing = loop.true_end if isinstance(loop, LoopResult) else loop
             why = in_brackets(getattr(missing, "reason", ""))
             return 0.0, f"Your report contains no loop closure error{why}."
-        if loop.absolute:
+        if loop.is_absolute_track:
             return 0.0, "The track of your loop does not drift. Measure the loop on odometry."
         error_text, path = format_length(loop.closure_error_m), format_length(loop.path_length_m)
         statement = f"You measured a loop closure error of {error_text} after {path}"

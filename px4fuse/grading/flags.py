@@ -65,16 +65,14 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
         )
     if not {"north", "east", "aisle"} & set(results.axes):
         yield "Only the vertical axis was analysed (--axis)."
-    without_imu = any(finding.id == "input_unavailable" for finding in results.findings)
+    without_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
     if settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
     source = results.source
-    tracks_as_received = [
-        track.name for track in source.available if track.passage == "as it arrived"
-    ]
-    if tracks_as_received and source.passage != "as it arrived":
+    tracks_as_received = [track.name for track in source.available if track.path == "as it arrived"]
+    if tracks_as_received and source.path != "as it arrived":
         yield (
-            f"The position source is {source.name} ({source.passage}), not "
+            f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."
         )
     for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):

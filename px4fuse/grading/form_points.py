@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from px4fuse.answer_form import MISTAKES, Answers, ClaimedMistake, QuantityAnswer
+from px4fuse.answer_form import MISTAKES, Answers, QuantityAnswer, StudentMistake
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING
 from px4fuse.record import table
@@ -99,11 +99,11 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     )
 
 
-Match = tuple[TrueMistake, ClaimedMistake | None, float]
+Match = tuple[TrueMistake, StudentMistake | None, float]
 
 
 def _mistake_feedback(
-    matches: list[Match], false_claims: list[ClaimedMistake], is_claimed_clean: bool
+    matches: list[Match], false_claims: list[StudentMistake], is_claimed_clean: bool
 ) -> Iterator[str]:
     """Yield a phrase for each right, missed or wrong mistake."""
     if not matches:
@@ -120,13 +120,13 @@ def _mistake_feedback(
         yield f"not in your flight: {', '.join(claim.kind for claim in false_claims)}"
 
 
-def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[ClaimedMistake]]:
+def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
     """Match each mistake with a claim and its share; also return the unmatched (false) claims.
 
     The best matches are taken first: the same kind, then related mistakes, then consequences.
     """
     unmatched = [claim for claim in answers.mistakes if claim.kind != "none"]
-    claim_by_kind: dict[str, tuple[ClaimedMistake, float]] = {}
+    claim_by_kind: dict[str, tuple[StudentMistake, float]] = {}
     candidates = [
         (kind_share(mistake.kind, claim.kind), mistake.kind, claim)
         for mistake in truth.mistakes
@@ -170,7 +170,7 @@ def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
     return shares
 
 
-def size_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
+def size_share(mistake: TrueMistake, claim: StudentMistake) -> float:
     """Return the share for a size: 1, 1/2 (close), or 1/3 (wrong sign, or related mistake)."""
     size = claim.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
@@ -184,7 +184,7 @@ def size_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
     return _value_share(size, mistake.low, mistake.high, 0.5 if close else 0.0)
 
 
-def when_share(mistake: TrueMistake, claim: ClaimedMistake) -> float:
+def when_share(mistake: TrueMistake, claim: StudentMistake) -> float:
     """Return the share for time and panel: one half each."""
     if mistake.from_s is None and mistake.until_s is None:
         is_time_right = claim.when == "whole flight"
@@ -206,7 +206,7 @@ def panels(kind: str) -> list[str]:
     return [*(panel for panel, kinds in TABLE["shows"].items() if kind in kinds), "cover"]
 
 
-def cure_share(mistake: TrueMistake, claim: ClaimedMistake, truth: FormTruth) -> float:
+def cure_share(mistake: TrueMistake, claim: StudentMistake, truth: FormTruth) -> float:
     """Return the share for a correction and its value."""
     value = claim.value_in_first_unit()
     worth = [
@@ -260,7 +260,7 @@ def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
 def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
     """Return the mean share for both verdicts and the behaviour of EKF2."""
     shares = [_ekf2_behaviour_share(answers, truth)]
-    for answer, known in ((answers.verdict_ours, truth.ours), (answers.verdict_ekf2, truth.ekf2)):
+    for answer, known in ((answers.verdict_kf, truth.kf), (answers.verdict_ekf2, truth.ekf2)):
         is_right = answer and answer == known.verdict
         # "consistent" is half right for a small factor
         is_nearly_right = (

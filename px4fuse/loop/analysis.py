@@ -10,7 +10,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import key_frame_spacing_m, key_frames, to_z_down
 from px4fuse.loop.corrections import correct_paths_by_distance, gate_closures, score_all, solve_all
-from px4fuse.loop.model import LANDING, KnownEnd, Loop, OdometryNoise
+from px4fuse.loop.model import LANDING, Loop, OdometryNoise, TrueEnd
 from px4fuse.loop.odometry import ClosureClaim, pose_graph
 from px4fuse.loop.tracks import LoopSource, odometry_of, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
@@ -68,23 +68,23 @@ def analyse(
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
     z_down_trajectory = to_z_down(trajectory)
     path = loop_segment.cut_trajectory(z_down_trajectory, segment, at_rest)
-    truth_used = truth if request.came_back and request.landed_at is None else None
+    truth_used = truth if request.closed_loop and request.landed_at is None else None
     by_truth = (
         None if truth_used is None else loop_segment.true_end(path, truth_used, segment, at_rest)
     )
-    known_end_found = _find_known_end(path, request, by_truth)
+    true_end_found = _find_true_end(path, request, by_truth)
     given_closures = [
         GivenClosure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in request.closures
     ]
     for closure in given_closures:
         _require_valid_closure(closure, path)
     claims: list[ClosureClaim] = [(closure, None) for closure in given_closures]
-    if not isinstance(known_end_found, Unavailable):
+    if not isinstance(true_end_found, Unavailable):
         claims.insert(
             0,
             (
-                GivenClosure(segment.start_s, segment.end_s, known_end_found.sigma_m),
-                known_end_found,
+                GivenClosure(segment.start_s, segment.end_s, true_end_found.sigma_m),
+                true_end_found,
             ),
         )
     spacing = request.key_frames_m
@@ -98,11 +98,11 @@ def analyse(
     graph_corrections, gated_closures = solve_all(path, nodes, graph, gated_closures, progress)
     end_m, heading = path.position_m[-1] - path.position_m[0], loop_segment.heading_change_deg(path)
     misclosure_m = (
-        known_end_found
-        if isinstance(known_end_found, Unavailable)
-        else end_m - known_end_found.displacement
+        true_end_found
+        if isinstance(true_end_found, Unavailable)
+        else end_m - true_end_found.displacement
     )
-    heading_error = _heading_error(known_end_found, heading)
+    heading_error = _heading_error(true_end_found, heading)
     landing = gated_closures[0] if gated_closures and gated_closures[0].source == LANDING else None
     corrected_by_distance = correct_paths_by_distance(
         path, distance, misclosure_m, heading_error, landing
@@ -124,12 +124,12 @@ def analyse(
         path_length_m=float(distance[-1]),
         end_from_start_m=by_axis(path.frame, end_m),
         heading_change_deg=heading,
-        known_end=known_end_found,
+        true_end=true_end_found,
         closure_error_m=error,
         closure_percent=None if error is None else 100.0 * error / float(distance[-1]),
         closure_error_axes_m=error_axes,
         heading_error_deg=heading_error,
-        absolute=flight is not None and _is_absolute(trajectory, flight),
+        is_absolute_track=flight is not None and _is_absolute(trajectory, flight),
         odometry_noise=noise,
         closures=gated_closures,
         corrections=score_all(path, corrected_by_distance | graph_corrections, references),
@@ -142,19 +142,19 @@ def analyse(
     )
 
 
-def _find_known_end(
-    path: Trajectory, request: LoopRequest, by_truth: KnownEnd | str | None
-) -> KnownEnd | Unavailable:
+def _find_true_end(
+    path: Trajectory, request: LoopRequest, by_truth: TrueEnd | str | None
+) -> TrueEnd | Unavailable:
     """Return the landing place: measured, by ground truth, or the take-off place."""
     if request.landed_at is not None:
-        if not request.came_back:
+        if not request.closed_loop:
             raise SettingsError(
-                "`landed_at` and `came_back` exclude each other.", "Omit one of them."
+                "`landed_at` and `closed_loop` exclude each other.", "Omit one of them."
             )
         return loop_segment.measured_end(path, request.landed_at)
-    if not request.came_back:
+    if not request.closed_loop:
         return Unavailable("closure error", "the loop is declared open (--open)", "Remove --open.")
-    return by_truth if isinstance(by_truth, KnownEnd) else loop_segment.assumed_end(path)
+    return by_truth if isinstance(by_truth, TrueEnd) else loop_segment.assumed_end(path)
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
@@ -198,7 +198,7 @@ def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
         )
 
 
-def _heading_error(end: KnownEnd | Unavailable, heading_deg: float | None) -> float | Unavailable:
+def _heading_error(end: TrueEnd | Unavailable, heading_deg: float | None) -> float | Unavailable:
     """Return the heading error at the end (°), or Unavailable."""
     what = "heading error of the loop"
     if isinstance(end, Unavailable):

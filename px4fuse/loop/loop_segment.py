@@ -10,7 +10,7 @@ from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad
-from px4fuse.loop.model import KnownEnd
+from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, by_axis
 
@@ -105,12 +105,12 @@ def heading_change_deg(path: Trajectory) -> float | None:
     return float(np.degrees(heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
 
 
-def assumed_end(path: Trajectory) -> KnownEnd:
+def assumed_end(path: Trajectory) -> TrueEnd:
     """Return the take-off place as landing place; equal heading if odometry nearly agrees."""
     change = heading_change_deg(path)
     same = change is not None and abs(change) <= SAME_HEADING_DEG
     heading = " with the same heading" if same else "; final heading unknown"
-    return KnownEnd(
+    return TrueEnd(
         displacement_m=by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if same else None,
         sigma_m=0.10,
@@ -120,7 +120,7 @@ def assumed_end(path: Trajectory) -> KnownEnd:
     )
 
 
-def measured_end(path: Trajectory, landed: Landing) -> KnownEnd:
+def measured_end(path: Trajectory, landed: Landing) -> TrueEnd:
     """Return the landing place that was measured relative to the take-off place."""
     forward_m, right_m, turned_deg = structs.astuple(landed)
     heading = 0.0
@@ -128,7 +128,7 @@ def measured_end(path: Trajectory, landed: Landing) -> KnownEnd:
         nose = path.rotation[0].apply([1.0, 0.0, 0.0])
         heading = float(np.arctan2(nose[1], nose[0]))
     ned_displacement_m = Rotation.from_rotvec(heading * DOWN).apply([forward_m, right_m, 0.0])
-    return KnownEnd(
+    return TrueEnd(
         displacement_m=by_axis(path.frame, ned_displacement_m),
         heading_change_deg=turned_deg,
         sigma_m=0.05,
@@ -140,9 +140,7 @@ def measured_end(path: Trajectory, landed: Landing) -> KnownEnd:
     )
 
 
-def true_end(
-    path: Trajectory, truth: Trajectory, segment: Segment, at_rest: bool
-) -> KnownEnd | str:
+def true_end(path: Trajectory, truth: Trajectory, segment: Segment, at_rest: bool) -> TrueEnd | str:
     """Return the landing place by the ground truth in the log, or the reason why it is unknown.
 
     The ground truth is rotated into the odometry frame by the headings at the start.
@@ -161,7 +159,7 @@ def true_end(
         return (
             "the ground truth has no orientation, so it cannot be rotated into the odometry frame"
         )
-    return KnownEnd(
+    return TrueEnd(
         displacement_m=by_axis(path.frame, ned_displacement_m),
         heading_change_deg=change,
         sigma_m=0.02,

@@ -28,7 +28,7 @@ Way = Literal[
 LANDING = "landing"
 
 
-class KnownEnd(Record, frozen=True, kw_only=True):
+class TrueEnd(Record, frozen=True, kw_only=True):
     """True landing place relative to the take-off place.
 
     Attributes
@@ -124,8 +124,8 @@ class Closure(Record, frozen=True, kw_only=True):
 class Correction(Record, frozen=True, kw_only=True):
     """Size of a correction, cost of the pose graph, and scores by reference."""
 
-    moved_max_m: NotNegative
-    moved_rms_m: NotNegative
+    correction_max_m: NotNegative
+    correction_rms_m: NotNegative
     cost_initial: NotNegative | None = None
     cost: NotNegative | None = None
     iterations: Count | None = None
@@ -162,9 +162,9 @@ class LoopResult(Record, frozen=True, kw_only=True):
     """Loop: path, landing place, closure errors and corrections, for the results.
 
     ``closure_error_m``: distance between measured and true end; ``closure_percent``: the same in
-    per cent of the path length; ``absolute``: the track follows a positioning system and does not
-    drift. Correction ``by_distance_plain`` changes positions only (Example 2 of the lesson);
-    ``by_distance`` also headings, if their error is known.
+    per cent of the path length; ``is_absolute_track``: the track follows a positioning system and
+    does not drift. Correction ``by_distance_plain`` changes positions only (Example 2 of the
+    lesson); ``by_distance`` also headings, if their error is known.
     """
 
     track: str
@@ -179,12 +179,12 @@ class LoopResult(Record, frozen=True, kw_only=True):
     path_length_m: NotNegative
     end_from_start_m: AxisLengths
     heading_change_deg: float | None = None
-    known_end: OrUnavailable[KnownEnd]
+    true_end: OrUnavailable[TrueEnd]
     closure_error_m: NotNegative | None = None
     closure_percent: NotNegative | None = None
     closure_error_axes_m: AxisLengths | None = None
     heading_error_deg: float | Unavailable
-    absolute: bool
+    is_absolute_track: bool
     odometry_noise: OdometryNoise
     closures: tuple[Closure, ...]
     corrections: Mapping[Way, OrUnavailable[Correction]]
@@ -248,7 +248,7 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
     @property
     def is_end_assumed(self) -> bool:
         """True if the closure error assumes landing at the take-off place."""
-        return isinstance(self.known_end, KnownEnd) and self.known_end.assumed
+        return isinstance(self.true_end, TrueEnd) and self.true_end.assumed
 
     def solved_graph(self) -> PoseGraph:
         """Return the pose graph with all closures and the poses of the best solution.

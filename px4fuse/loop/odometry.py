@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad
-from px4fuse.loop.model import KnownEnd, OdometryNoise
+from px4fuse.loop.model import OdometryNoise, TrueEnd
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
@@ -20,7 +20,7 @@ MIN_VARIANCE_GROWTH = 2.0
 FLOOR_SHARE = 1e-2
 END_SHARE = 0.1  # fraction of the path whose variances count as early, and as late
 # closure, and its landing place if it is that of the landing
-ClosureClaim = tuple[GivenClosure, KnownEnd | None]
+ClosureClaim = tuple[GivenClosure, TrueEnd | None]
 
 
 def odometry_variances(

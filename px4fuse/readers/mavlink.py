@@ -305,7 +305,7 @@ def _describe(
         parameters=MappingProxyType(parameters),
         notes=(*recording.notes, *faults, *dropped),
         restarts=recording.restarts,
-        receipt_went_back=recording.receipt_went_back,
+        receive_time_reversals=recording.receive_time_reversals,
         dropped=dict(sorted(recording.dropped.items())),
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),

@@ -55,7 +55,7 @@ class Recording:
     damage : tuple of str
         Sentences on unreadable parts.
     notes : list of str
-    restarts, receipt_went_back : int or None
+    restarts, receive_time_reversals : int or None
         As in :class:`~px4fuse.log.LogInfo`.
     dropped : dict
         Samples dropped because of an invalid timestamp, by message; filled by :meth:`read`.
@@ -73,7 +73,7 @@ class Recording:
     notes: list[str]
     damage: tuple[str, ...] = ()
     restarts: int | None = None
-    receipt_went_back: int | None = None
+    receive_time_reversals: int | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
 

@@ -179,10 +179,10 @@ def _step_s(topics: Topics) -> float:
         return target
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
     known = topics.primary_samples(layout).index
-    return samples_per_step(target, interval, rows_of_stamps(time, known)) * interval
+    return samples_per_step(target, interval, rows_of_timestamps(time, known)) * interval
 
 
-def rows_of_stamps(times_s: Array, known_s: ArrayLike) -> IntArray:
+def rows_of_timestamps(times_s: Array, known_s: ArrayLike) -> IntArray:
     """Return the rows of ``times_s`` whose time is in ``known_s``, rounded to 1 µs."""
     wanted = np.rint(np.asarray(known_s, dtype=float) * 1e6)
     return np.flatnonzero(np.isin(np.rint(times_s * 1e6), wanted))

@@ -40,7 +40,7 @@ ARRIVAL_SHARE = 0.9
 # s; largest time difference of height and position: 2.5 cm error at a climb rate of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
 # Hz; a lower GNSS rate means that the logger decimated the fixes (receivers send 5 to 20 Hz)
-MAX_THINNED_HZ = 4.0
+MAX_DOWNSAMPLED_HZ = 4.0
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
@@ -351,14 +351,14 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     samples = samples.assign(**_velocity(gps).set_axis(samples.index))
     samples = finite_rows(samples, Columns.POSITION)
     rate_hz, notes = sample_rate(samples), tuple[str, ...]()
-    if rate_hz < MAX_THINNED_HZ and not len(unlogged_fixes):
+    if rate_hz < MAX_DOWNSAMPLED_HZ and not len(unlogged_fixes):
         reconstructed_fixes, notes = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
         samples = (
             pd.concat([samples, reconstructed_fixes]).sort_index()
             if len(reconstructed_fixes)
             else samples
         )
-    if rate_hz < MAX_THINNED_HZ:
+    if rate_hz < MAX_DOWNSAMPLED_HZ:
         notes = (
             f"GNSS fixes are logged at {rate_hz:.1f} Hz, below the rate of receivers: the logger "
             "dropped fixes. Set SDLOG_PROFILE bit 1 to log all",

@@ -22,12 +22,12 @@ from px4fuse.record import table
 class TrackSource:
     """Position track that a ULog may contain; its key is the name for ``--position-source``.
 
-    ``kind`` and ``passage`` define its origin, ``remedy`` is the action to log it, and ``layouts``
+    ``kind`` and ``path`` define its origin, ``remedy`` is the action to log it, and ``layouts``
     are the layouts of its topic, if it has one.
     """
 
     kind: str
-    passage: str
+    path: str
     description: str
     remedy: str
     layouts: tuple[str, ...] = ()
@@ -35,7 +35,7 @@ class TrackSource:
     @property
     def origin(self) -> Origin:
         """Origin of the track."""
-        return find_origin(self.kind, self.passage)
+        return find_origin(self.kind, self.path)
 
 
 _ROWS = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])

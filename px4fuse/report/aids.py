@@ -45,7 +45,9 @@ def write_appendix(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
     aid_results = analysis.aids
     if isinstance(aid_results, Unavailable):
         return {}
-    if all(name not in aid_results or aid_results[name].verdict == "idle" for name in OUTDOOR_AIDS):
+    if all(
+        name not in aid_results or aid_results[name].verdict == "disabled" for name in OUTDOOR_AIDS
+    ):
         return {}
     write_aids(page, aid_results)
     return aid_results
@@ -73,19 +75,19 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     """Write a table row per aid and axis, and a list of the disabled aids below it."""
     rows: list[list[Cell]] = []
     for aid in aids.values():
-        if aid.verdict == "idle":
+        if aid.verdict == "disabled":
             continue
-        enabled = "" if aid.intended_share is None else f"{aid.intended_share:.0%}"
+        enabled = "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}"
         noise = "" if aid.noise is None else f"{format_number(aid.noise)} {aid.unit}"
         colour = style.GOOD_COLOUR if aid.verdict == "consistent" else style.MUTED_COLOUR
-        if aid.is_bad:
+        if aid.is_faulty:
             colour = style.SEVERITY_COLOURS["warning"]
         aid_cells: list[Cell] = [
             aid.label,
             (format_aid_verdict(aid), colour),
             enabled,
-            f"{aid.rejected_share:.1%}",
-            f"{aid.longest_without:.1f}",
+            f"{aid.rejected_fraction:.1%}",
+            f"{aid.longest_gap_duration_s:.1f}",
             noise,
         ]
         for name, axis in aid.axes.items():
@@ -121,7 +123,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         right=(2, 3, 4, 5, 7, 8, 10),
         size=6.8,
     )
-    disabled_labels = [aid.label for aid in aids.values() if aid.verdict == "idle"]
+    disabled_labels = [aid.label for aid in aids.values() if aid.verdict == "disabled"]
     if disabled_labels:
         page.write(
             f"Disabled in flight (logged, never fused): {', '.join(disabled_labels)}.",
@@ -132,10 +134,8 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
 
 def format_aid_verdict(aid: AidResult) -> str:
     """Format the verdict on an aid, with the factor between reported and actual σ."""
-    if aid.verdict == "starved":
-        return f"not fused for {aid.longest_without:.1f} s"
-    if not aid.verdict.startswith("variance"):
-        return aid.verdict
+    if aid.verdict == "not_fused":
+        return f"not fused for {aid.longest_gap_duration_s:.1f} s"
     return format_sigma_verdict(aid.verdict, max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5)
 
 
@@ -144,7 +144,7 @@ def _draw_strips(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> N
     span = flight_span(flight)
     if isinstance(flight.ekf2, Unavailable) or isinstance(span, Unavailable):
         return
-    fused_names = [name for name, aid in aids.items() if aid.verdict != "idle"]
+    fused_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
     page.heading("Normalised innovations of each aid (all axes)", above=8.0)
     page.numbers(
         "Normalised innovations ν/√S. Expected: 95 % within ±2 (lines). Hollow: not "

@@ -19,7 +19,7 @@ MAX_DROP = 12.0  # nats; lower end of the log-likelihood axis
 CURVE_REACH = 2.5  # distance that is drawn on each side, as a multiple of the 95 % interval
 NEGLIGIBLE_S = 0.010  # s; one EKF2 step (EKF2_PREDICT_US)
 # Findings for which the report has the page
-CLOCK_FINDINGS = ("source_clock_changes", "source_clock_offset", "ekf2_ev_delay_wrong")
+CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
 def summary_line(analysis: Analysis, findings: Iterable[Finding]) -> str:
@@ -35,14 +35,14 @@ def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
     clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
-    return not clock.determinable or any(one.id in CLOCK_FINDINGS for one in findings)
+    return not clock.is_determinable or any(one.id in CLOCK_FINDINGS for one in findings)
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
     """Return the estimated time offset and the actions as labelled texts."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"Cannot be estimated: {clock.reason}. {clock.remedy}"}
-    if not clock.determinable:
+    if not clock.is_determinable:
         return {
             "Offset": f"Cannot be estimated: {clock.reason}.",
             "Action": "Fly passes of 5 m or more with clear starts and stops.",
@@ -73,10 +73,10 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             f"Set {name} to {ml_delay_ms:.0f} ms (now {delay:g} ms; 95 % {least:.0f} to "
             f"{most:.0f} ms), or correct the sender's clock."
         )
-    if clock.change_p is not None and clock.change_p < MAX_CHANGE_P:
+    if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         advice["Changes"] = (
-            f"The offset changes during the flight ({format_p_value(clock.change_p)}): "
+            f"The offset changes during the flight ({format_p_value(clock.change_p_value)}): "
             f"{offset_texts}."
         )
     if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import Of
+from px4fuse.comparison.causal_replays import Statistic
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
@@ -38,10 +38,10 @@ SMALL_P = 0.01
 RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # points; heights of the axes
 GREY = "#dcdcdc"
 # Statistic that a cause explains: its label, and the power of the value that is printed
-CAUSE_STATISTICS: Mapping[Of, tuple[str, float]] = {
+CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
-    "apart": ("KF - EKF2 (m)", 1.0),
+    "difference": ("KF - EKF2 (m)", 1.0),
 }
 
 
@@ -112,7 +112,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     for cause in analysis.causes:
         if cause.axis == axis.name:
             owner = "KF" if cause.filter == "kf" else "EKF2"
-            statistic, power = CAUSE_STATISTICS[cause.of]
+            statistic, power = CAUSE_STATISTICS[cause.statistic]
             values = (format_number(number**power, 2) for number in (cause.before, cause.after))
             rows.append(
                 [
@@ -239,8 +239,8 @@ def _nis_sentence(series: list[Series]) -> str:
 
 def _shape_sentence(series: list[Series]) -> str:
     return "\n".join(
-        f"{one.name}: {one.statement.outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), mean "
-        f"{one.statement.innovation_mean_m:+z.3f} m ({format_p_value(one.statement.bias_p)})."
+        f"{one.name}: {one.statement.fraction_outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), "
+        f"mean {one.statement.innovation_mean_m:+z.3f} m ({format_p_value(one.statement.bias_p)})."
         for one in series
     )
 
@@ -261,7 +261,7 @@ def _statistic_cells(_: AxisComparison, __: str, one: FilterSummary | UnjudgedFi
         return [""] * 5
     return [
         f"{one.count}",
-        f"{one.outside_two_sigma:.1%}",
+        f"{one.fraction_outside_two_sigma:.1%}",
         f"{one.bias_t:+.1f}",
         f"{one.lag1_autocorrelation:+.2f}",
         format_p_value(one.ljung_box_p),

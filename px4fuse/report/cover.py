@@ -16,7 +16,7 @@ from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.log import LogInfo
 from px4fuse.report.event_marks import LANDING_MARK, TAKE_OFF_MARK
-from px4fuse.report.page import PAGE_WIDTH, Page, halves, legend_above, words
+from px4fuse.report.page import PAGE_WIDTH, Page, halves, legend_above, styled_text
 from px4fuse.report.phrases import (
     filters_by_name,
     format_clock_map,
@@ -53,7 +53,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     page = Page("EKF2 check: comparison with a two-state Kalman filter (KF)")
     page.foot(_map_and_facts(analysis, facts(analysis)))
     page.write(flight_line(results.student, analysis.flight.log), colour=MUTED_COLOUR, above=-4.0)
-    for sentence in results.story:
+    for sentence in results.summary:
         page.write(sentence, size=10.5, above=2.0)
     _write_verdict(page, analysis)
     write_errors(page, analysis)
@@ -155,11 +155,11 @@ def write_finding(page: Page, group: list[Finding]) -> None:
     """Write severity, time, title with id, message, action and consequences of a finding."""
     finding, *followers = group
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
-    texts = [words(title, 8.0, bold=True), words(finding.message, 8.0)]
+    texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
     if finding.remedy:
-        texts.append(words(f"Action: {finding.remedy}", 7.5, MUTED_COLOUR))
+        texts.append(styled_text(f"Action: {finding.remedy}", 7.5, MUTED_COLOUR))
     if followers:
-        texts.append(words(format_consequences(followers), 7.5, MUTED_COLOUR))
+        texts.append(styled_text(format_consequences(followers), 7.5, MUTED_COLOUR))
     page.labelled(
         f"{finding.severity}\n{finding.when}".strip(),
         *texts,

@@ -9,7 +9,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
-from px4fuse.ekf2.steps import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
@@ -37,7 +37,9 @@ AWAY_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that increase 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the steps of each explained axis; no page if no axis is explained."""
     explanations = _explanations(analysis)
-    if not any(isinstance(why, Why) for why in explanations.values()):
+    if not any(
+        isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
+    ):
         return
     page = Page(
         TITLE,
@@ -47,12 +49,12 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
             "that step; hatched bars increase it. The bars add up to 100 %."
         ),
     )
-    for name, why in explanations.items():
-        if isinstance(why, Unavailable):
+    for name, explanation in explanations.items():
+        if isinstance(explanation, Unavailable):
             page.heading(f"{name}: no result", 9.5, above=10.0)
-            page.write(f"{capitalise_first(why.reason)}. {why.remedy}")
+            page.write(f"{capitalise_first(explanation.reason)}. {explanation.remedy}")
         else:
-            _draw_axis(page, name, why, analysis)
+            _draw_axis(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
     assert isinstance(replay, Ekf2Replay)  # the explanation was made from it
     assert replay.agreement is not None
@@ -60,29 +62,31 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     yield page
 
 
-def _explanations(analysis: Analysis) -> Mapping[str, Why | Unavailable]:
+def _explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
     """Return the explanation of the aisle axis, else those of all axes."""
-    explanations = analysis.why
+    explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
 
-def write_explanation(page: Page, why: Why | Unavailable) -> None:
+def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
     """Write the largest step of the difference KF - EKF2, or the reason why it is unknown."""
-    if isinstance(why, Unavailable):
-        page.labelled("KF-EKF2", f"Difference not explained: {why.reason}.")
+    if isinstance(explanation, Unavailable):
+        page.labelled("KF-EKF2", f"Difference not explained: {explanation.reason}.")
     else:
-        page.labelled("KF-EKF2", why.sentences[0])
+        page.labelled("KF-EKF2", explanation.sentences[0])
 
 
 def unexplained_note(analysis: Analysis) -> str:
     """Return the reason why the page is missing; "" if it exists or the log has no EKF2."""
     explanations = list(_explanations(analysis).values())
     if isinstance(analysis.flight.ekf2, Unavailable) or any(
-        isinstance(why, Why) for why in explanations
+        isinstance(explanation, DifferenceExplanation) for explanation in explanations
     ):
         return ""
     reasons = {
-        f"{why.reason}. {why.remedy}": None for why in explanations if isinstance(why, Unavailable)
+        f"{explanation.reason}. {explanation.remedy}": None
+        for explanation in explanations
+        if isinstance(explanation, Unavailable)
     }
     return f"Difference KF - EKF2 not explained: {' '.join(reasons)}" if reasons else ""
 
@@ -98,8 +102,8 @@ def format_agreement(agreement: Agreement) -> str:
     return (
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
         f"Correlation of {agreement.samples} innovations {correlation}; S ratio replay/log "
-        f"{ratio}; rejected {agreement.rejected_share_replayed:.1%} (log "
-        f"{agreement.rejected_share_logged:.1%})"
+        f"{ratio}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
+        f"{agreement.rejected_fraction_logged:.1%})"
         + "".join(
             f". The {AIDS[name].label} does not agree and is not used: {reason}"
             for name, reason in agreement.doubtful.items()
@@ -107,22 +111,26 @@ def format_agreement(agreement: Agreement) -> str:
     )
 
 
-def _draw_axis(page: Page, name: str, why: Why, analysis: Analysis) -> None:
-    spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in why.spans_s)
+def _draw_axis(
+    page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
+) -> None:
+    spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
     page.heading(f"{name}, {spans}", 9.5, above=10.0)
-    for sentence in why.sentences:
+    for sentence in explanation.sentences:
         page.write(sentence, size=8.5, above=1.0)
-    names = [step.name for step in why.steps]
+    names = [step.name for step in explanation.steps]
     columns = halves(NAMED_FRACTION, gap=COLUMN_GAP)
-    for column, left, (quantity, unit, power) in zip(
-        columns,
-        (LABEL_WIDTH, 4.0),
-        (("position", "m", "m2"), ("velocity", "m/s", "m2_s2")),
-        strict=True,
+    quantities = (
+        ("position", "m", "m2", explanation.unexplained_mean_square_m2),
+        ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
+    )
+    for column, left, (quantity, unit, power, unexplained) in zip(
+        columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
-        total = getattr(why, f"{quantity}_mean_square_{power}")
-        steps = np.array([getattr(step, f"{quantity}_mean_square_{power}") for step in why.steps])
-        unexplained = getattr(why, f"{quantity}_left_mean_square_{power}")
+        total = getattr(explanation, f"{quantity}_mean_square_{power}")
+        steps = np.array(
+            [getattr(step, f"{quantity}_mean_square_{power}") for step in explanation.steps]
+        )
         title, height = (
             f"{quantity} difference, {np.sqrt(total):.3f} {unit} RMS",
             ROW_HEIGHT * (len(names) + 2),
@@ -133,12 +141,13 @@ def _draw_axis(page: Page, name: str, why: Why, analysis: Analysis) -> None:
     page.beside(*columns, gap=COLUMN_GAP)
     title = "Position difference KF - EKF2 (m, dark) and unexplained part (light)"
     axes = event_marks.panel(
-        page, analysis, title, _time_sentence(why), TIME_HEIGHT, axis=name, strip=True
+        page, analysis, title, _time_sentence(explanation), TIME_HEIGHT, axis=name, strip=True
     )
     position_difference, remainder = (
-        pd.Series(v, why.times_s) for v in (why.kf_minus_ekf2_m, why.unexplained_m)
+        pd.Series(v, explanation.times_s)
+        for v in (explanation.kf_minus_ekf2_m, explanation.unexplained_m)
     )
-    for start, end in why.spans_s:
+    for start, end in explanation.spans_s:
         draw_curve(axes, position_difference.loc[start:end], **LINES["KF"])
         draw_curve(axes, remainder.loc[start:end], color=EKF2_COLOUR, lw=0.8)
 
@@ -165,11 +174,11 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, left: float) ->
     axes.grid(visible=False)
 
 
-def _time_sentence(why: Why) -> str:
+def _time_sentence(explanation: DifferenceExplanation) -> str:
     """Caption of the time panel: largest difference and unexplained RMS."""
-    largest = int(np.argmax(np.abs(why.kf_minus_ekf2_m)))
+    largest = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     return (
-        f"Largest difference {abs(why.kf_minus_ekf2_m[largest]):.2g} m at "
-        f"{why.times_s[largest]:.1f} s; unexplained RMS "
-        f"{np.sqrt(np.mean(why.unexplained_m**2)):.2g} m."
+        f"Largest difference {abs(explanation.kf_minus_ekf2_m[largest]):.2g} m at "
+        f"{explanation.times_s[largest]:.1f} s; unexplained RMS "
+        f"{np.sqrt(np.mean(explanation.unexplained_m**2)):.2g} m."
     )

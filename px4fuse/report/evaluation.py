@@ -206,7 +206,7 @@ def _draw_rpe(axes: Axes, score: Evaluation) -> None:
             axes.plot([place] * 2, ends, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
         axes.plot(place, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
     shown_indices = range(0, len(known), 1 + len(known) // MAX_DELTA_LABELS)
-    axes.set_xticks(shown_indices, [known[place][0].delta_words for place in shown_indices])
+    axes.set_xticks(shown_indices, [known[place][0].delta_text for place in shown_indices])
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_SCALE_M))
     axes.margins(x=0.1)
     axes.set_xlabel("delta")
@@ -284,7 +284,7 @@ def write_evaluation(page: Page, score: Evaluation) -> None:
 def score_rows(score: Evaluation) -> list[list[str]]:
     """Return the table rows of the ATE and each RPE, with the columns of SCORE_HEAD."""
     errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": score.ate}
-    errors |= {f"RPE {error.delta_words} (m)": error for error in score.rpe}
+    errors |= {f"RPE {error.delta_text} (m)": error for error in score.rpe}
     rows = []
     for name, error in errors.items():
         translation, rotation = error.translation_m, error.rotation_deg

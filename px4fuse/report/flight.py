@@ -176,7 +176,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
             f"{name} {format_verdict(one)}" for name, one in filters_by_name(result).items()
         )
         if isinstance(result.difference, Difference):
-            verdicts += f"; KF - EKF2 {result.difference.position_rmse_m:.3f} m RMS"
+            verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
         column.heading(result.axis.name)
         column.write(f"{verdicts}.", size=7.5)
     page.beside(*columns, gap=COLUMN_GAP)

@@ -168,7 +168,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     page.labelled("Track", track_text)
     page.labelled("Part", f"{_format_span(loop)}, {loop.part_reason}")
     page.labelled("Closure", describe_closure_error(loop))
-    end = loop.known_end
+    end = loop.true_end
     page.labelled("True end", "not used" if isinstance(end, Unavailable) else end.source)
     for closure in loop.closures[:1]:
         page.labelled("Gate", describe_gate(closure))
@@ -230,7 +230,7 @@ def write_scores(page: Page, loop: Loop) -> None:
         if not known:
             continue
         first = next(iter(known.values()))
-        head = ["path", *(f"{e.delta_words} (m)" for e in first.rpe), "rotation (°)"]
+        head = ["path", *(f"{e.delta_text} (m)" for e in first.rpe), "rotation (°)"]
         page.table(
             head,
             [
@@ -325,9 +325,9 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 def format_correction(correction: CorrectedPath) -> str:
     """Format RMS and maximum (m) of a correction."""
-    if not correction.moved_max_m:
+    if not correction.correction_max_m:
         return "–"
-    return f"{correction.moved_rms_m:.2f} / {correction.moved_max_m:.2f}"
+    return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
 
 
 def graph_summary(solved: SolvedGraph) -> Page:

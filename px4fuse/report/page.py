@@ -57,12 +57,12 @@ class Page:
     ) -> None:
         """Write a paragraph; `above` and `indent` in points, `mark` before a list item."""
         if text or mark:
-            block = words(text, size, colour, bold)
+            block = styled_text(text, size, colour, bold)
             self.add("text", above=above, indent=indent, mark=mark, **block)
 
     def heading(self, text: str, size: float = 9.0, above: float = 6.0) -> None:
         """Write a heading within the page."""
-        self.add("heading", above=above, **words(text, size, bold=True))
+        self.add("heading", above=above, **styled_text(text, size, bold=True))
 
     def numbers(self, text: str) -> None:
         """Write the numbers of the panel above in small print."""
@@ -78,9 +78,11 @@ class Page:
         colour: str = "black",
         bold: bool = True,
     ) -> None:
-        """Write a label with texts beside it; :func:`words` sets the style of a text."""
-        styled_texts = [words(text, size) if isinstance(text, str) else text for text in texts]
-        styled_label = words(label, size, colour, bold)
+        """Write a label with texts beside it; :func:`styled_text` sets the style of a text."""
+        styled_texts = [
+            styled_text(text, size) if isinstance(text, str) else text for text in texts
+        ]
+        styled_label = styled_text(label, size, colour, bold)
         self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=above)
 
     def advice(self, texts: Mapping[str, str], size: float = 8.0) -> None:
@@ -191,7 +193,7 @@ def halves(first: float = 0.5, gap: float = 14.0) -> tuple[Page, Page]:
     return Page(width=left), Page(width=PAGE_WIDTH - gap - left)
 
 
-def words(text: str, size: float, colour: str = "black", bold: bool = False) -> Block:
+def styled_text(text: str, size: float, colour: str = "black", bold: bool = False) -> Block:
     """Return a text with its size (points), colour and weight."""
     return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
 

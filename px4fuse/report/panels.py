@@ -218,7 +218,7 @@ def _position_numbers(result: AxisComparison) -> str:
     if isinstance(part, Unavailable):
         return f"{part.what}: {part.reason}"
     return (
-        f"KF - EKF2: RMS {part.position_rmse_m:.3f} m, mean {part.position_mean_m:+.3f} m, "
+        f"KF - EKF2: RMS {part.position_rms_m:.3f} m, mean {part.position_mean_m:+.3f} m, "
         f"maximum {part.position_maximum_m:.2f} m"
     )
 
@@ -226,7 +226,7 @@ def _position_numbers(result: AxisComparison) -> str:
 def _velocity_numbers(result: AxisComparison) -> str:
     texts = [_error_numbers(result, VELOCITIES)]
     if isinstance(result.difference, Difference):
-        texts.append(f"KF - EKF2: RMS {result.difference.velocity_rmse_m_s:.3f} m/s")
+        texts.append(f"KF - EKF2: RMS {result.difference.velocity_rms_m_s:.3f} m/s")
     return "; ".join(filter(None, texts))
 
 
@@ -289,8 +289,8 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
             sentences.append(f"{name}: {one.reason}.")
         else:
             sentences.append(
-                f"{name}: {one.outside_two_sigma:.1%} of {one.count} innovations outside ±2√S "
-                f"(expected 5 %): {format_verdict(one)}."
+                f"{name}: {one.fraction_outside_two_sigma:.1%} of {one.count} innovations outside "
+                f"±2√S (expected 5 %): {format_verdict(one)}."
             )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")

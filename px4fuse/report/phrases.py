@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
 from px4fuse.comparison.model import UnjudgedFilter as Unjudged
@@ -23,10 +23,9 @@ if TYPE_CHECKING:
 # p value of the Ljung-Box test below which innovations are reported as not white. It keeps the
 # false alarm rate of a flight's eight tests below 1 %
 MIN_WHITE_P = 0.001
-SIGMA_VERDICTS = {
-    "variance overstated": ("underconfident", "large"),
-    "variance understated": ("overconfident", "small"),
-}
+# Error of the reported σ, by verdict
+SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
+RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
@@ -49,13 +48,12 @@ def format_verdict(statement: Consistency | Unavailable) -> str:
 def format_sigma_verdict(verdict: str, factor: float) -> str:
     """Format a verdict of the results with the factor between reported and actual σ.
 
-    >>> format_sigma_verdict("variance understated", 2.41)
+    >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
     """
     if verdict not in SIGMA_VERDICTS:
         return verdict
-    confidence, size = SIGMA_VERDICTS[verdict]
-    return f"{confidence}, σ {format_factor(factor)}× too {size}"
+    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_VERDICTS[verdict]}"
 
 
 def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
@@ -98,9 +96,9 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     has_truth = isinstance(analysis.flight.truth, Truth)
 
     def rms_cells(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
-        statistics: list[Any] = [result.difference if name == "KF" else None] if has_ekf2 else []
-        statistics += [one.truth] if has_truth else []
-        return [_format_rms(statistic, field) for statistic in statistics for field in RMSE_FIELDS]
+        difference = result.difference if name == "KF" else None
+        cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
+        return cells + [_format_rms(one.truth, field) for field in RMSE_FIELDS if has_truth]
 
     head = [*VERDICT_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
@@ -133,7 +131,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         )
     small_deviations = [
         f"{filter_name} {axis} (σ {format_factor(statement.sigma_error_factor)} times too "
-        f"{'large' if statement.sigma_factor > 1.0 else 'small'})"
+        f"{'large' if statement.sigma_ratio < 1.0 else 'small'})"
         for axis, filter_name, statement in statements
         if statement.verdict != "consistent" and statement.sigma_error_factor < SIGMA_FACTOR_FINDING
     ]
@@ -159,7 +157,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
 
 def format_consequences(followers: Sequence[Finding]) -> str:
     """Format findings that follow from the same cause, with their ids."""
-    return "Consequences: " + " ".join(f"{one.headline} [{one.id}]." for one in followers)
+    return "Consequences: " + " ".join(f"{one.title} [{one.id}]." for one in followers)
 
 
 def format_clock_map(clock: ClockMap) -> str:
@@ -206,7 +204,7 @@ def tuning_advice(
     found = tuned.get(name)
     if not isinstance(found, AxisTuning):
         return {}
-    advice, sigma_a, sigma_z = {}, found.filter_sigma_a, found.sigma_z
+    advice, sigma_a, sigma_z = {}, found.sigma_a_two_state, found.sigma_z
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
         advice["Drift"] = (

@@ -58,7 +58,7 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
             *(one.own_parameters for one in (EV_POS, GNSS_POS) if one != aid)
         )
         facts["position source"] = (
-            f"{source.name} ({source.origin.kind}, {source.origin.passage}) from "
+            f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
     parameters = (

@@ -34,7 +34,7 @@ STYLES = {
     MUTED_COLOUR: "dim",
     SEVERITY_COLOURS["error"]: "bold red",
     SEVERITY_COLOURS["warning"]: "yellow",
-    SEVERITY_COLOURS["info"]: "cyan",
+    SEVERITY_COLOURS["note"]: "cyan",
     GOOD_COLOUR: "green",
 }
 # The pattern of a value excludes the full stop at the end of a sentence

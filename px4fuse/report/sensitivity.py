@@ -74,7 +74,7 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
         return
     axes = page.panel(title, _map_sentence(tuned_noises), MAP_HEIGHT, left=MAP_LEFT, above=14.0)
     chosen = settings.sigma_a_m_s2, settings.sigma_z_m
-    noises = tuned_noises.filter_sigma_a, tuned_noises.sigma_z
+    noises = tuned_noises.sigma_a_two_state, tuned_noises.sigma_z
     (a, a_limits), (z, z_limits) = map(_noise_grid, chosen, noises)
     axes.contourf(
         z, a, _log_likelihood_drop(analysis, name, tuned_noises, a, z), LEVELS, colors=SHADES
@@ -120,12 +120,14 @@ def _noise_grid(chosen: float, noise: Noise) -> tuple[Array, tuple[float, float]
 
 
 def _map_sentence(tuned_noises: AxisTuning) -> str:
-    drop = format_number(max(tuned_noises.gain_nats * tuned_noises.count, 0.0), 2)
+    drop = format_number(
+        max(tuned_noises.log_likelihood_gain_per_measurement * tuned_noises.count, 0.0), 2
+    )
     has_random_walk = tuned_noises.noises.walk_m > tuned_noises.noises.sigma_z_m
     walk_note = " The random walk of the source is not included." if has_random_walk else ""
     return (
         "Maximum-likelihood estimate: SIGMA_A "
-        f"{format_noise(tuned_noises.filter_sigma_a, 'm/s²')}, SIGMA_Z "
+        f"{format_noise(tuned_noises.sigma_a_two_state, 'm/s²')}, SIGMA_Z "
         f"{format_noise(tuned_noises.sigma_z, 'm')}. The chosen pair is {drop} nats below the "
         f"maximum. Dotted lines: constant gain.{walk_note}"
     )

@@ -37,7 +37,7 @@ TRUTH_COLOUR = "#111111"
 MEASUREMENT_COLOUR = "#9a9a9a"
 MUTED_COLOUR = "#555555"
 GOOD_COLOUR = "#1f6b3a"
-SEVERITY_COLOURS = {"error": "#a61b1b", "warning": "#8a5a00", "info": "#33556b"}
+SEVERITY_COLOURS = {"error": "#a61b1b", "warning": "#8a5a00", "note": "#33556b"}
 
 KF_LINE: dict[str, Any] = {"color": KF_COLOUR, "lw": 1.0, "ls": "-"}
 EKF2_LINE: dict[str, Any] = {"color": EKF2_COLOUR, "lw": 1.1, "ls": (0, (4, 1.6))}

@@ -3,7 +3,7 @@
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
-from px4fuse.ekf2.steps import Why
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.findings import group_by_root
 from px4fuse.report.aids import write_alone, write_appendix
 from px4fuse.report.cover import facts, write_finding
@@ -37,7 +37,7 @@ def summary(analysis: Analysis | AidsOnlyAnalysis, results: Any, report: object 
         page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
         write_alone(page, analysis, results.findings)
         return page
-    for sentence in results.story:
+    for sentence in results.summary:
         page.write(sentence)
     page.add("blank")
     names = " + ".join([log.name, *(file.name for file in analysis.flight.inputs)])
@@ -48,10 +48,12 @@ def summary(analysis: Analysis | AidsOnlyAnalysis, results: Any, report: object 
     write_errors(page, analysis)
     for note in (ERROR_LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED_COLOUR)
-    why = analysis.why.get(analysis.main.axis.name)
-    is_in_summary = isinstance(why, Why) and why.cause in results.story
-    if why is not None and not is_in_summary:
-        write_explanation(page, why)
+    explanation = analysis.difference_steps.get(analysis.main.axis.name)
+    is_in_summary = (
+        isinstance(explanation, DifferenceExplanation) and explanation.cause in results.summary
+    )
+    if explanation is not None and not is_in_summary:
+        write_explanation(page, explanation)
     write_appendix(page, analysis)
     if not results.findings:
         page.write("Findings: none.")

@@ -27,11 +27,11 @@ AXIS_ROWS: Rows = (
     ("    median σ_p (m)", lambda axis: _format_number(axis.sigma_p_median_m)),
     ("    position RMSE (m)", lambda axis: _format_number(axis.position_rmse_to_truth_m)),
 )
-HEIGHT_ROWS: Rows = (*NIS_ROWS, ("    rejected", lambda height: f"{height.rejected_share:.1%}"))
+HEIGHT_ROWS: Rows = (*NIS_ROWS, ("    rejected", lambda height: f"{height.rejected_fraction:.1%}"))
 # statistics of the whole replay
 OVERALL_ROWS: Rows = (
     ("samples", lambda s: f"{s.samples}"),
-    ("rejected", lambda s: f"{s.rejected_share:.1%}"),
+    ("rejected", lambda s: f"{s.rejected_fraction:.1%}"),
     ("longest time without fusion (s)", lambda s: _format_number(s.longest_without_fusion_s, 2)),
     ("position resets", lambda s: f"{s.resets}"),
 )
@@ -81,7 +81,7 @@ def rows(counterfactual: WhatIfAnalysis) -> list[list[str]]:
 
 def _format_cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str:
     """Format a statistic of an axis or aid; the name "" stands for the whole replay."""
-    if not summary.steady:
+    if not summary.is_predictable:
         return NOT_PREDICTABLE
     part = {"": summary, **summary.axes, **summary.heights, **summary.others}.get(name)
     return "n/a" if part is None else cell(part)
@@ -94,7 +94,7 @@ def sweep_table(counterfactual: WhatIfAnalysis) -> tuple[list[str], list[list[st
     (_, nis), _, _, (_, sigma), (_, rmse) = AXIS_ROWS
     for one in sweep_summaries(counterfactual):
         cells = [NOT_PREDICTABLE, *[""] * 5]
-        if one.steady:
+        if one.is_predictable:
             per_axis_cells = ["/".join(map(cell, one.axes.values())) for cell in (nis, sigma, rmse)]
             cells = [
                 per_axis_cells[0],
@@ -128,7 +128,7 @@ def swept_parameter(counterfactual: WhatIfAnalysis) -> str:
 def reading(counterfactual: WhatIfAnalysis) -> list[str]:
     """Return notes on the best values of the sweep and on the limits of the replay."""
     lines = []
-    if summaries := [one for one in sweep_summaries(counterfactual) if one.steady]:
+    if summaries := [one for one in sweep_summaries(counterfactual) if one.is_predictable]:
         name = swept_parameter(counterfactual)
         best = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         lines.append(
@@ -146,7 +146,7 @@ def reading(counterfactual: WhatIfAnalysis) -> list[str]:
                 f"The horizontal position RMSE against ground truth is smallest at {name} "
                 f"{format_number(errors[least])} ({least:.3f} m)."
             )
-    if not all(one.steady for one in counterfactual.whatif.whatif):
+    if not all(one.is_predictable for one in counterfactual.whatif.whatif):
         lines.append(
             f"Not predictable: more than {MAX_REJECTED_SHARE:.0%} of the samples would "
             f"be rejected, {1000.0 * DISTURBANCE_M:.0f} mm of position noise would change "
@@ -163,8 +163,8 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 def summary(counterfactual: WhatIfAnalysis) -> Page:
     """Make the terminal page of ``px4fuse whatif``."""
     page = Page()
-    if AISLE in counterfactual.why:
-        write_explanation(page, counterfactual.why[AISLE])
+    if AISLE in counterfactual.difference_steps:
+        write_explanation(page, counterfactual.difference_steps[AISLE])
     log, whatif_result = counterfactual.flight.log, counterfactual.whatif
     page.labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)

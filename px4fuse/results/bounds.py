@@ -21,7 +21,7 @@ LONGEST_M, LARGEST_RATIO = 1e9, 1e6
 # Bounds by a pattern for the name of the field; the first match applies
 BOUNDS = {
     r"(^|_)(nis|nees)($|_)": (0.0, LARGEST_RATIO),
-    r"(fused|intended|lost|rejected)_share($|_)": (0.0, 1.0),
+    r"(enabled|fused|lost|rejected)_fraction($|_)": (0.0, 1.0),
     r"(^|_)correlation$": (-1.0, 1.0),
     r"(^|_)(ratio|factor)($|_)": (-LARGEST_RATIO, LARGEST_RATIO),
     r"_m$": (-LONGEST_M, LONGEST_M),
@@ -70,12 +70,12 @@ def within_bounds(results: T) -> T:
     )
 
 
-def _kinds(kind: Any) -> tuple[Any, ...]:
+def types_of(kind: Any) -> tuple[Any, ...]:
     """Return the types that a field accepts."""
     if get_origin(kind) is Annotated:
-        return _kinds(get_args(kind)[0])
+        return types_of(get_args(kind)[0])
     if get_origin(kind) in (Union, UnionType):
-        return tuple(member for part in get_args(kind) for member in _kinds(part))
+        return tuple(member for part in get_args(kind) for member in types_of(part))
     return getattr(kind, "kinds", (kind,))
 
 
@@ -114,7 +114,7 @@ def _struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Str
 
 def _mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list[str]) -> Any:
     of_values = next(
-        (get_args(member)[1] for member in _kinds(kind) if len(get_args(member)) == 2), Any
+        (get_args(member)[1] for member in types_of(kind) if len(get_args(member)) == 2), Any
     )
     checked: dict[str, Any] = {}
     for key, old in value.items():
@@ -150,7 +150,7 @@ def _unavailable(
     old: Any, kind: Any, path: str, error: _OutsideError, reasons: list[str]
 ) -> Unavailable:
     """Return the Unavailable that replaces a record; raise the error if its type allows none."""
-    for member in _kinds(kind):
+    for member in types_of(kind):
         if isinstance(member, type) and issubclass(member, Unavailable):
             texts = {"what": path, "reason": str(error), "remedy": REMEDY}
             other_fields = {

@@ -11,7 +11,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find, find_aids, find_loop
-from px4fuse.findings.summary import summarise_flight
+from px4fuse.findings.summary import summarise
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.record import to_serializable
@@ -37,7 +37,7 @@ _COPIED_FIELDS = (
     "clock",
     "heading",
     "ekf2_replay",
-    "why",
+    "difference_steps",
     "causes",
     "loop",
     "notes",
@@ -55,7 +55,7 @@ def results(
             **_flight_fields(contract.COMPARISON, request, analysis),
             **{name: to_serializable(getattr(analysis, name)) for name in _COPIED_FIELDS},
             aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-            story=summarise_flight(analysis, findings),
+            summary=summarise(analysis, findings),
             findings=findings,
             student=student,
         )
@@ -106,7 +106,7 @@ def whatif_results(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF, request, counterfactual.flight),
             agreement=whatif_result.agreement,
-            judged_s=whatif_result.evaluated_s,
+            evaluated_s=whatif_result.evaluated_s,
             asked=counterfactual.asked,
             logged=whatif_result.logged,
             replayed=whatif_result.replayed,
@@ -193,13 +193,13 @@ def _flight_fields(
             AvailableTrack(
                 track.name,
                 track.origin.kind,
-                track.origin.passage,
+                track.origin.path,
                 len(track.samples),
                 track.rate_hz,
             )
             for track in comparison.flight.positions
         ),
-        not_in_log=tuple(part for part in comparison.missing if part.source),
+        missing=tuple(part for part in comparison.missing if part.source),
     )
     setting_values: dict[str, Any] = asdict(settings) | {
         "clock_offset_s": settings.clock_offset_s + placed_s

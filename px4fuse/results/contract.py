@@ -1,7 +1,7 @@
 """Contract of the results: one JSON object per command, its schema, and how it is written.
 
-px4fuse reads all results with its own major version of the schema; a new field increases the minor
-version.
+px4fuse reads all results with its own major version of the schema; fields of a newer minor version
+are ignored.
 """
 
 import json
@@ -16,7 +16,7 @@ from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
-from px4fuse.ekf2.steps import WhySteps
+from px4fuse.ekf2.steps import DifferenceSteps
 from px4fuse.ekf2.whatif import Summary
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.frame_rotation import HeadingError
@@ -26,7 +26,7 @@ from px4fuse.findings import Finding
 from px4fuse.flight import Alignment
 from px4fuse.log import ClockMap, InputFile, LogInfo
 from px4fuse.loop.model import LoopResult
-from px4fuse.position_source import Passage, PositionKind
+from px4fuse.position_source import DataPath, PositionKind
 from px4fuse.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import VERSION, Provenance, Schema, Student, Version
@@ -55,7 +55,7 @@ class AvailableTrack(Record, frozen=True):
 
     name: str
     kind: PositionKind
-    passage: Passage
+    path: DataPath
     samples: Count
     rate_hz: Positive | None = None
 
@@ -63,14 +63,14 @@ class AvailableTrack(Record, frozen=True):
 class PositionSource(Record, frozen=True, kw_only=True):
     """Position source with which KF and EKF2 are compared.
 
-    ``kind`` is the type of sensor, ``passage`` the path of the data into the log.
+    ``kind`` is the type of sensor, ``path`` the path of the data into the log.
     ``ekf2_parameters`` are the logged EKF2 parameters of the source, by PX4 name and in PX4's
     units. ``log`` is the file with the data.
     """
 
     name: str
     kind: PositionKind
-    passage: Passage
+    path: DataPath
     ekf2_parameters: Mapping[str, float]
     description: str
     reason: str
@@ -80,7 +80,7 @@ class PositionSource(Record, frozen=True, kw_only=True):
     reconstructed: bool
     topics: tuple[str, ...]
     available: tuple[AvailableTrack, ...]
-    not_in_log: tuple[Unavailable, ...]
+    missing: tuple[Unavailable, ...]
     log: str
     alignment: Alignment | None = None
 
@@ -99,7 +99,7 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
 
 
 # Field of NoiseEstimate with the maximum-likelihood estimate of each KF setting
-TUNED_FIELDS = {"sigma_a_m_s2": "filter_sigma_a_m_s2", "sigma_z_m": "sigma_z_m"}
+TUNED_FIELDS = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
 Which = Literal["A", "B"]
@@ -153,7 +153,7 @@ class FindingChange(Record, frozen=True):
     """Finding that only one of the two inputs has."""
 
     id: str
-    severity: Literal["error", "warning", "info"]
+    severity: Literal["error", "warning", "note"]
     message: str
     only_in: Which
 
@@ -187,14 +187,14 @@ class ComparisonResults(_FlightResults, frozen=True):
         Yaw misalignment between the position frame and the heading of the vehicle.
     ekf2_replay : Replayed
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
-    why : mapping of axis name to WhySteps
+    difference_steps : mapping of axis name to DifferenceSteps
         Differences between EKF2 and KF, by filter step.
     causes : tuple of Intervention
         Re-runs with one change each, and how much of an inconsistency each change explains.
     aids : mapping of PX4's name to AidResult
         Sensors that EKF2 fused, each with statistics of its innovations; empty without innovations.
     loop : LoopResult
-    story : tuple of str
+    summary : tuple of str
         Summary of the flight in up to three sentences.
     findings : tuple of Finding
         Most severe first; of the same severity, missing data before noises.
@@ -212,11 +212,11 @@ class ComparisonResults(_FlightResults, frozen=True):
     clock: OrUnavailable[Clock]
     heading: OrUnavailable[HeadingError]
     ekf2_replay: OrUnavailable[Replayed]
-    why: dict[str, OrUnavailable[WhySteps]]
+    difference_steps: dict[str, OrUnavailable[DifferenceSteps]]
     causes: tuple[Intervention, ...]
     aids: dict[str, AidResult]
     loop: OrUnavailable[LoopResult]
-    story: tuple[str, ...]
+    summary: tuple[str, ...]
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
@@ -284,15 +284,15 @@ class EvaluationResults(Score, frozen=True, kw_only=True):
 class WhatIfResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
-    All statistics are over the spans ``judged_s``. ``asked`` is True if the changes of ``whatif``
-    are the maximum-likelihood estimates; ``sweep`` contains one summary per value.
+    All statistics are over the spans ``evaluated_s``. ``asked`` is True if the changes of
+    ``whatif`` are the maximum-likelihood estimates; ``sweep`` contains one summary per value.
     """
 
     schema: Schema
     request: WhatIfRequest
     log: Log
     agreement: Agreement
-    judged_s: tuple[Span, ...]
+    evaluated_s: tuple[Span, ...]
     asked: bool
     logged: Summary
     replayed: Summary

@@ -2,7 +2,7 @@
 
 import platform
 from importlib import metadata
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
@@ -10,7 +10,8 @@ from msgspec import Meta
 from px4fuse.answer_form import Answers
 from px4fuse.record import Record
 
-VERSION: Literal["3.0"] = "3.0"
+# Readers compare the major version; a new field increases the minor version
+VERSION = "4.0"
 # Libraries that affect the numbers
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 MAX_NOTES_BYTES = 200_000
@@ -23,7 +24,7 @@ class Schema(Record, frozen=True):
     """Name of the results, and version of their schema."""
 
     name: str
-    version: Literal["3.0"]
+    version: Annotated[str, Meta(pattern=r"^4\.[0-9]{1,4}$")]
 
 
 class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

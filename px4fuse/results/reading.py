@@ -1,14 +1,17 @@
 """Strict reading of results, which may come from an untrusted source."""
 
 import json
+import re
 import unicodedata
 from functools import cache
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
+from msgspec.structs import fields
 
 from px4fuse.errors import ResultsError
 from px4fuse.record import decode_record_or_unavailable
+from px4fuse.results.bounds import types_of
 from px4fuse.results.contract import KINDS, Results
 from px4fuse.results.model import VERSION
 
@@ -34,7 +37,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     Raises
     ------
     ResultsError
-        The data are too large, not JSON, nested too deeply, or not results of this version.
+        The data are too large, not JSON, nested too deeply, or not results of this major version.
     """
     if len(data) > MAX_BYTES:
         raise ResultsError(f"{name} is larger than {MAX_BYTES // 1_000_000} MB.")
@@ -49,12 +52,18 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     kind = KINDS.get(str(schema.get("name"))) if isinstance(schema, dict) else None
     if schema is None or kind is None:
         raise ResultsError(f"{name} contains no results of px4fuse.")
-    if (version := str(schema.get("version"))) != VERSION:
+    version, (major, minor) = str(schema.get("version")), VERSION.split(".")
+    if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
+        provenance = value.get("provenance")
+        writer = provenance.get("px4fuse") if isinstance(provenance, dict) else None
+        wrote = f"px4fuse {one_line(str(writer), 60)}" if writer else "the px4fuse that wrote it"
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; this px4fuse reads version "
-            f"{VERSION}.",
-            "Create the report again, or use the px4fuse version that wrote it.",
+            f"{major}.",
+            f"Create the report again, or read it with {wrote}.",
         )
+    if int(version.partition(".")[2]) > int(minor):
+        value = _known_fields(value, kind)
     try:
         results: Results = msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
     except msgspec.ValidationError as error:
@@ -62,6 +71,22 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
             f"{name} does not follow the results schema: {one_line(str(error), 300)}."
         ) from error
     return results
+
+
+def _known_fields(value: Any, kind: Any) -> Any:
+    """Drop the fields of plain data that a newer minor version of the schema has added."""
+    kinds = types_of(kind)
+    if isinstance(value, dict):
+        records = [one for one in kinds if hasattr(one, "__struct_fields__")]
+        known = {field.encode_name: field.type for one in records for field in fields(one)}
+        if records:
+            return {key: _known_fields(value[key], known[key]) for key in value if key in known}
+        value_type = next((get_args(one)[1] for one in kinds if len(get_args(one)) == 2), Any)
+        return {key: _known_fields(part, value_type) for key, part in value.items()}
+    if isinstance(value, list):
+        item_type = next((get_args(one)[0] for one in kinds if get_args(one)), Any)
+        return [_known_fields(part, item_type) for part in value]
+    return value
 
 
 def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:

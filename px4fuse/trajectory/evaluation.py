@@ -257,11 +257,13 @@ def _time_offset(
 ) -> tuple[TimeOffset, list[str]]:
     """Return the offset to add to the timestamps of the estimate, and warnings."""
     if isinstance(given_s, float | int):
-        return TimeOffset(offset_s=given_s, determinable=True, reason="Requested offset."), []
+        return TimeOffset(offset_s=given_s, is_determinable=True, reason="Requested offset."), []
     clock_offset_s = clock_difference(estimate, reference)
     by_clock = "UNIX time of both clocks" if clock_offset_s else "unchanged timestamps"
     clock_offset = TimeOffset(
-        offset_s=clock_offset_s or 0.0, determinable=True, reason=f"{capitalise_first(by_clock)}."
+        offset_s=clock_offset_s or 0.0,
+        is_determinable=True,
+        reason=f"{capitalise_first(by_clock)}.",
     )
     start, end = estimate.time_s[[0, -1]] + (clock_offset_s or 0.0)
     no_overlap = start > reference.time_s[-1] or end < reference.time_s[0]
@@ -272,9 +274,9 @@ def _time_offset(
         return clock_offset, []
     found = estimate_time_offset(estimate, reference)
     if is_estimated:
-        if found.determinable:
+        if found.is_determinable:
             return found, []
-        used = structs.replace(clock_offset, determinable=False, reason=found.reason)
+        used = structs.replace(clock_offset, is_determinable=False, reason=found.reason)
         return used, [f"{found.reason} {capitalise_first(by_clock)} used instead."]
     offset, (low, high) = found.offset_s or 0.0, found.interval_s or (0.0, 0.0)
     is_doubtful = not low <= 0.0 <= high and abs(offset) >= MIN_CLOCK_DOUBT_S

@@ -98,7 +98,7 @@ class RelativeError(Record, frozen=True):
     rotation_deg: OrUnavailable[Statistics]
 
     @property
-    def delta_words(self) -> str:
+    def delta_text(self) -> str:
         """Distance of a pair, with unit."""
         return str(Delta(self.delta, self.unit))
 

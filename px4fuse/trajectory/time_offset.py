@@ -59,14 +59,14 @@ class TimeOffset(Record, frozen=True, kw_only=True):
         Offset to add to the timestamps of the estimate; None if it cannot be determined.
     interval_s : (float, float) or None
         95 % interval.
-    determinable : bool
+    is_determinable : bool
     reason : str
         Method, or reason why the offset cannot be determined.
     """
 
     offset_s: float | None = None
     interval_s: Span | None = None
-    determinable: bool
+    is_determinable: bool
     reason: str
 
 
@@ -149,14 +149,14 @@ def _search(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
     return TimeOffset(
         offset_s=best.offset_s,
         interval_s=(best.offset_s - half_interval_s, best.offset_s + half_interval_s),
-        determinable=True,
+        is_determinable=True,
         reason="Maximum speed correlation over all lags, refined by minimum ATE "
         f"({best.rms_m:.3g} m after a similarity alignment, {len(best.time_s)} poses).",
     )
 
 
 def _not_determinable(why: str) -> TimeOffset:
-    return TimeOffset(determinable=False, reason=f"The time offset cannot be estimated: {why}.")
+    return TimeOffset(is_determinable=False, reason=f"The time offset cannot be estimated: {why}.")
 
 
 def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:

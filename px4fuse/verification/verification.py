@@ -51,7 +51,7 @@ ESTIMATE_PATHS = (
     "tuning",
     "clock",
     "ekf2_replay",
-    "why",
+    "difference_steps",
     "findings",
     "loop.closures",
     "loop.corrections",

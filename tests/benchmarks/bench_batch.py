@@ -1,11 +1,10 @@
 """Parallel efficiency and the coordinator's memory of ``px4fuse batch``.
 
 ``python tests/benchmarks/bench_batch.py [FLIGHTS] [WORKERS]`` simulates short flights (default
-200), compares them one after another in one process, and then with so many workers (default 2),
-with the time that they take to start. Efficiency is the time of one process, divided by the
-time of the workers and their number; on a machine that does other work besides, the CPU time says
-more: that of the one process divided by that of coordinator and workers together, per log. Prints
-both, the coordinator's memory after each tenth of the run, and what one worker-hour does.
+200), compares them in one process, and then with workers (default 2), including their start.
+Efficiency is the time of one process divided by time and number of the workers; on a computer with
+other load, the ratio of CPU times per log is more exact. Prints both, the coordinator's memory
+after each tenth of the run, and the number of logs per worker-hour.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ WARM = 2
 
 
 def main(count: int, workers: int) -> None:
-    """Measure and print."""
+    """Measure and print the efficiency."""
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch, "logs")
@@ -53,7 +52,7 @@ def main(count: int, workers: int) -> None:
             if what.startswith("comparing") and done % max(1, of // 10) == 0:
                 memory.append(here.memory_info().rss / 1e6)
 
-        # of the coordinator and of children that have ended
+        # CPU time of the coordinator and of ended workers
         cpu, begun = sum(os.times()[:4]), time.perf_counter()
         run([str(folder)], Path(scratch, "out"), workers=workers, progress=look)
         many_s, many_cpu_s = time.perf_counter() - begun, sum(os.times()[:4]) - cpu

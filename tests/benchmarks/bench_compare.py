@@ -1,8 +1,8 @@
-"""Speed of ``px4fuse compare`` as a whole process, against the floor that no tool can go below.
+"""Speed of ``px4fuse compare`` as a process, compared with the time of its libraries.
 
-The floor is what the same libraries need for the same file and the same number of pages: pyulog
-reads the same topics, matplotlib saves empty pages. Both run in turn, so that the ratio holds on a
-machine whose speed drifts. Nothing here can fail: run it, read it.
+The reference is the time for the same file and number of pages: pyulog reads the same topics,
+matplotlib saves empty pages. Both run in turn, so the ratio does not depend on the load of the
+computer. The benchmark prints times and asserts nothing.
 
     python tests/benchmarks/bench_compare.py [RUNS] [--log FULL.ulg] [--px4 SCRIPT]
 
@@ -14,10 +14,10 @@ shipped here::
     git -C PX4-Autopilot sparse-checkout set Tools/ecl_ekf
 
 Then ``--px4 PX4-Autopilot/Tools/ecl_ekf/process_logdata_ekf.py``; it needs pyulog, numpy and
-matplotlib, reads logs of its own version of PX4 (check out that tag) which hold the innovations'
-flags, runs on a copy of the log and writes its PDF beside that: twenty pages of some fifty panels.
-With matplotlib 3.11 it draws an empty panel on each page besides, a fifth of its time. Without it a
-stand-in does about as much: pyulog reads every topic, matplotlib draws twenty pages, fifty panels.
+matplotlib, and reads logs of its PX4 version (check out that tag) with innovation flags. It runs on
+a copy of the log and writes a PDF of 20 pages with about 50 panels. With matplotlib 3.11 it also
+draws an empty panel on each page, a fifth of its time. Without it a script with similar work is
+used: pyulog reads every topic, matplotlib draws 20 pages with 50 panels.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ with PdfPages(sys.argv[2]) as pdf:
 
 
 def print_ratio(name: str, ours: list[str], peer: list[str], runs: int, more: str = "") -> None:
-    """Run both in turn, and print the medians of their ratios."""
+    """Run both in turn, and print the median of the ratios."""
     pairs = [[measured(ours), measured(peer)] for _ in range(runs)]
     for what in ("wall", "cpu"):
         a, b = np.transpose([[getattr(side, f"{what}_s") for side in both] for both in pairs])

@@ -1,7 +1,7 @@
-"""How well EKF2's model agrees with the log, what it says of other parameters, and its speed.
+"""Agreement of the EKF2 model with logs, predictions with other parameters, and speed.
 
-Prints the tables; what is not a time is asserted. Flights are those of the further logs, which are
-not part of the project; without them, the sample flight alone.
+Prints tables, and asserts all numbers except times. Flights are the shared logs, which are not part
+of the project; without them, the sample flight only.
 
     python tests/benchmarks/bench_ekf2.py [FOLDER] [--write]
 
@@ -40,7 +40,7 @@ def opened(path: Path) -> Model | Unavailable:
 
 
 def agreement_table(paths: list[Path]) -> dict[str, Model]:
-    """Open and judge every flight's model; print why there is none."""
+    """Open and evaluate the model of each flight; print the reason if there is none."""
     models = {}
     for path in paths:
         model = opened(path)
@@ -65,7 +65,7 @@ def judge_agreement(name: str, model: Model) -> None:
             assert axis.velocity_rms_difference_m_s < 0.02, (name, aid)
     for axis in agreement.axes.values():
         if OVERCONFIDENT in name:
-            off = agreement.rejected_share_replayed - agreement.rejected_share_logged
+            off = agreement.rejected_fraction_replayed - agreement.rejected_fraction_logged
             assert abs(off) < 0.03, name
             assert abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) < 0.10, name
             continue
@@ -85,9 +85,9 @@ def judge_agreement(name: str, model: Model) -> None:
 
 
 def waterfalls(models: dict[str, Model]) -> dict[str, float]:
-    """Print and judge the walk of every flight: shares of the mean square, both axes together.
+    """Print and check the steps of each flight: shares of the mean square over both axes.
 
-    Returns what is left of each.
+    Returns the unexplained share of each flight.
     """
     unexplained = {}
     steps = (*STEPS[:-2], FIELD_STEP, VELOCITY_STEP, FLOW_STEP, *STEPS[-2:])
@@ -99,7 +99,7 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
         total = sum(axis.position_mean_square_m2 for axis in axes)
         for step in (step for axis in axes for step in axis.steps):
             bars[step.name] += step.position_mean_square_m2 / total
-        left = sum(axis.position_left_mean_square_m2 for axis in axes) / total
+        left = sum(axis.unexplained_mean_square_m2 for axis in axes) / total
         told = " | ".join(f"{share:.1%}" for share in (*bars.values(), left))
         print(f"{name} | {np.sqrt(total):.3f} | {told}")
         assert abs(sum(bars.values()) + left - 1.0) < 1e-9, name
@@ -109,7 +109,7 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
 
 
 def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
-    """Agreement on every flight as the documentation has it."""
+    """Return the table of agreement for the documentation."""
     lines = [
         "| flight | innovations | correlation (north / east) | S replayed / logged, 5 to 95 % | "
         "rejected (replayed / logged) | published position, RMS difference (m, north / east) | "
@@ -121,7 +121,7 @@ def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
         cells = (
             name, a.samples, " / ".join(f"{axis.innovation_correlation:.4f}" for axis in axes),
             f"{min(x.s_ratio_p5 for x in axes):.3f} to {max(x.s_ratio_p95 for x in axes):.3f}",
-            f"{a.rejected_share_replayed:.1%} / {a.rejected_share_logged:.1%}",
+            f"{a.rejected_fraction_replayed:.1%} / {a.rejected_fraction_logged:.1%}",
             " / ".join(f"{axis.position_rms_difference_m:.3f}" for axis in axes),
             f"{left[name]:.1%}", height_cell(a),
         )  # fmt: skip
@@ -130,7 +130,7 @@ def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
 
 
 def height_cell(agreement: Agreement) -> str:
-    """Of a flight whose heights are replayed."""
+    """Return the table cell of a flight with replayed heights."""
     heights = [*agreement.gnss_hgt.values(), *agreement.baro_hgt.values()]
     if not heights or agreement.doubtful:
         return "from the log"
@@ -139,7 +139,7 @@ def height_cell(agreement: Agreement) -> str:
 
 
 def in_page() -> str:
-    """The table that the documentation has."""
+    """Return the table in the documentation."""
     return PAGE.read_text(encoding="utf-8").split(BEGIN)[1].split(END)[0].strip()
 
 
@@ -156,10 +156,10 @@ def horizontal_rmse(summary: Summary) -> float:
 
 
 def counterfactuals(models: dict[str, Model]) -> None:
-    """Print and judge what other parameters would have done, against the truth."""
+    """Print and check predictions with other parameters, against ground truth."""
     clean = "v1.16.1_aisle_nominal"
     print("\nwhat if | mean NIS north, east | rejected | RMSE to truth m (as flown)")
-    # the errors are those of an independent replay, or next to those of a flight without the fault
+    # expected errors: of an independent replay, or similar to a flight without the fault
     for name, change, expected_m in (
         ("v1.16.1_aisle_overconfident", {"EKF2_EVP_NOISE": 0.1}, None),
         ("v1.16.1_aisle_clock_late", {"EKF2_EV_DELAY": 250.0}, clean),
@@ -177,12 +177,12 @@ def counterfactuals(models: dict[str, Model]) -> None:
         nis = [axis.nis_mean for axis in summary.axes.values()]
         rmse = horizontal_rmse(summary)
         print(
-            f"{name} {change} | {nis[0]:.2f}, {nis[1]:.2f} | {summary.rejected_share:.1%} | "
+            f"{name} {change} | {nis[0]:.2f}, {nis[1]:.2f} | {summary.rejected_fraction:.1%} | "
             f"{rmse:.3f} ({horizontal_rmse(made.logged):.3f})"
         )
         if "EKF2_EVP_NOISE" in change:
             assert all(0.9 <= value <= 1.1 for value in nis), nis
-            assert summary.rejected_share == 0.0
+            assert summary.rejected_fraction == 0.0
         elif isinstance(expected_m, float):
             assert abs(summary.position_rmse_to_truth_m / expected_m - 1.0) < 0.06, (name, summary)
         elif expected_m in models:
@@ -192,7 +192,7 @@ def counterfactuals(models: dict[str, Model]) -> None:
 
 
 def cpu_s(work: Callable[[], object], runs: int = 5) -> float:
-    """Least CPU time over some runs: what else the machine does only adds to it."""
+    """Return the least CPU time of several runs, because other load only increases it."""
     return min(timeit.repeat(work, number=1, repeat=runs, timer=time.process_time))
 
 
@@ -215,7 +215,7 @@ def speed(flight: Flight, model: Model) -> None:
 
 
 def flights(folders: list[Path]) -> list[Path]:
-    """The logs of some folders, by name; the sample flight where there are none."""
+    """Return the logs of folders, by name; without logs, the sample flight."""
     return [log for folder in folders for log in sorted(folder.glob("*.ulg"))] or [SAMPLE]
 
 

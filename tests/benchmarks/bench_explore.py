@@ -1,8 +1,8 @@
-"""How soon the page of explore is redrawn after a slider moves, in Chromium without a GPU.
+"""Time to redraw the explore page after a slider moves, in Chromium without a GPU.
 
-Of the sample flight, two minutes long, in a window of 1400 by 900: from the slider's event until
-the frame is over in which the plots were painted, at every knob; the replay alone; and the page's
-size. Nothing here can fail: run it, read it.
+Sample flight of two minutes in a window of 1400 by 900: time from the slider event to the end of
+the frame with the new plots, for each setting; time of the replay; and size of the page. Prints
+times and asserts nothing.
 
     python tests/benchmarks/bench_explore.py
 """

@@ -1,10 +1,10 @@
-"""Seconds per report and memory of grading a class, its logs beside it.
+"""Time per report and memory of grading a class with its logs.
 
 ``python tests/benchmarks/bench_grade.py [REPORTS]`` makes up to 20 short simulated flights and
-their reports, grades them, and prints the time per report, against the time that the same analysis
-takes without grading, and the most memory that the grading process and any one of its workers
-took. Then it hands them in under other names until there are REPORTS (default 300), with the
-verification of each as an earlier run would have kept it, and prints how long another rubric takes.
+their reports, grades them, and prints the time per report, compared with the time of the analysis
+without grading, and the peak memory of the grading process and of a worker. Then it copies them
+under other names to REPORTS (default 300) files with cached verifications, and prints the time for
+another rubric.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ FLIGHTS = 20
 
 
 def make(job: tuple[int, Path, Path]) -> float:
-    """Simulate one flight and make its report; seconds that the report took."""
+    """Simulate one flight and make its report; return the time of the report (s)."""
     seed, logs, reports = job
     log = logs / f"{seed}.ulg"
     flight = simulate(Scenario(passes=2, length_m=8.0, seed=seed))
@@ -67,7 +67,7 @@ def make(job: tuple[int, Path, Path]) -> float:
 
 
 def graded(folder: Path, reports: Path, rubric: Path) -> dict[str, float]:
-    """Grade a folder of reports in a process of its own."""
+    """Grade a folder of reports in a new process."""
     script = folder / "grade_them.py"
     script.write_text(GRADE)
     paths = (script, reports, folder / "logs", folder / "class", rubric)
@@ -78,7 +78,7 @@ def graded(folder: Path, reports: Path, rubric: Path) -> dict[str, float]:
 
 
 def hand_in_again(folder: Path, count: int) -> Path:
-    """The reports under other names and with other bytes, each with its record."""
+    """Copy reports with other names and bytes, each with its cached record."""
     again = folder / "again"
     made = sorted((folder / "reports").glob("*.pdf"))
     records = folder / "class" / "records"
@@ -95,7 +95,7 @@ def hand_in_again(folder: Path, count: int) -> Path:
 
 
 def main() -> None:
-    """Make, grade, print."""
+    """Make reports, grade them and print times."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 300
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with tempfile.TemporaryDirectory() as name:
@@ -106,7 +106,7 @@ def main() -> None:
         with ProcessPoolExecutor(os.cpu_count()) as pool:
             jobs = [(seed, logs, reports) for seed in range(min(count, FLIGHTS))]
             taken = list(pool.map(make, jobs))
-        alone = sum(taken[4:]) / len(taken[4:])  # the first ones import
+        alone = sum(taken[4:]) / len(taken[4:])  # the first reports include imports
         first, other = folder / "first.toml", folder / "other.toml"
         first.write_text(rubric_text(), encoding="utf-8")
         other.write_text(rubric_text().replace("points = 10", "points = 12"), encoding="utf-8")

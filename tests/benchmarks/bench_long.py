@@ -1,8 +1,8 @@
 """Time and memory of ``compare``, ``tune`` and ``sync`` on flights of 2 to 60 minutes.
 
-The flights are simulated. The floor is what pyulog needs for the same topics: it runs in turn with
-each, so that the ratio holds on a machine whose speed drifts. Nothing here can fail: run it, read
-it. Linux and macOS.
+The flights are simulated. The reference is the time of pyulog for the same topics, which runs in
+turn with each command, so the ratio does not depend on the load of the computer. Prints times and
+asserts nothing. Linux and macOS.
 
     python tests/benchmarks/bench_long.py [MINUTES ...]   # of 2, 10, 23, 27, 60
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from measured import Measured, measured
 
-# Passes of an aisle so long (m), by minutes; 60 minutes are the longest flight that is simulated
+# Number of passes and length of the aisle (m) by minutes; longer flights cannot be simulated
 FLIGHTS = {2: (6, 12), 10: (35, 12), 23: (82, 12), 27: (96, 12), 60: (100, 31)}
 READ = "import sys; from pyulog import ULog; ULog(sys.argv[1], sys.argv[2].split(','))"
 

@@ -1,8 +1,8 @@
-"""Speed and memory of the MAVLink reader, against pymavlink's own reader of the same file.
+"""Speed and memory of the MAVLink reader, compared with pymavlink on the same file.
 
-Both decode every message: ours into columns, pymavlink's ``recv_match`` into one object each. They
-run in turn, so that the ratio holds on a machine whose speed drifts. Nothing here can fail: run it,
-read it.
+Both decode every message: px4fuse into columns, pymavlink's ``recv_match`` into one object each.
+They run in turn, so the ratio does not depend on the load of the computer. Prints times and asserts
+nothing.
 
     python tests/benchmarks/bench_mavlink.py [RUNS] [FILE ...]
 """
@@ -28,8 +28,8 @@ MINUTES = 10
 RATE_HZ = 200
 
 
-def ours(path: Path) -> int:
-    """Frames, and every message type into columns."""
+def read_columns(path: Path) -> int:
+    """Read frames, and decode every message type into columns."""
     from px4fuse.readers.mavlink_frames import message_name, read_frames
 
     frames = read_frames(path.name, path.read_bytes())
@@ -39,7 +39,7 @@ def ours(path: Path) -> int:
     return len(frames)
 
 
-def pymavlinks(path: Path) -> int:
+def read_with_pymavlink(path: Path) -> int:
     from pymavlink import mavutil
 
     link = mavutil.mavlink_connection(str(path), dialect="all", notimestamps=path.suffix != ".tlog")
@@ -52,10 +52,10 @@ def pymavlinks(path: Path) -> int:
 
 
 def synthetic(path: Path) -> Path:
-    """Ten minutes at 200 messages per second, of the made aisle flight."""
+    """Write ten minutes of the simulated aisle flight at 200 messages per second."""
     from mavlink_tools import Aisle
 
-    # 68 messages per second beside the IMU, over a link that keeps their order
+    # 68 messages per second in addition to the IMU, over a link that keeps their order
     aisle = Aisle(
         seconds=60.0 * MINUTES, imu_hz=RATE_HZ - 68.0,
         delay=lambda rng: 0.002 + rng.exponential(0.0003),
@@ -65,7 +65,7 @@ def synthetic(path: Path) -> Path:
 
 
 def memory(work: Callable[[Path], object], path: Path) -> float:
-    """Peak over the size of the file."""
+    """Return the peak memory divided by the size of the file."""
     tracemalloc.start()
     work(path)
     peak = tracemalloc.get_traced_memory()[1]
@@ -81,9 +81,11 @@ def main() -> None:
         files = [Path(name) for name in sys.argv[2:]] or [LOG]
         files.append(synthetic(Path(folder) / f"{MINUTES}_minutes.tlog"))
         for path in files:
-            count, theirs = ours(path), pymavlinks(path)
-            read_log(path)  # tables that are made once
-            readers = [partial(read, path) for read in (pymavlinks, ours, read_log)]
+            count, theirs = read_columns(path), read_with_pymavlink(path)
+            read_log(path)  # tables that are cached
+            readers = [
+                partial(read, path) for read in (read_with_pymavlink, read_columns, read_log)
+            ]
             took = np.array([[seconds(read) for read in readers] for _ in range(runs)])
             a, b, whole = np.median(took, axis=0)
             ratio = np.median(took[:, 0] / took[:, 1])

@@ -1,8 +1,8 @@
-"""Speed of pose graph optimisation against GTSAM, from the same start to the same tolerances.
+"""Speed of pose graph optimisation compared with GTSAM, with equal start and tolerances.
 
-Both run in turn, so that the ratio holds on a machine whose speed drifts; ours includes finding the
-pattern and its order, GTSAM's its ordering. Then how time grows with the poses of laps of a loop.
-Nothing here can fail: run it, read it. Needs GTSAM and ../shared/pose_graphs.
+Both run in turn, so the ratio does not depend on the load of the computer; both include their
+ordering. Then the time as a function of the number of poses. Prints times and asserts nothing.
+Needs GTSAM and ../shared/pose_graphs.
 
     OMP_NUM_THREADS=1 python tests/benchmarks/bench_pose_graph.py [RUNS] [FILE ...]
 """
@@ -23,7 +23,7 @@ SIZES = (100, 300, 1000, 3000, 10_000)
 
 
 def chain(poses: int):
-    """Laps of 50 poses in space, a closure to the lap before every tenth pose."""
+    """Make laps of 50 poses in space; every tenth pose has a closure to the previous lap."""
     from px4fuse.trajectory.graph import lie
     from px4fuse.trajectory.graph.model import PoseGraph, composed
 

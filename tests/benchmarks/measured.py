@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Measured:
-    """What one run took."""
+    """Times and memory of one run."""
 
     wall_s: float
     cpu_s: float
@@ -21,13 +21,13 @@ class Measured:
 
 
 def measured(command: list[str]) -> Measured:
-    """Run a command; one core each, so that CPU time compares.
+    """Run a command on one core, so that CPU times are comparable.
 
-    Its exit code does not matter: PX4's script ends with an error where it finds an anomaly.
+    The exit code is ignored: PX4's script ends with an error if it finds an anomaly.
     """
     start = time.perf_counter()
     one_core = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    one_core.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package is compiled
+    one_core.pop("PYTHONDONTWRITEBYTECODE", None)  # write bytecode, as for an installed package
     run = subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=one_core
     )
@@ -37,5 +37,5 @@ def measured(command: list[str]) -> Measured:
 
 
 def seconds(work: Callable[[], object], runs: int = 1) -> float:
-    """Median over some runs."""
+    """Return the median time of several runs."""
     return statistics.median(timeit.repeat(work, number=1, repeat=runs))

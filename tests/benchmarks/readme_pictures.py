@@ -1,4 +1,4 @@
-"""Make the README's pictures again, from the pages that its own commands write.
+"""Make the pictures of README from the pages that its commands write.
 
     python tests/benchmarks/readme_pictures.py
 
@@ -24,14 +24,14 @@ from px4fuse.cli import cli
 REPOSITORY = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(REPOSITORY / "tests"))
 
-from browser import BROWSERS  # noqa: E402 - it stands among the tests
+from browser import BROWSERS  # noqa: E402 - module of the tests
 
 WINDOW = "1360,1010"
 REPORTS = REPOSITORY / "reports" / "example"
 AISLE = "compare sample_logs/aisle_uwb.ulg"
 EVALUATE = "evaluate sample_logs/loop_vio.ulg:vio sample_logs/loop_slam.tum"
 DPI, COLOURS, MAX_BYTES = 96, 64, 100_000
-# Head and foot of a page, as shares of its height, are left out; a margin (pixels) stays
+# Head and foot of a page (fractions of its height) are cut off; margin (pixels)
 HEAD, FOOT, MARGIN = 0.045, 0.965, 12
 
 
@@ -69,7 +69,7 @@ PICTURES = (
 
 
 def made(picture: Picture, folder: Path) -> Image.Image:
-    """The picture in full colour; reports are made once."""
+    """Draw the picture in full colour; each report is made once."""
     stem = picture.command.replace("/", "_").replace(" ", "_").replace(":", "_")
     report = folder / f"{stem}.pdf"
     words = shlex.split(picture.command)
@@ -90,7 +90,7 @@ def made(picture: Picture, folder: Path) -> Image.Image:
 
 
 def screenshot(words: list[str], folder: Path) -> Image.Image:
-    """What a web page shows first."""
+    """Take a picture of the first screen of a web page."""
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         raise SystemExit("A picture of a web page requires Chromium on the path.")
@@ -109,18 +109,18 @@ def screenshot(words: list[str], folder: Path) -> Image.Image:
 
 
 def smaller(drawn: Image.Image) -> Image.Image:
-    """A picture as wide as the others."""
+    """Scale a picture to the common width."""
     size = int(drawn.width * 0.7), int(drawn.height * 0.7)
     return drawn.convert("RGB").resize(size, Image.Resampling.LANCZOS)
 
 
 def run(words: list[str]) -> None:
-    """Run one of px4fuse's commands."""
+    """Run a px4fuse command."""
     cli.main(words, standalone_mode=False)
 
 
 def main() -> None:
-    """Write every picture and say how large it is."""
+    """Write every picture and print its size."""
     with tempfile.TemporaryDirectory() as folder:
         for picture in PICTURES:
             target = REPORTS / f"{picture.name}.png"

@@ -1,4 +1,4 @@
-"""Outputs that are aimed at inputs, drawn at random: how many runs change an input (none may).
+"""Random commands whose output path is one of their inputs; no run may change an input.
 
 ``python tests/studies/aimed_outputs.py --count 2000 --seed 1`` draws a command, one of its inputs,
 one of its outputs and a way to it (``tests/aimed.py``), and adds detours (``./``, ``x/../``) and
@@ -26,8 +26,8 @@ TESTS = Path(__file__).resolve().parents[1]
 if str(TESTS) not in sys.path:
     sys.path.insert(0, str(TESTS))
 
-from aimed import Aim, aims, cleared, hashed, made_desk  # noqa: E402
-from conftest import page_of  # noqa: E402
+from aimed import Aim, aims, file_hashes, make_desk, make_empty_folder  # noqa: E402
+from conftest import blank_page  # noqa: E402
 
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import OutputError  # noqa: E402
@@ -36,7 +36,7 @@ WAYS = ("refused", "other error", "written", "changed")
 
 
 def detoured(typed: str, place: Path, rng: random.Random) -> str:
-    """The same path by further links and steps that lead back."""
+    """Return the same path with additional links and detours."""
     for number in range(rng.randrange(3)):
         folder, name = os.path.split(typed.rstrip(os.sep))
         match rng.randrange(4):
@@ -49,20 +49,20 @@ def detoured(typed: str, place: Path, rng: random.Random) -> str:
                 link.symlink_to(Path(typed).absolute())
                 typed = str(link)
             case 3 if os.path.realpath(os.path.relpath(typed)) == os.path.realpath(typed):
-                typed = os.path.relpath(typed)  # it leaves out "x/..", also where x is a link
+                typed = os.path.relpath(typed)  # it removes "x/..", also if x is a link
     return typed
 
 
 def outcome(aim: Aim, desk: Path, place: Path, rng: random.Random, before: object) -> str:
-    """Run one aim; "" where there is no such way."""
-    arguments = aim.arguments(desk, cleared(place))
+    """Run one aim and return its outcome; "" if the way is not possible."""
+    arguments = aim.arguments(desk, make_empty_folder(place))
     if arguments is None:
         return ""
     *rest, target = arguments
     if not target.endswith(".pdf") or aim.way != "beside":
         target = detoured(target, place, rng)
     result = CliRunner().invoke(cli, [*rest, target])
-    if hashed(desk) != before:
+    if file_hashes(desk) != before:
         return "changed"
     if isinstance(result.exception, OutputError):
         return "refused"
@@ -70,16 +70,19 @@ def outcome(aim: Aim, desk: Path, place: Path, rng: random.Random, before: objec
 
 
 def main() -> None:
-    """Draw, run and print the table."""
+    """Draw and run aims, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     rng, every, begin = random.Random(given.seed), aims(), time.monotonic()
     counts: dict[str, Counter[str]] = {aim.command: Counter() for aim in every}
-    with tempfile.TemporaryDirectory() as folder, mock.patch("px4fuse.report.pdf.render", page_of):
-        desk = made_desk(Path(folder, "desk"))
-        before = hashed(desk)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        mock.patch("px4fuse.report.pdf.render", blank_page),
+    ):
+        desk = make_desk(Path(folder, "desk"))
+        before = file_hashes(desk)
         os.chdir(desk)
         done = 0
         while done < given.count:

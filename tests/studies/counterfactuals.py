@@ -1,11 +1,11 @@
-"""Whether what px4fuse predicts of EKF2 with another setting is what EKF2 does when it is flown.
+"""Predictions of EKF2 with another parameter, compared with flights that use it.
 
-``python tests/studies/counterfactuals.py [SEEDS] [outdoor]`` flies pairs of simulated flights that
-differ in one parameter of EKF2 alone (the same seed), predicts the second from the first, and
-prints for each pair the predicted and the flown mean NIS, rejected share and position error, and at
-the end how many were available, steady and right: NIS and error within 10 %, rejections within 3
-points. EKF2 in these flights is px4fuse's model, so that the study tests the way from a log to the
-prediction, not the model.
+``python tests/studies/counterfactuals.py [SEEDS] [outdoor]`` simulates pairs of flights that
+differ in one EKF2 parameter only (same seed), predicts the second from the first, and prints for
+each pair the predicted and the flown mean NIS, rejected share and position error. At the end it
+prints how many were available, predictable and correct: NIS and error within 10 %, rejections
+within 3 points. EKF2 in these flights is px4fuse's model, so the study tests the path from a log to
+the prediction, not the model.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Kind, make_scenario
 
 NIS_WITHIN, REJECTED_WITHIN, ERROR_WITHIN = 0.10, 0.03, 0.10
-# Of a mistake of ``simulate``: PX4's parameter, what it is without the mistake, what is flown, and
-# how many of the parameter's units one of the mistake's is
+# By mistake of ``simulate``: PX4 parameter, correct value, sizes of the mistake, and the factor
+# from the unit of the mistake to that of the parameter
 KNOBS: dict[Kind, dict[str, tuple[str, float, tuple[float, ...], float]]] = {
     "aisle": {
         "ekf2-noise": ("EKF2_EVP_NOISE", 0.1, (0.02, 0.03, 0.05, 0.2, 0.5, 1.0), 1.0),
         "ekf2-delay": ("EKF2_EV_DELAY", 0.0, (0.05, 0.1, 0.175, 0.25), 1e3),
         "ekf2-gate": ("EKF2_EVP_GATE", 5.0, (1.0, 1.5, 2.0, 3.0, 10.0, 50.0), 1.0),
     },
-    # the receiver states 0.4 m, below which the parameter changes nothing
+    # the receiver reports 0.4 m; smaller values of the parameter have no effect
     "outdoor": {
         "ekf2-noise": ("EKF2_GPS_P_NOISE", 0.4, (0.6, 1.0, 2.0), 1.0),
         "ekf2-delay": ("EKF2_GPS_DELAY", 110.0, (0.0, 0.05, 0.2, 0.25), 1e3),
         "ekf2-gate": ("EKF2_GPS_P_GATE", 5.0, (1.0, 1.5, 2.0, 3.0, 10.0), 1.0),
     },
 }
-# Kind and seed, what was flown first and then, as ``--mistake`` takes it, and what is predicted
+# Kind, seed, mistakes of the first and the second flight, predicted parameter and its value
 Pair = tuple[Kind, int, str, str, str, float]
 
 
 def pairs(seeds: int, kind: Kind = "aisle") -> Iterator[Pair]:
-    """From the right setting to each wrong one, and back."""
+    """Yield pairs from the correct setting to each wrong one, and back."""
     for seed in range(1, seeds + 1):
         for mistake, (name, right, values, per_unit) in KNOBS[kind].items():
             for value in values:
@@ -52,19 +52,19 @@ def pairs(seeds: int, kind: Kind = "aisle") -> Iterator[Pair]:
 
 
 def opened(kind: Kind, seed: int, mistake: str) -> Model | Unavailable:
-    """EKF2 as flown with a mistake, made ready for replays."""
+    """Open the EKF2 model of a flight with a mistake."""
     scenario = make_scenario(kind, seed=seed, passes=3)
     return open_model(simulate_flight(scenario, parse((mistake,) if mistake else ())))
 
 
 def flown(kind: Kind, seed: int, mistake: str) -> WhatIf | Unavailable:
-    """EKF2 as flown with a mistake, replayed."""
+    """Replay EKF2 of a flight with a mistake."""
     model = opened(kind, seed, mistake)
     return model if isinstance(model, Unavailable) else what_if(model, [])
 
 
 def tried(pair: Pair) -> tuple[Pair, str, tuple[float, ...]]:
-    """Verdict on one pair, and predicted and flown NIS, rejected share and position error (m)."""
+    """Return the verdict on a pair, and predicted and flown NIS, rejected share and RMSE (m)."""
     kind, seed, first, then, name, value = pair
     model = opened(kind, seed, first)
     found = model if isinstance(model, Unavailable) else what_if(model, [{name: value}])
@@ -78,13 +78,14 @@ def tried(pair: Pair) -> tuple[Pair, str, tuple[float, ...]]:
     assert not isinstance(errors_m[0], Unavailable)
     assert not isinstance(errors_m[1], Unavailable)
     numbers = (
-        predicted.nis_mean, real.nis_mean, predicted.rejected_share, real.rejected_share, *errors_m
+        predicted.nis_mean, real.nis_mean, predicted.rejected_fraction, real.rejected_fraction,
+        *errors_m
     )  # fmt: skip
-    if not predicted.steady:
+    if not predicted.is_predictable:
         return pair, "chaotic", numbers
     near = abs(predicted.nis_mean / real.nis_mean - 1.0) <= NIS_WITHIN
     near &= abs(errors_m[0] / errors_m[1] - 1.0) <= ERROR_WITHIN
-    near &= abs(predicted.rejected_share - real.rejected_share) <= REJECTED_WITHIN
+    near &= abs(predicted.rejected_fraction - real.rejected_fraction) <= REJECTED_WITHIN
     return pair, "right" if near else "WRONG", numbers
 
 

@@ -1,9 +1,9 @@
-"""False-alarm rates and power of the detectors, measured on simulated flights.
+"""False alarm and detection rates of the detectors, measured on simulated flights.
 
-``python tests/studies/detector_rates.py`` measures them again and rewrites ``rates.csv`` beside it;
-it says how long it will take. ``--clean`` and
-``--faulty`` give other numbers of flights, ``--only TEXT`` prints the rows of the scenarios and
-findings whose name holds it, and writes nothing.
+``python tests/studies/detector_rates.py`` measures them again and rewrites ``rates.csv`` in its
+folder; it prints the expected duration. ``--clean`` and ``--faulty`` set the numbers of flights,
+``--only TEXT`` prints the rows of scenarios and findings whose name contains TEXT, and writes
+nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scipy.stats import binomtest
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import estimate_frame_rotation, noises_and_clock
+from px4fuse.comparison.estimates import estimate_frame_rotation, estimate_noises_and_clock
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, find_loop
@@ -40,11 +40,11 @@ CLEAN = "none"
 CLEAN_FLIGHTS, FAULTY_FLIGHTS = 50, 20
 # Faulty flights have other seeds than clean ones
 FAULTY_SEED = 10_000
-ALWAYS = ("ekf2_unavailable", "ekf2_is_a_model", "loop_end_assumed")
+ALWAYS = ("ekf2_not_logged", "ekf2_simulated", "loop_landing_assumed")
 NOT_ASKED = Unavailable("EKF2 replay", "the condition is not about EKF2", "Fly with EKF2.")
-# Beginnings of the findings that are read from what EKF2 logs
-OF_EKF2 = ("ekf2_", "source_stamps_of_arrival")
-# Options of ``px4fuse simulate`` that a scenario may have, and their fields
+# Prefixes of findings that need the log of EKF2
+OF_EKF2 = ("ekf2_", "source_timestamps_are_arrival_times")
+# Options of ``px4fuse simulate`` for scenarios, and their fields
 OPTIONS = {
     "--kind": "kind", "--passes": "passes", "--pause": "pause_s", "--yaw": "yaw",
     "--uwb-rate": "uwb_rate_hz", "--sigma-uwb": "sigma_uwb_m",
@@ -53,16 +53,16 @@ OPTIONS = {
 
 @dataclass(frozen=True)
 class Flown:
-    """One kind of flight without mistakes.
+    """Scenario: a type of flight without mistakes.
 
     Attributes
     ----------
     options : str
-        As ``px4fuse simulate`` takes them.
+        Options of ``px4fuse simulate``.
     settings : Settings
-        What such flights ask for: the IMU's white noise with what bias and attitude errors add.
+        Best settings: IMU white noise plus the effect of bias and attitude errors.
     true : tuple of str
-        Findings that are no false alarms on it.
+        Findings that are not false alarms on this flight.
     """
 
     options: str
@@ -81,8 +81,8 @@ SCENARIOS: Mapping[str, Flown] = MappingProxyType({
     "0.30 m": Flown("--sigma-uwb 0.3", Settings(0.27, 0.30)),
     "hover": Flown("--passes 2 --pause 30", Settings(0.27, 0.10)),
     "yaw follows": Flown("--yaw follow", Settings(0.27, 0.10)),
-    "loop, VIO": Flown("--kind loop", Settings(0.27, 0.01), ("errors_larger_than_claimed",)),
-    # faster, so that an attitude that is off weighs more
+    "loop, VIO": Flown("--kind loop", Settings(0.27, 0.01), ("error_exceeds_reported_sigma",)),
+    # faster, so an attitude error has a larger effect
     "outdoors, GNSS": Flown("--kind outdoor", Settings(0.35, 0.40)),
 })  # fmt: skip
 RIGHT = SCENARIOS[DEFAULT].settings
@@ -90,10 +90,10 @@ RIGHT = SCENARIOS[DEFAULT].settings
 
 @dataclass(frozen=True)
 class Condition:
-    """A mistake of a stated size, and the finding that must name it.
+    """Mistake of a given size, and the finding that must report it.
 
     ``typed`` is the ``condition`` of the table: options of ``px4fuse simulate``, first those of
-    the scenario where it is not the usual one, or a field of ``Settings`` with its value.
+    the scenario if it is not the default, or a field of ``Settings`` with its value.
     """
 
     finding: str
@@ -101,13 +101,13 @@ class Condition:
 
     @property
     def scenario(self) -> str:
-        """Name of the scenario that the options are of, the usual one where there are none."""
+        """Name of the scenario with these options; without options, the default."""
         options = " ".join(self._options)
         return next(name for name, flown in SCENARIOS.items() if flown.options == options)
 
     @property
     def _words(self) -> list[str]:
-        """What is typed besides the mistakes."""
+        """Options and settings without the mistakes."""
         return re.sub(r"--mistake \S+", "", self.typed).split()
 
     @property
@@ -116,24 +116,24 @@ class Condition:
 
     @property
     def mistakes(self) -> tuple[str, ...]:
-        """As ``px4fuse simulate --mistake`` takes them."""
+        """Arguments of ``px4fuse simulate --mistake``."""
         return tuple(re.findall(r"--mistake (\S+)", self.typed))
 
     @property
     def ekf2(self) -> bool:
-        """Whether EKF2 flies along: not where a mistake is about something else, for speed."""
-        outdoors = "outdoor" in self._options  # GNSS is a source where EKF2 fused it
+        """True if EKF2 is simulated, which is slow: only if the finding needs it."""
+        outdoors = "outdoor" in self._options  # GNSS is a source only if EKF2 fuses it
         return outdoors or not self.finding or self.finding.startswith(OF_EKF2)
 
     @property
     def settings(self) -> Settings:
-        """The right ones, with those of this condition in their place."""
+        """Best settings of the scenario, with those of this condition."""
         pairs = (word.split("=") for word in self._words if "=" in word)
         given: dict[str, Any] = {name: float(value) for name, value in pairs}
         return replace(SCENARIOS[self.scenario].settings, **given)
 
     def flight(self, seed: int) -> Scenario:
-        """What is flown."""
+        """Scenario of the flight with this seed."""
         words = self._options
         given: dict[str, Any] = {}
         for option, value in zip(words[::2], words[1::2], strict=True):
@@ -145,11 +145,11 @@ class Condition:
 
 
 def rates() -> pd.DataFrame:
-    """The table as it was measured last."""
+    """Read the table of the last measurement."""
     return pd.read_csv(TABLE, keep_default_na=False)
 
 
-# A new one is a row of the table without numbers
+# A new condition is a row of the table without numbers
 CONDITIONS = tuple(
     Condition(row.finding, row.condition) for row in rates().itertuples() if row.condition != CLEAN
 )
@@ -157,39 +157,39 @@ CONDITIONS = tuple(
 
 @dataclass(frozen=True)
 class Job:
-    """One flight, and the conditions that are judged on it: they differ in settings only."""
+    """One flight, and its conditions, which differ in settings only."""
 
     seed: int
     conditions: tuple[Condition, ...]
 
 
 def clean(scenario: str) -> Condition:
-    """The condition of flights without a mistake."""
+    """Return the condition of flights without a mistake."""
     return Condition("", SCENARIOS[scenario].options)
 
 
 def found(seed: int, condition: Condition | None = None) -> tuple[str, ...]:
-    """Findings on one simulated flight, most severe first, each before what it brings with it.
+    """Return the findings on one simulated flight, most severe first, causes before consequences.
 
-    Those that always are there are left out.
+    Findings that every flight has are left out.
 
     Parameters
     ----------
     condition : Condition, optional
-        None for a clean flight of the usual scenario.
+        None for a clean flight of the default scenario.
     """
     return _fly(Job(seed, (condition or clean(DEFAULT),)))[0]
 
 
 def _fly(job: Job) -> list[tuple[str, ...]]:
-    """Findings for each condition of one flight."""
+    """Return the findings for each condition of one flight."""
     first = job.conditions[0]
     scenario = first.flight(job.seed)
     mistakes = parse(first.mistakes)
     named: list[tuple[str, ...]] = []
     of_loop: tuple[str, ...] = ()
     if scenario.kind == "loop":
-        # the loop without the truth, which would tell where it landed
+        # the loop without ground truth, which would show the landing
         flight = simulate_flight(replace(scenario, truth=False), mistakes)
         loop = analyse(LoopSource(trajectory_of(flight, "vio"), flight))
         of_loop = tuple(found.id for found in find_loop(loop))
@@ -200,7 +200,7 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
     for condition in job.conditions:
         compared = explained
         if condition.settings != first.settings:
-            # the most likely noises and the clock's offset do not depend on the chosen ones
+            # maximum-likelihood noises and time offset do not depend on the settings
             again = compare(flight, condition.settings, axes=("north", "east"))
             compared = replace(explained, **vars(again))
         ids = tuple(found.id for found in find(compared))
@@ -209,13 +209,13 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
 
 
 def _explain(flight: Flight, condition: Condition) -> Analysis:
-    """What the detectors look at, without why EKF2 differs, for speed."""
+    """Make the analysis for the detectors, without the steps from KF to EKF2, which are slow."""
     comparison = compare(flight, condition.settings, axes=("north", "east"))
-    tuning, clock = noises_and_clock(comparison)
+    tuning, clock = estimate_noises_and_clock(comparison)
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
     heading = estimate_frame_rotation(comparison, tuning, clock)
     return Analysis(
-        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, why={},
+        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, difference_steps={},
         loop=analyse_flight_loop(flight), heading=heading,
     )  # fmt: skip
 
@@ -231,7 +231,7 @@ def jobs(
     scenarios: Iterable[str] = tuple(SCENARIOS),
     conditions: Iterable[Condition] = CONDITIONS,
 ) -> list[Job]:
-    """All flights: a scenario's flights without mistakes, and each mistake's.
+    """Return all flights: those without mistakes by scenario, and those of each mistake.
 
     Conditions that differ in settings only share their flights.
     """
@@ -245,18 +245,18 @@ def jobs(
 
 
 def measure(flown: list[Job]) -> pd.DataFrame:
-    """Fly every job, on all cores.
+    """Run every job, on all cores.
 
     Returns
     -------
     DataFrame
         ``finding``, ``scenario``, ``condition`` ("none" for flights without a mistake: the rate is
         that of false alarms), ``flights``, ``rate``, its 95 % interval ``low``, ``high`` (Clopper
-        and Pearson 1934), and ``first``, the share in which that finding came first.
+        and Pearson 1934), and ``first``, the share of flights with that finding first.
     """
     processes = os.cpu_count() or 1
     with ProcessPoolExecutor(processes) as pool:
-        # one of each kind tells how long all will take
+        # one flight of each kind, to estimate the duration
         kinds = {job.conditions[0].scenario: job for job in flown}
         started = dict(zip(kinds, pool.map(_seconds, kinds.values()), strict=True))
         total = sum(started[job.conditions[0].scenario] for job in flown) / processes
@@ -295,7 +295,7 @@ def _row(name: str, scenario: str, condition: str, own: list[tuple[str, ...]]) -
 
 
 def rate(hits: int, of: int) -> dict[str, float]:
-    """A share with its 95 % interval (Clopper and Pearson 1934)."""
+    """Return a share with its 95 % interval (Clopper and Pearson 1934)."""
     low, high = binomtest(hits, of).proportion_ci()
     return {"rate": round(hits / of, 4), "low": round(float(low), 4), "high": round(float(high), 4)}
 

@@ -1,9 +1,9 @@
-"""What forms earn that nobody thought about, on assigned flights.
+"""Points of guessed answer forms on assigned flights.
 
-``python tests/studies/form_guesses.py`` draws assignments as ``simulate --assignment`` does, takes
-the right answers of each, and prints the mean share of the points of: forms filled in at random,
-"none" everywhere, the constant form that earns most (the commonest mistake with the commonest
-answers), and forms filled in with the truth. ``--students`` gives another number of flights.
+``python tests/studies/form_guesses.py`` draws assignments like ``simulate --assignment`` and prints
+the mean share of the points of random forms, of "none" everywhere, of the best constant form (the
+most frequent mistake with the most frequent answers), and of correct forms. ``--students`` sets the
+number of flights.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from statistics import fmean
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.answer_form import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, ClaimedMistake
+from px4fuse.answer_form import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, StudentMistake
 from px4fuse.assignment.assignment import fly
 from px4fuse.assignment.roster import Person
 from px4fuse.assignment.truth import FormTruth, TrueMistake
@@ -29,7 +29,7 @@ GUESSES = 20
 
 
 def truth(number: int) -> FormTruth:
-    """The right answers to the flight of one student of a mixed class."""
+    """Return the correct answers for the flight of one student of a mixed class."""
     student = Person(f"s{number}")
     _, answer = fly(SECRET, student, "mixed")
     assert answer.form is not None
@@ -37,11 +37,11 @@ def truth(number: int) -> FormTruth:
 
 
 def at_random(rng: np.random.Generator) -> Answers:
-    """A form that knows what can be said and nothing else."""
+    """Return a form with random valid answers."""
     named = [name for name in MISTAKES if name != "none"]
     kinds = rng.choice(named, int(rng.integers(1, 4)), replace=False)
     claims = tuple(
-        ClaimedMistake(
+        StudentMistake(
             str(kind), float(rng.lognormal(-1.0, 1.5)), when="whole flight",
             parameter=str(rng.choice(list(CURES))), value=float(rng.lognormal(-1.0, 1.5)),
             panel=str(rng.choice(PANELS)),
@@ -50,8 +50,8 @@ def at_random(rng: np.random.Generator) -> Answers:
     )  # fmt: skip
     return Answers(
         log_sha256=SHA256,
-        mistakes=(ClaimedMistake("none"),) if rng.random() < 1.0 / 3.0 else claims,
-        verdict_ours=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
+        mistakes=(StudentMistake("none"),) if rng.random() < 1.0 / 3.0 else claims,
+        verdict_kf=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         ekf2_did=(str(rng.choice(EKF2_DID)),),
         quantities=tuple(rng.normal(0.0, 0.3, 3).tolist()),
@@ -59,15 +59,15 @@ def at_random(rng: np.random.Generator) -> Answers:
 
 
 def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
-    """The same for everybody: a mistake of the likeliest sizes, and the commonest of all else."""
+    """Yield constant forms: one mistake of several sizes, and the most frequent other answers."""
 
     def common(values: list[str]) -> str:
         return Counter(values).most_common(1)[0][0]
 
     blank = Answers(
         log_sha256=SHA256,
-        mistakes=(ClaimedMistake("none"),),
-        verdict_ours=common([one.ours.verdict for one in truths]),  # type: ignore[arg-type]
+        mistakes=(StudentMistake("none"),),
+        verdict_kf=common([one.kf.verdict for one in truths]),  # type: ignore[arg-type]
         verdict_ekf2=common([one.ekf2.verdict for one in truths]),  # type: ignore[arg-type]
         ekf2_did=(common([said for one in truths for said in one.ekf2_did]),),
     )
@@ -80,7 +80,7 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
     for size in np.quantile(sizes, np.arange(0.05, 1.0, 0.1)):
         cure = cures(TrueMistake(kind, size, size, size), truths[0])[0][0]
         for from_s in (None, float(np.median(begins))):
-            claim = ClaimedMistake(
+            claim = StudentMistake(
                 kind, float(size), when="whole flight" if from_s is None else "", from_s=from_s,
                 parameter=cure, panel=panels(kind)[0],
             )  # fmt: skip
@@ -88,7 +88,7 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
 
 
 def right(one: FormTruth) -> Answers:
-    """The truth, as a student would write it."""
+    """Return the correct form."""
     claims = []
     for wrong in one.mistakes:
         parameter, (low, high), _ = cures(wrong, one)[0]
@@ -96,7 +96,7 @@ def right(one: FormTruth) -> Answers:
         value = None if np.isinf(low) else value
         whole = wrong.from_s is None and wrong.until_s is None
         claims.append(
-            ClaimedMistake(
+            StudentMistake(
                 wrong.kind, wrong.size, when="whole flight" if whole else "", parameter=parameter,
                 from_s=wrong.from_s, until_s=wrong.until_s, value=value,
                 panel=panels(wrong.kind)[0],
@@ -104,8 +104,8 @@ def right(one: FormTruth) -> Answers:
         )  # fmt: skip
     return Answers(
         log_sha256=SHA256,
-        mistakes=tuple(claims) or (ClaimedMistake("none"),),
-        verdict_ours=one.ours.verdict,  # type: ignore[arg-type]
+        mistakes=tuple(claims) or (StudentMistake("none"),),
+        verdict_kf=one.kf.verdict,  # type: ignore[arg-type]
         verdict_ekf2=one.ekf2.verdict,  # type: ignore[arg-type]
         ekf2_did=one.ekf2_did,
         quantities=one.quantities,
@@ -119,7 +119,7 @@ def main() -> None:
     with ProcessPoolExecutor() as pool:
         truths = list(pool.map(truth, range(given.students), chunksize=5))
     rng = np.random.default_rng(1)
-    none = Answers(log_sha256=SHA256, mistakes=(ClaimedMistake("none"),))
+    none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
     loops = [one for one in truths if one.sigma_z_m < 0.05]
     aisles = [one for one in truths if one.sigma_z_m >= 0.05]
     print(f"{len(aisles)} aisles, {len(loops)} loops")

@@ -1,6 +1,6 @@
-"""Freeze what px4fuse says of 60 recordings, and compare two frozen states.
+"""Freeze the output of px4fuse on 60 recordings, and compare two frozen states.
 
-``freeze.py FOLDER`` runs each case in a process of its own and writes, per case, the exit code, the
+``freeze.py FOLDER`` runs each case in a new process and writes, per case, the exit code, the
 terminal text, the JSON results, and the text and drawing operations of every PDF page.
 ``freeze.py --compare BEFORE AFTER`` lists the differences; floats agree to 1e-9.
 

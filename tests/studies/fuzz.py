@@ -36,8 +36,8 @@ if str(TESTS) not in sys.path:
 
 import mavlink_tools  # noqa: E402
 import ulog_tools  # noqa: E402
-from class_tools import in_turn  # noqa: E402
-from conftest import page_of  # noqa: E402
+from class_tools import run_in_turn  # noqa: E402
+from conftest import blank_page  # noqa: E402
 
 from px4fuse import answer_form, workers  # noqa: E402
 from px4fuse.analysis import run_or_evaluate_aids  # noqa: E402
@@ -63,7 +63,7 @@ from px4fuse.verification.pdf_input import read_report  # noqa: E402
 REPOSITORY = TESTS.parent
 REPORT = REPOSITORY / "reports" / "example" / "aisle_uwb.pdf"
 SLOW_S, COMMAND_S = 5.0, 15.0
-# Numbers and words that parsers may handle incorrectly
+# Numbers and texts that parsers may handle incorrectly
 ODD = (
     b"nan", b"-inf", b"1e999", b"-1e-400", b"1.8e308", b"0", b"-0", b"", b"9" * 400, b"0x1p3",
     "١٢".encode(), "−1".encode(), b"1,5", b"1_0", b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"#",
@@ -162,7 +162,7 @@ def _recordings() -> list[bytes]:
 def _reports() -> list[bytes]:
     """Return the example report, and its results attached to an empty page."""
     report = REPORT
-    return [report.read_bytes(), page_of(None, report.with_suffix(".json").read_text())]
+    return [report.read_bytes(), blank_page(None, report.with_suffix(".json").read_text())]
 
 
 def _report(path: Path) -> object:
@@ -243,7 +243,7 @@ def _command(*words: str) -> Callable[[Path], object]:
         given = [word.format(path=path, out=out) for word in words]
         with contextlib.ExitStack() as stack:
             for module in (grading, workers):
-                stack.enter_context(mock.patch.object(module, "run_bounded", in_turn))
+                stack.enter_context(mock.patch.object(module, "run_bounded", run_in_turn))
             done = CliRunner().invoke(cli, given)
         if done.exception is not None and not isinstance(done.exception, SystemExit):
             raise done.exception

@@ -37,7 +37,7 @@ if str(TESTS) not in sys.path:
     sys.path.insert(0, str(TESTS))
 
 import mavlink_tools  # noqa: E402
-from conftest import page_of  # noqa: E402
+from conftest import blank_page  # noqa: E402
 from exchange import replace  # noqa: E402
 from ulog_tools import Log, load  # noqa: E402
 
@@ -299,7 +299,11 @@ def impossible(value: Any, path: str = "") -> Iterator[str]:
             yield f"{path} {value} is negative"
         elif "correlation" in name and "time" not in name and abs(value) > 1.0:
             yield f"{path} {value} is no correlation"
-        elif name.endswith("share") and not -1e-9 <= value <= 1.0 + 1e-9:
+        elif (
+            name.endswith("fraction")
+            and name != "explained_fraction"
+            and not -1e-9 <= value <= 1.0 + 1e-9
+        ):
             yield f"{path} {value} is no share"
         elif name.endswith("_m") and abs(value) > LONGEST_M:
             yield f"{path} {value} is no length"
@@ -334,7 +338,7 @@ def run_command(
     words = [word.format(log=log, out=out) for word in command]
     where = f"{label}: {command[0]}"
     begin = time.process_time()
-    with warnings.catch_warnings(), mock.patch.object(pdf, "render", page_of):
+    with warnings.catch_warnings(), mock.patch.object(pdf, "render", blank_page):
         warnings.simplefilter("error")
         done = CliRunner().invoke(cli, words)
     took = time.process_time() - begin

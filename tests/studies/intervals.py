@@ -1,9 +1,9 @@
-"""How often the 95 % intervals of SIGMA_Z, SIGMA_A and the clock offset cover the truth.
+"""Coverage of the 95 % intervals of SIGMA_Z, SIGMA_A and the clock offset.
 
-``python tests/studies/intervals.py [FLIGHTS]`` flies every scenario of the detectors'
-rates, and the usual one with outliers, with as many seeds (by default 50), and prints a line for
-each: coverage, bias of SIGMA_Z and of the offset with the standard error of its mean, how much the
-offset scatters against its stated sigma, and false clock findings. Nothing is asserted.
+``python tests/studies/intervals.py [FLIGHTS]`` simulates each scenario of detector_rates.py, and
+the default one with outliers, with this number of seeds (default 50). It prints for each: coverage,
+bias of SIGMA_Z and of the offset with the standard error of its mean, scatter of the offset divided
+by its σ, and false clock findings. Nothing is asserted.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.estimates import noises_and_clock
+from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.source_clock import MIN_OFFSET_S
@@ -31,17 +31,17 @@ Job = tuple[int, str, str]
 
 
 def covers(noise: Noise, true: float) -> bool:
-    """Whether an interval, open ends included, holds a value."""
+    """Return True if an interval, which may have open ends, contains a value."""
     return (noise.low or 0.0) <= true <= (noise.high or np.inf)
 
 
 def measured(job: Job) -> tuple[float, ...] | None:
-    """What one flight gives; None where there is no estimate."""
+    """Return the estimates of one flight; None without an estimate."""
     seed, scenario, mistake = job
     flown = replace(clean(scenario).flight(seed), ekf2=False, truth=False)
     flight = simulate_flight(flown, parse((mistake,) if mistake else ()))
     comparison = compare(flight, axes=("north", "east"))
-    tuning, clock = noises_and_clock(comparison)
+    tuning, clock = estimate_noises_and_clock(comparison)
     tuned = tuning[HORIZONTAL]
     if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
         return None
@@ -50,13 +50,14 @@ def measured(job: Job) -> tuple[float, ...] | None:
     return (
         (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
         covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),
-        clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.determinable,
-        clock.determinable and false, clock.change_p is not None and clock.change_p < MAX_CHANGE_P,
+        clock.offset_s, low <= 0.0 <= high, clock.offset_s / clock.sigma_s, clock.is_determinable,
+        clock.is_determinable and false,
+        clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P,
     )  # fmt: skip
 
 
 def lines(flights: int) -> Iterator[str]:
-    """One line for each scenario."""
+    """Yield one line for each scenario."""
     conditions = [(name, "") for name in SCENARIOS] + [(DEFAULT, each) for each in OUTLIERS]
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         for name, mistake in conditions:

@@ -1,13 +1,13 @@
-"""How many one-operator changes of the package the suite notices.
+"""Mutation test: share of one-operator changes of the package that a test detects.
 
-``python tests/studies/mutants.py --map FOLDER`` runs every test file once by itself under coverage
-and keeps in FOLDER which lines each test covers. ``python tests/studies/mutants.py FOLDER --number
+``python tests/studies/mutants.py --map FOLDER`` runs each test file separately under coverage and
+writes to FOLDER the lines that each test covers. ``python tests/studies/mutants.py FOLDER --number
 300 --seed 1`` then draws changes from the whole package, runs for each the tests that cover its
 line (those that cover least first) until one fails, and prints each verdict, and killed and
-surviving changes by room. ``--begin 40`` goes on with a draw that was stopped after 40. A change
-that outlives ``--seconds`` of tests counts as a survivor, one whose line no test covers as
-uncovered; those that no test can tell stand in :data:`EQUIVALENT`, with why. Nothing in the
-checkout is changed.
+surviving changes by package. ``--begin 40`` continues a run that was stopped after 40. A change
+that survives ``--seconds`` of tests counts as a survivor, one whose line no test covers as
+uncovered; changes that no test can detect are listed in :data:`EQUIVALENT` with the reason. The
+checkout is not changed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SWAPPED = {
     ast.And: ("and", "or"), ast.Or: ("or", "and"),
 }  # fmt: skip
 
-# Changes that no test can tell, by file and what they make of a line
+# Changes that no test can detect, by file and part of the changed line
 EQUIVALENT = {
     ("px4fuse/ekf2/steps.py", "for column in Columns.POSITION[:3]"):
         "numpy.hypot takes a third array for its output",
@@ -53,7 +53,7 @@ EQUIVALENT = {
 
 
 class Mutant(NamedTuple):
-    """One change: characters ``start`` to ``end`` of a file become ``new``."""
+    """Change that replaces characters ``start`` to ``end`` of a file by ``new``."""
 
     path: str
     line: int
@@ -65,7 +65,7 @@ class Mutant(NamedTuple):
         """Return the file's text with the change."""
         return source[: self.start] + self.new + source[self.end :]
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """Return the change in one line, for the table."""
         source = (ROOT / self.path).read_text(encoding="utf-8")
         before = source.splitlines()[self.line - 1].strip()
@@ -74,7 +74,7 @@ class Mutant(NamedTuple):
 
 
 def mutants(path: Path) -> Iterator[Mutant]:
-    """Every one-operator change of a file: operators, numbers, truth values, signs, conditions."""
+    """Yield all one-operator changes of a file: operators, numbers, booleans, signs, conditions."""
     source = path.read_text(encoding="utf-8")
     starts = [0]
     for line in source.splitlines(keepends=True):
@@ -103,7 +103,7 @@ def mutants(path: Path) -> Iterator[Mutant]:
         return ast.get_source_segment(source, node) or ""
 
     tree = ast.parse(source)
-    # zip(..., strict=False) shows only where another mistake was made first
+    # zip(..., strict=False) has an effect only after another mistake
     keywords = (node for node in ast.walk(tree) if isinstance(node, ast.keyword))
     left_out = {id(keyword.value) for keyword in keywords if keyword.arg == "strict"}
     for node in ast.walk(tree):
@@ -131,7 +131,7 @@ def mutants(path: Path) -> Iterator[Mutant]:
 
 
 def copied(folder: Path) -> Path:
-    """A copy of the checkout to change and test in, compiled."""
+    """Make a compiled copy of the checkout, to change and test."""
     kept = ("px4fuse", "tests", "docs", "sample_logs", "reports")
     for name in kept:
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -144,7 +144,7 @@ def copied(folder: Path) -> Path:
 
 
 def passes(folder: Path, *arguments: str, before: Sequence[str] = (), seconds: float) -> bool:
-    """Whether tests pass in a copy; those that take too long do not."""
+    """Return True if tests pass in a copy within the time limit."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, *before, "-m", "pytest", "-n", "0", "-q", "-x", *arguments]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -155,9 +155,9 @@ def passes(folder: Path, *arguments: str, before: Sequence[str] = (), seconds: f
 
 
 def make_map(out: Path, workers: int, only: str) -> None:
-    """Run every test file under coverage; keep in ``out`` which lines each of its tests covers.
+    """Run each test file under coverage; write to ``out`` the lines that each test covers.
 
-    What runs outside a test (imports, fixtures) is kept under the empty name.
+    Lines that run outside a test (imports, fixtures) have the empty name.
     """
     from coverage import CoverageData
 
@@ -184,7 +184,7 @@ def make_map(out: Path, workers: int, only: str) -> None:
                         lines.setdefault(test, {}).setdefault(name, []).append(line)
             data.unlink()
             took = time.monotonic() - begin
-            if passed:  # what fails anyway would kill every change
+            if passed:  # a test that fails without a change would kill every change
                 (out / f"{path.stem}.json").write_text(json.dumps({"lines": lines}))
             print(f"{took:6.1f} s {'passed' if passed else 'FAILED'} {path.name}", flush=True)
 
@@ -194,7 +194,7 @@ def make_map(out: Path, workers: int, only: str) -> None:
 
 
 class Cover:
-    """Which tests cover which lines."""
+    """Lines covered by each test and fixture."""
 
     def __init__(self, folder: Path) -> None:
         self.lines: dict[str, dict[str, set[int]]] = {}
@@ -208,10 +208,10 @@ class Cover:
         self.width = {test: sum(map(len, lines.values())) for test, lines in self.lines.items()}
 
     def of(self, mutant: Mutant) -> list[str]:
-        """Tests to run for a change, those that cover least first.
+        """Return the tests to run for a change, those that cover least first.
 
-        A line that runs while its module is imported is tested by what covers the module most
-        (which test imports it first is chance); one of a fixture by the whole file.
+        A line that runs while its module is imported is tested by the tests that cover the module
+        most, because any test may import it first; a line of a fixture by the whole file.
         """
         path = mutant.path
         covered = (self.lines, self.fixtures)
@@ -224,7 +224,7 @@ class Cover:
             some = [test for test, lines in self.lines.items() if path in lines]
             in_order = sorted(some, key=lambda t: self.width[t] / len(self.lines[t][path]))
             first, last = [RECORDS], []
-        # what keeps all that is printed and drawn covers much and misses little: after the nearest
+        # golden tests detect most changes of output, so they follow after the nearest
         kept = [test for test in in_order[NEAREST:] if "test_golden" in test]
         others = [test for test in in_order[NEAREST:] if test not in kept]
         return [*first, *in_order[:NEAREST], *kept, *others, *last]
@@ -238,21 +238,21 @@ def _bodies(path: str) -> list[range]:
 
 
 def in_function(path: str, line: int) -> bool:
-    """Whether a line runs when a function is called, not when its module is imported."""
+    """Return True if a line runs when a function is called, not when its module is imported."""
     return any(line in body for body in _bodies(path))
 
 
-# Looks at every class of the package, and covers no line
+# Examines every class of the package without covering a line
 RECORDS = "tests/test_records.py"
-# Files whose fixtures cover a line; more than that is what all do
+# Maximum number of files whose fixtures cover a line; otherwise all files do
 FEW = 8
-# Tests that one process runs, in turn: what covers least most often fails
+# Number of tests per process, in turn: tests that cover least fail most often
 NEAREST = 4
 PORTIONS = (NEAREST + 1, 16, 40, 120, 10_000)
 
 
 def main() -> None:
-    """Make the map, or draw, test and print."""
+    """Make the map, or draw changes, test them and print the verdicts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--map", action="store_true")
@@ -278,7 +278,7 @@ def main() -> None:
 
         def judge(mutant: Mutant) -> str:
             names = cover.of(mutant)
-            after = mutant.told().partition("  ->  ")[2]
+            after = mutant.describe().partition("  ->  ")[2]
             if any(mutant.path == path and part in after for path, part in EQUIVALENT):
                 return "equivalent"
             if not names:

@@ -1,21 +1,21 @@
-"""What px4fuse says of positions whose errors are known: models of errors over real motion.
+"""Findings for known position errors: models of errors on real motion.
 
-``python tests/studies/source_errors.py LOG … --flights 8`` takes IMU and attitude of logs (flown by
-the real EKF2) and the truth of the JSON file beside each, lays simulated errors of a positioning
-system over the truth, at several rates, and prints for each model of errors how often each finding
-was told, and each "since" of the story. ``--pairs`` lays two models over the truth at once. It is
-independent of ``px4fuse.simulation``: it shares no line with it. EKF2's own record is left out,
-since it fused other positions. Logs without the positions as they arrived (no
-``vehicle_visual_odometry``) are no use: theirs were made of EKF2's output, of which less is said.
+``python tests/studies/source_errors.py LOG … --flights 8`` takes IMU and attitude of logs of PX4's
+EKF2 and the ground truth of the JSON file next to each, adds simulated errors of a positioning
+system at several rates, and prints for each model of errors the frequency of each finding, and the
+causes in the summary. ``--pairs`` combines two models. The study is independent of
+``px4fuse.simulation``. EKF2's states are left out, because EKF2 fused other positions. Logs need
+the positions as received (``vehicle_visual_odometry``); positions reconstructed from EKF2 are
+excluded from some findings.
 
-The truth stays in the flight, as it is in the log; ``--no-truth`` takes it out, as on a flight
-outdoors. Right is a flight whose first finding, EKF2's absence left out, is the model's own, and
-for white noise none; no other statement counts. The stamps are right: the truth of the JSON files
-agrees with the logs' own ground truth at 0.000 s. The clock offset that is found, 10 to 20 ms late
-on average at 0.1 m, is the estimate's: half its σ, as late with an IMU made of the truth and fresh
-noise, and within 5 ms of zero with one without noise. Several logs of PX4's simulation share one
-sequence of IMU noise (it is seeded), so that what the IMU adds is no fresh chance in each. At 2 Hz
-errors of 0.2 s are white to all purposes: 92 % of them is forgotten from one position to the next.
+Ground truth stays in the flight; ``--no-truth`` removes it, as on an outdoor flight. A flight
+counts as correct if its first finding, except the missing EKF2, is that of the model, and for white
+noise if there is none. The timestamps are correct: the ground truth of JSON files and logs agrees
+at 0.000 s. The estimated clock offset is 10 to 20 ms late on average at 0.1 m, which is half its σ;
+it is the same with an IMU simulated from ground truth with other noise, and within 5 ms of zero
+without IMU noise. Several logs of PX4's simulation share one seeded sequence of IMU noise, so their
+IMU errors are not independent. At 2 Hz errors with a time constant of 0.2 s are practically white:
+their correlation between positions is 8 %.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.summary import summarise_flight
+from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 
 Values = NDArray[np.float64]
 SIGMA_M = 0.10
 Rng = np.random.Generator
-# Errors (m), and what is added to the stamps (s); of a model, from true positions at the times
+# Position errors (m) and timestamp errors (s); made by a model from times and true positions
 Made = tuple[Values, Values | float]
 Model = Callable[[Rng, Values, Values], Made]
 
@@ -56,7 +56,7 @@ def white(rng: Rng, time: Values, true: Values, sigma: Values | float = SIGMA_M)
 
 
 def coloured(rng: Rng, time: Values, true: Values, tau_s: float, share: float = 0.5) -> Made:
-    """White, and a first-order process of time constant tau that has this share of the variance."""
+    """White noise plus a first-order process of time constant tau with this share of variance."""
     slow = np.zeros_like(true)
     keep = np.exp(-np.diff(time) / tau_s)
     slow[0] = rng.normal(size=3)
@@ -67,7 +67,7 @@ def coloured(rng: Rng, time: Values, true: Values, tau_s: float, share: float = 
 
 
 def held(rng: Rng, time: Values, true: Values, share: float) -> Made:
-    """Some positions are the one before, sent again."""
+    """Repeat the previous position in a share of the samples."""
     sent = true + rng.normal(size=true.shape) * SIGMA_M
     again = rng.random(len(time)) < share
     for i in range(1, len(time)):
@@ -93,7 +93,7 @@ def with_outliers(rng: Rng, time: Values, true: Values, share: float) -> Made:
 
 
 def two_levels(rng: Rng, time: Values, true: Values, factor: float) -> Made:
-    """Three times as noisy in the middle third."""
+    """White noise with a larger σ in the middle third."""
     middle = (time > time[len(time) // 3]) & (time < time[2 * len(time) // 3])
     sigma = np.where(middle, factor * SIGMA_M, SIGMA_M)[:, None]
     return rng.normal(size=true.shape) * sigma, 0.0
@@ -120,25 +120,25 @@ def clock_jump(rng: Rng, time: Values, true: Values, late: float) -> Made:
 MODELS: dict[str, tuple[Model, str]] = {
     "white 0.1 m": (white, ""),
     "white 0.05, 0.2 m north, east": (
-        partial(white, sigma=np.array([0.05, 0.2, 0.1])), "source_axes_unequal"),
-    "AR(1) 0.2 s": (partial(coloured, tau_s=0.2), "source_coloured"),
-    "AR(1) 1 s": (partial(coloured, tau_s=1.0), "source_coloured"),
-    "AR(1) 5 s": (partial(coloured, tau_s=5.0), "source_coloured"),
-    "AR(1) 20 s": (partial(coloured, tau_s=20.0), "source_coloured"),
-    "held 30 %": (partial(held, share=0.3), "source_repeats"),
-    "held 60 %": (partial(held, share=0.6), "source_repeats"),
-    "low pass 0.3 s": (partial(low_pass, tau_s=0.3), "source_smoothed"),
-    "low pass 0.6 s": (partial(low_pass, tau_s=0.6), "source_smoothed"),
+        partial(white, sigma=np.array([0.05, 0.2, 0.1])), "source_noise_unequal_axes"),
+    "AR(1) 0.2 s": (partial(coloured, tau_s=0.2), "source_noise_time_correlated"),
+    "AR(1) 1 s": (partial(coloured, tau_s=1.0), "source_noise_time_correlated"),
+    "AR(1) 5 s": (partial(coloured, tau_s=5.0), "source_noise_time_correlated"),
+    "AR(1) 20 s": (partial(coloured, tau_s=20.0), "source_noise_time_correlated"),
+    "held 30 %": (partial(held, share=0.3), "source_samples_repeated"),
+    "held 60 %": (partial(held, share=0.6), "source_samples_repeated"),
+    "low pass 0.3 s": (partial(low_pass, tau_s=0.3), "source_low_pass_filtered"),
+    "low pass 0.6 s": (partial(low_pass, tau_s=0.6), "source_low_pass_filtered"),
     "outliers 5 %": (partial(with_outliers, share=0.05), "source_outliers"),
-    "three times as noisy": (partial(two_levels, factor=3.0), "source_noise_changes"),
-    "scale 20 %": (partial(scaled, scale=0.2), "source_scale_wrong"),
-    "jump 1 m": (partial(jumped, size=1.0), "source_jumps"),
-    "clock 0.3 s late": (partial(clock, late=0.3), "source_clock_offset"),
-    "clock jumps 0.3 s": (partial(clock_jump, late=0.3), "source_clock_changes"),
+    "three times as noisy": (partial(two_levels, factor=3.0), "source_noise_varies"),
+    "scale 20 %": (partial(scaled, scale=0.2), "source_scale_error"),
+    "jump 1 m": (partial(jumped, size=1.0), "source_position_jump"),
+    "clock 0.3 s late": (partial(clock, late=0.3), "source_time_offset"),
+    "clock jumps 0.3 s": (partial(clock_jump, late=0.3), "source_time_offset_changes"),
 }  # fmt: skip
 
 
-# Two at once: errors of both, with the white noise of both
+# Two models at once: errors of both, with the white noise of both
 PAIRS = (
     ("outliers 5 %", "clock 0.3 s late"), ("outliers 5 %", "scale 20 %"),
     ("outliers 5 %", "jump 1 m"), ("clock 0.3 s late", "scale 20 %"),
@@ -149,7 +149,7 @@ BOTH = " + "
 
 
 def model_of(name: str) -> Model:
-    """The model of that name, or of two."""
+    """Return the model of this name, or the sum of two models."""
     models = [MODELS[each][0] for each in name.split(BOTH)]
 
     def added(rng: Rng, time: Values, true: Values) -> Made:
@@ -160,7 +160,7 @@ def model_of(name: str) -> Model:
 
 
 def truth_of(log: Path, flight: Flight) -> CubicSpline:
-    """True positions (m, NED) over the flight's time, from where the tag was at each sample."""
+    """Return true positions (m, NED) as a function of flight time, from the tag positions."""
     rows = json.loads(log.with_suffix(".json").read_text())["uwb"]
     rows = [row for row in rows if row.get("t_px4_us")]
     time = np.array([row["t_px4_us"] * 1e-6 for row in rows]) - flight.log.boot_time_s
@@ -171,12 +171,12 @@ def laid_over(
     flight: Flight, known: CubicSpline, model: Model, rate_hz: float, seed: int,
     sigma_m: float = SIGMA_M,
 ) -> Flight:  # fmt: skip
-    """The flight with a source of such errors, and without EKF2."""
+    """Return the flight with simulated position errors, and without EKF2."""
     rng = np.random.default_rng(seed)
     first = next(track for track in flight.positions if track.origin.is_automatic)
     start, end = max(known.x[0], 0.0), known.x[-1]
     count = int((end - start) * rate_hz)
-    # measured near a regular time, as a tag that takes turns
+    # time slots of a tag, with jitter
     time = start + (np.arange(count) + rng.uniform(0.1, 0.3, count)) / rate_hz
     time = time[time < end]
     true = known(time)
@@ -193,7 +193,7 @@ def laid_over(
 
 
 def told(job: tuple[str, str, float, int], *, truth: bool = True) -> tuple[str, tuple[str, ...]]:
-    """Findings of one flight that are no information, causes only, most severe first."""
+    """Return findings above information on one flight, causes only, most severe first."""
     log, name, rate_hz, seed = job
     flight = read_log(Path(log))
     sigma_z_m = float(SIGMA_M * np.sqrt(len(name.split(BOTH))))
@@ -202,19 +202,19 @@ def told(job: tuple[str, str, float, int], *, truth: bool = True) -> tuple[str, 
     if not truth:
         flight = replace(flight, truth=Unavailable("truth", "left out", "Not in this study."))
     analysis = explain(compare(flight, Settings(0.27, sigma_z_m), axes=("north", "east")))
-    told = summarise_flight(analysis, find(analysis))[0].partition(", since ")[2]
+    told = summarise(analysis, find(analysis))[0].partition(", since ")[2]
     since = (f"since: {re.sub(r'[-+0-9.]+', '#', told.partition(' (')[0])}",) if told else ()
     return name, since + tuple(
         f"{one.id}{'!' if one.severity == 'error' else ''}"
         for one in find(analysis)
-        if one.severity != "info" and one.caused_by is None
+        if one.severity != "note" and one.caused_by is None
     )
 
 
 def right(name: str, ids: tuple[str, ...]) -> bool:
-    """Whether the first finding is the model's own; of a pair, whether both are told."""
+    """Return True if the first finding is that of the model; for a pair, if both are reported."""
     wanted = {MODELS[each][1] for each in name.split(BOTH)} - {""}
-    causes = [one.strip("!") for one in ids if not one.startswith(("since", "ekf2_unavailable"))]
+    causes = [one.strip("!") for one in ids if not one.startswith(("since", "ekf2_not_logged"))]
     return wanted <= set(causes if len(wanted) > 1 else causes[:1]) and bool(wanted) >= bool(causes)
 
 

@@ -1,5 +1,5 @@
 /* Sentences and verdicts on the flight with the current settings, worded as in findings/summary.py. */
-const Story = (() => {
+const Summary = (() => {
   // format_number and format_factor of text.py, format_metres of findings/summary.py
   const formatNumber = (x, digits = 3) =>
     Number(x.toPrecision(digits)).toLocaleString("en", { maximumFractionDigits: 20 });
