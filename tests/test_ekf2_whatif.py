@@ -33,6 +33,7 @@ from px4fuse.ekf2.steps import (
 )
 from px4fuse.ekf2.whatif import AxisSummary, Summary, _longest_between_fusions, _notes, what_if
 from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
@@ -206,6 +207,8 @@ def test_what_if_late_samples_add_note():
         (note,) = _notes(model, one)
         assert note.startswith("EKF2_EV_DELAY=90: 5 of 10 samples")
         assert note.endswith(f"(2 would never be fused){remedy}")
+        few = SimpleNamespace(**(vars(one) | {"updates": range(1)}))
+        assert "5 of 5 samples" in next(_notes(model, few))
         one.late = one.lost = 0
         assert list(_notes(model, one)) == []
 
@@ -237,6 +240,14 @@ def test_what_if_rejecting_flight_predicts_remedy(tmp_path, mistake, seed, chang
     assert predicted.position_rmse_to_truth_m == pytest.approx(
         expected.position_rmse_to_truth_m, rel=0.15
     )
+
+
+def test_what_if_delay_without_fusion_is_rejected(model, monkeypatch):
+    changed = {"EKF2_EV_DELAY": 300.0}
+    never = replace(model.flown, updates=model.flown.updates[:0], lost=9, changed=changed)
+    monkeypatch.setattr(whatif, "replay_settings", lambda *_, **_more: [never])
+    with pytest.raises(SettingsError, match=r"EKF2_EV_DELAY=300: .* never be fused .* 9 samples"):
+        what_if(model, [changed])
 
 
 def test_what_if_most_rejected_is_unpredictable(model):

@@ -74,8 +74,10 @@ def equal_text(one: str, other: str) -> bool:
     return one == other
 
 
-def compare(one: bytes, other: bytes, **options: Any) -> tuple[PageDifference, ...]:
-    return compare_pages(one, other, options.pop("alike", equal_text), **options)
+def compare(
+    one: bytes, other: bytes, alike: Callable[[str, str], bool] = equal_text
+) -> tuple[PageDifference, ...]:
+    return compare_pages(one, other, alike)
 
 
 # -- forgeries ------------------------------------------------------------------------------------
@@ -731,41 +733,6 @@ def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
     assert compare(forged(made, on_page(1, digit)), made, alike=alike) != ()
     spread = forged(pdf, lambda w: on_page(1, lambda c: spread_text(c, w))(w))
     assert compare(spread, pdf, alike=alike) != ()
-
-
-# -- other libraries ----------------------------------------------------------------------------
-
-
-def within_figure(add: bytes) -> Edit:
-    """Add drawing operations inside the clip of the first figure."""
-    return once(rb"(/Alt\(.*?\sW\sn)", lambda m: m[1] + b" " + add)
-
-
-@pytest.mark.parametrize(
-    ("change", "equal"),
-    [
-        (within_figure(b"0 0 m 9 9 l S"), True),
-        (within_figure(b"Q " + WHITE + b" q"), False),
-        (within_figure(b"BT/f0 8 Tf(x)Tj ET"), False),
-        (once(rb"(/Alt\(.*?\sW\sn.*?Tm\s*\[?\()", rb"\1\\000\\001"), False),
-        (once(rb"(/Alt\(.*?\sW\sn.*?)/f0 ", rb"\1/f1 "), False),
-        (once(rb"(/Alt\([^)]*\)>>BDC\nq )[\d.]+", rb"\g<1>1"), False),
-        (lambda content: content + b"\n" + WHITE, False),
-        (once(rb"/c0 cs [\d. ]+ scn", b"/c0 cs 0 0.6 0 scn"), False),
-    ],
-)
-def test_compare_pages_other_libraries_figures_by_text(
-    pdf: bytes, change: Edit, equal: bool
-) -> None:
-    made = forged(pdf, on_page(1, change))
-    assert (compare(made, pdf, same_libraries=False) == ()) == equal
-    assert compare(made, pdf) != ()
-
-
-def test_compare_pages_other_libraries_structure_is_compared(pdf: bytes) -> None:
-    for kind in ("a text field", "a layer for print", "outlines exchanged", "another digit"):
-        found = compare(forged(pdf, FORGERIES[kind][0]), pdf, same_libraries=False)
-        assert found, kind
 
 
 # -- limits --------------------------------------------------------------------------------------

@@ -326,11 +326,62 @@ def test_verify_changed_printed_record_is_not_verified(
     assert verdict.outcome != "verified", verdict
     assert verdict.differences == ()
     assert verdict.redrawn != loop.pdf
-    named = any("matplotlib 9.9.9 (here" in reason for reason in verdict.reasons)
+    named = any("matplotlib 9.9.9; here" in reason for reason in verdict.reasons)
     assert named == (path[-1] == "matplotlib")
 
 
-# -- changed pages ---------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def foreign(loop: VerifiedReport) -> VerifiedReport:
+    """Report that states another Matplotlib version, in its results and on its last page."""
+    results = copy.deepcopy(loop.results)
+    set_value("3.99.0", "provenance", "libraries", "matplotlib")(results)
+    again = verification.recompute(read_again(results), loop.files)
+    drawn = again[1]()
+    return VerifiedReport(forged(drawn, with_results(to_json(results))), results, again, loop.files)
+
+
+def test_verify_other_libraries_same_drawing_is_verified(foreign: VerifiedReport) -> None:
+    verdict = foreign.verified(foreign.pdf)
+    assert verdict.outcome == "verified", verdict
+    assert foreign.verified(forged(foreign.pdf, shifted_page)).outcome == "verified"
+
+
+def shifted_page(writer: PdfWriter) -> None:
+    """Coordinates moved less than the tolerance, as by another version of Matplotlib."""
+    on_page(1, lambda content: re.sub(
+        rb"(\d+\.\d+) (\d+\.\d+) l\b", lambda m: b"%.6f %s l" % (float(m[1]) + 0.01, m[2]), content
+    ))(writer)  # fmt: skip
+
+
+def in_figure(pattern: bytes, new: bytes) -> Edit:
+    """Replace the first match behind the clip of the first figure."""
+    return lambda content: re.sub(
+        rb"(/Alt\(.*?\sW\sn.*?)" + pattern, rb"\g<1>" + new, content, count=1, flags=re.DOTALL
+    )
+
+
+PLOTS: dict[str, Edit] = {
+    "a point erased": in_figure(rb"[\d.]+ [\d.]+ l (?=[\d.]+ [\d.]+ l )", b""),
+    "a point moved": in_figure(rb"([\d.]+) ([\d.]+) l\b", rb"9\2 \3 l"),
+    "a curve erased": in_figure(rb"[\d.]+ [\d.]+ m(?: [\d.]+ [\d.]+ l)+\s+S", b"0 0 m 0 0 l S"),
+    "a curve more": in_figure(rb"", b" 0 0 m 90 90 l S"),
+    "another colour": in_figure(rb"[\d.]+ [\d.]+ [\d.]+ SCN", b"0 0.6 0 SCN"),
+    "another width": in_figure(rb" [\d.]+ w ", b" 9 w "),
+    "covered": in_figure(rb"", b" 1 g 0 0 900 900 re f"),
+}
+
+
+@pytest.mark.parametrize("name", PLOTS)
+def test_verify_other_libraries_changed_plot_is_found(foreign: VerifiedReport, name: str) -> None:
+    verdict = foreign.verified(forged(foreign.pdf, on_page(1, PLOTS[name])))
+    assert verdict.outcome == "cannot verify", verdict
+    assert "page 1: drawing operation" in verdict.reasons[0]
+    assert any("made with matplotlib 3.99.0; here" in reason for reason in verdict.reasons)
+    assert verdict.remedy.startswith("Verify it with matplotlib 3.99.0.")
+    assert verdict.redrawn == foreign.again[1]()
+
+
+# -- what is changed on the pages ------------------------------------------------------------------
 
 
 def replace_last(pattern: bytes, replacement: Any) -> Callable[[bytes], bytes]:

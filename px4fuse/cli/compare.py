@@ -8,7 +8,6 @@ import click
 
 from px4fuse.cli import inputs, outputs
 from px4fuse.request import settings_name
-from px4fuse.writing import STANDARD_OUTPUT
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES = get_args(Severity)
@@ -50,7 +49,7 @@ def compare(
         outcome = run_or_evaluate_aids(request, step)
         results = outcome_results(request, outcome, person)
         release_free_memory()  # the import of the report modules needs memory
-        if output is None and json_path != STANDARD_OUTPUT:
+        if output is None and json_path is None:
             output = outputs.default_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, outcome, step)
     outputs.write_and_print(contents, summary(outcome, results, output), request)

@@ -34,5 +34,7 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
         # imported late: Bokeh is slow to import, and an error above does not need it
         from px4fuse.explore.page import html_text
 
-        content = html_text(analysis).encode()
-    outputs.write_and_print({target: content})
+        page = html_text(analysis)
+        if output is None:
+            outputs.check_default_page(target, page)
+    outputs.write_and_print({target: page.encode()})

@@ -256,13 +256,9 @@ max_size_option = option(
     expose_value=False,
     callback=_set_max_size,
 )
-#: Option --json
-json_option = option(
-    "--json FILE",
-    "Write the results as JSON; - prints them to standard output. With --json and without -o, no "
-    "report is written.  [default: beside the report]",
-    name="json_path",
-)
+_JSON_MEANING = "Write the results as JSON; - prints them to standard output."
+#: Option --json of commands without a report
+json_option = option("--json FILE", _JSON_MEANING, name="json_path")
 
 
 def _open_flag(option_text: str, name: str) -> Option:
@@ -287,7 +283,14 @@ person_options = options("person", notes={"type": InputPath()}, answers={"type":
 
 def report_options(meaning: str) -> Option:
     """Declare -o for the PDF report and --json for its results."""
-    return _combine_options(option("-o, --output FILE.pdf", meaning), json_option)
+    json_meaning = (
+        f"{_JSON_MEANING} With --json and without -o, no report is written.  [default: beside the "
+        "report]"
+    )
+    return _combine_options(
+        option("-o, --output FILE.pdf", meaning),
+        option("--json FILE", json_meaning, name="json_path"),
+    )
 
 
 system_option = request_options(EvaluationRequest, {"system": OPTIONS["system"]})

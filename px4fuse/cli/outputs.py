@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import signal
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -38,6 +40,8 @@ WRITTEN_KEY = "px4fuse.written"
 OPEN_KEY = "px4fuse.opened"
 # Types of files that --open opens, in this order
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
+# Command and SHA-256 of the log in the head of a web page
+GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
 
 
 class Interrupted(Exception):  # noqa: N818 - the user ended the run, no error
@@ -110,7 +114,6 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
     OutputError
         A file of that name exists and is not a report of the same files and student.
     """
-    from px4fuse.results.contract import file_hashes_in, to_json
     from px4fuse.results.reading import read_results
     from px4fuse.verification.pdf_input import attached_results
 
@@ -119,23 +122,47 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
         short_stem = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
-    for file, read in ((path, attached_results), (path.with_suffix(".json"), read_results)):
-        if not file.exists():
-            continue
-        try:
-            old = read(file.read_bytes(), file.name)
-        except (OSError, ResultsError):
-            is_same = False
-        else:
-            is_same = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
-            is_same &= _person(old) in (NO_PERSON, _person(results))
-        if not is_same:
-            raise OutputError(
-                f"{file} exists and is not a report of the same files and student by this version; "
-                "it was not overwritten",
-                "Choose another name with -o.",
-            )
+    kind = "a report of the same files and student by this version"
+    _check_default(path, kind, partial(_is_same_report, results, attached_results))
+    _check_default(path.with_suffix(".json"), kind, partial(_is_same_report, results, read_results))
     return path
+
+
+def check_default_page(path: Path, page: str) -> None:
+    """Check the default path of a web page.
+
+    Raises
+    ------
+    OutputError
+        A file of that name exists and is not a page of the same command and log.
+    """
+    made_by = GENERATOR.findall(page)
+    kind = "a page of the same command and log by this version"
+    _check_default(path, kind, lambda content: GENERATOR.findall(content.decode()) == made_by)
+
+
+def _check_default(path: Path, kind: str, is_replaceable: Callable[[bytes], bool]) -> None:
+    """Raise an error if the file of a default path exists and its content is of another kind."""
+    try:
+        replaceable = not path.exists() or is_replaceable(path.read_bytes())
+    except (OSError, UnicodeDecodeError, ResultsError):
+        replaceable = False
+    if not replaceable:
+        raise OutputError(
+            f"{path} exists and is not {kind}; it was not overwritten",
+            "Choose another name with -o.",
+        )
+
+
+def _is_same_report(
+    results: Results, read: Callable[[bytes, str], Results], content: bytes
+) -> bool:
+    """Return True if the files are the same, and the old report has no other student."""
+    from px4fuse.results.contract import file_hashes_in, to_json
+
+    old = read(content, "report")
+    same_files = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
+    return same_files and _person(old) in (NO_PERSON, _person(results))
 
 
 def _person(results: Results) -> tuple[str, str]:

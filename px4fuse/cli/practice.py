@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.inputs import options
-from px4fuse.cli.outputs import OPEN_KEY, progress, web_page, write_and_print
+from px4fuse.cli.outputs import OPEN_KEY, check_default_page, progress, web_page, write_and_print
 
 
 @click.command()
@@ -35,5 +35,7 @@ def practice(
     with progress(target) as step:
         from px4fuse.practice import practice_text
 
-        content = practice_text(seed, level, flights, step).encode()
-    write_and_print({target: content})
+        page = practice_text(seed, level, flights, step)
+        if output is None:
+            check_default_page(target, page)
+    write_and_print({target: page.encode()})

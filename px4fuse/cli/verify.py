@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import InputPath, max_size_option, open_option, report_options
+from px4fuse.cli.inputs import InputPath, json_option, max_size_option, open_option, option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.errors import LogError
 from px4fuse.reading import display_name, files_by_sha256, read_bytes_limited
@@ -29,7 +29,8 @@ TIMEOUT_S = 1800.0
 @click.argument("report", type=InputPath(), metavar="REPORT.pdf")
 @click.argument("logs", type=InputPath(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@report_options("Write the report again, from the log.")
+@option("-o, --output FILE.pdf", "Write the report again, from the log.")
+@json_option
 @open_option
 def verify(
     report: Path, logs: tuple[Path, ...], output: Path | None, json_path: Path | None

@@ -381,6 +381,12 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         updates[inside_spans(updates.index, evaluated_s)],
         updates["fused_at_s"].to_numpy(),
     )
+    if evaluated_updates.empty:
+        raise SettingsError(
+            f"{_change_text(replay)}: {replay.source} would never be fused in the evaluated time; "
+            f"{replay.lost} samples arrive after the fusion horizon",
+            "Choose another value.",
+        )
     # the variance grows between two samples; both ends define the interpolation
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
@@ -587,9 +593,14 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
         )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
-        change = ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
+        # of two samples in one step EKF2 fuses the newer one, so updates may be fewer than samples
+        samples = max(len(replay.updates), replay.late) + replay.lost
         yield (
-            f"{change or 'As flown'}: {replay.late + replay.lost} of "
-            f"{len(replay.updates) + replay.lost} samples would arrive after the fusion horizon "
-            f"({replay.lost} would never be fused){remedy}"
+            f"{_change_text(replay)}: {replay.late + replay.lost} of {samples} samples would "
+            f"arrive after the fusion horizon ({replay.lost} would never be fused){remedy}"
         )
+
+
+def _change_text(replay: Ekf2Replay) -> str:
+    """Return the changed parameters, or "As flown"."""
+    return ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "As flown"

@@ -38,6 +38,7 @@ def html_text(analysis: Analysis) -> str:
         command="explore",
         heading="Interactive Kalman filter",
         title=data["log"],
+        sha256=analysis.flight.log.sha256,
     )
 
 
@@ -73,6 +74,7 @@ def page_text(
     command: str,
     heading: str,
     title: str,
+    sha256: str = "",
     rounds: int = 0,
     choices: Mapping[str, str] = {},
 ) -> str:
@@ -85,6 +87,8 @@ def page_text(
     data : dict
         One flight of the page; either all flights have ground truth or none.
     command, heading, title : str
+    sha256 : str
+        SHA-256 of the log, in the head of the page.
     rounds : int
         Number of flights in a practice set.
     choices : mapping of str to str
@@ -105,6 +109,7 @@ def page_text(
         command=command,
         heading=heading,
         title=title,
+        made_from=f"px4fuse {command} {sha256}".rstrip(),
         made_with=f"px4fuse {version('px4fuse')}",
         data=scripts,
         rounds=rounds,

@@ -39,7 +39,7 @@ def page_flags(verdict: Verdict) -> Iterator[str]:
     """Flag a PDF that differs from the redrawn report, with the first difference."""
     if verdict.pages:
         first, *others = verdict.pages
-        more_text = f" {len(others)} more differences." if others else ""
+        more_text = f" Further differences: {len(others)}." if others else ""
         yield (
             "The PDF differs from the report that px4fuse draws from the log. "
             f"{capitalise_first(first.sentence)}.{more_text} Read the redrawn report."

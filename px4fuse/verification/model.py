@@ -67,7 +67,8 @@ class Verdict:
     ----------
     status : Status
         Result for the numbers. "cannot verify" also if the numbers agree, but the structure of the
-        PDF differs from that of the redrawn one.
+        PDF differs from that of the redrawn one, or the pages differ and the report names other
+        library versions.
     reasons : tuple of str
         Sentences: differences, reason for "cannot verify", or for "verified" the checks.
     with_log : bool

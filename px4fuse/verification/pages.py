@@ -98,7 +98,7 @@ Operation = tuple[str, tuple[Operand, ...]]
 
 
 def compare_pages(
-    submitted: bytes, redrawn: bytes, words_alike: WordsAlike, same_libraries: bool = True
+    submitted: bytes, redrawn: bytes, words_alike: WordsAlike
 ) -> tuple[PageDifference, ...]:
     """Compare a handed-in PDF with the redrawn report, in a process with limits.
 
@@ -108,9 +108,6 @@ def compare_pages(
         A file that :func:`px4fuse.verification.pdf_input.read_report` accepted.
     words_alike : callable
         Returns True if two texts are equal up to the rounding of a number.
-    same_libraries : bool
-        False if the report was made with other versions of the libraries that draw figures: of a
-        figure only its place and texts are compared.
 
     Returns
     -------
@@ -118,7 +115,7 @@ def compare_pages(
         At most MAX_FOUND, in page order; empty if the PDF is what px4fuse writes. If the limits
         are exceeded, that is the difference.
     """
-    job = (submitted, redrawn, words_alike, same_libraries)
+    job = (submitted, redrawn, words_alike)
     found = run_one_bounded(_found, job, TIMEOUT_S, MEMORY_BYTES)
     if isinstance(found, JobFailure):
         what = f"not compared within the limits ({found.reason.rstrip('.')})"
@@ -126,12 +123,12 @@ def compare_pages(
     return found
 
 
-def _found(job: tuple[bytes, bytes, WordsAlike, bool]) -> tuple[PageDifference, ...]:
-    submitted, redrawn, words_alike, same_libraries = job
+def _found(job: tuple[bytes, bytes, WordsAlike]) -> tuple[PageDifference, ...]:
+    submitted, redrawn, words_alike = job
     try:
         with pypdf.apply_configuration(**PYPDF_LIMITS):
             submitted_pdf, redrawn_pdf = map(opened, (submitted, redrawn))
-            walk = _Walk(words_alike, same_libraries)
+            walk = _Walk(words_alike)
             found = [PageDifference(0, what, True) for what in _tables(submitted)]
             found += islice(walk.differences(submitted_pdf, redrawn_pdf), MAX_FOUND)
             producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
@@ -159,7 +156,6 @@ class _Walk:
     """
 
     words_alike: WordsAlike
-    same_libraries: bool
     compared: set[tuple[int, int, int]] = field(default_factory=set)
     parents: list[tuple[Any, Any, str]] = field(default_factory=list)
     fonts: Mapping[str, Any] = field(default_factory=dict)
@@ -278,8 +274,6 @@ class _Walk:
     def _other_operation(self, submitted: bytes, redrawn: bytes) -> str:
         """Describe the first operation that differs; empty if none does."""
         both = [_operations(each) for each in (submitted, redrawn)]
-        if not self.same_libraries:
-            both = [_without_drawings(each) for each in both]
         font = ""
         for number, pair in enumerate(zip_longest(*both, fillvalue=("", ())), start=1):
             (one, found), (other, drawn) = pair
@@ -403,20 +397,3 @@ def _near(operator: str, submitted: Sequence[Operand], redrawn: Sequence[Operand
         )
         for at, (one, other) in enumerate(zip(submitted, redrawn, strict=True))
     )
-
-
-def _without_drawings(operations: Iterator[Operation]) -> Iterator[Operation]:
-    """Leave out what figures draw within their clip, except texts.
-
-    Typst marks a figure by its description (/Alt) and clips it to its place.
-    """
-    figure = clipped = False
-    depth = 0
-    for operator, operands in operations:
-        if operator == "BDC" and not clipped:
-            figure, depth = "/Alt" in operands, 0
-        depth += (operator == "q") - (operator == "Q")
-        clipped = clipped and depth > 0
-        if not clipped or operator in _TEXT or operator == "Tf":
-            yield operator, operands
-        clipped = clipped or (figure and operator == "n" and depth > 0)

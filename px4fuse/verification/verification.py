@@ -273,21 +273,28 @@ def _verify_with_log(
         else f"all {compared} values agree with a new run on the log (within "
         f"{RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
     ]
-    others = _other_libraries(submitted.provenance, recomputed.provenance)
     words_alike = partial(same_words, numbers_alike=numbers_alike)
-    pages = compare_pages(pdf, redrawn, words_alike, same_libraries=not others)
+    pages = compare_pages(pdf, redrawn, words_alike)
     foreign = any(difference.structural for difference in pages)
+    here = recomputed.provenance.libraries.items()
+    others = sorted({*submitted.provenance.libraries.items()} - {*here}) if pages else []
+    not_comparable = foreign or bool(others)
     page_status: PageStatus = "same"
     if pages:
-        page_status = "not compared" if foreign else "differ"
-    status: Status = "numbers differ" if mismatches else "cannot verify" if foreign else "verified"
+        page_status = "not compared" if not_comparable else "differ"
+    status: Status = "verified"
+    if mismatches or not_comparable:
+        status = "numbers differ" if mismatches else "cannot verify"
     sentences = [difference.sentence for difference in pages[:SHOWN_PAGES]]
-    sentences += [f"{len(pages) - SHOWN_PAGES} more differences"] * (len(pages) > SHOWN_PAGES)
+    sentences += [f"further differences: {len(pages) - SHOWN_PAGES}"] * (len(pages) > SHOWN_PAGES)
     # the class table shows the first reason
     reasons = [*sentences, *reasons] if status == "cannot verify" else [*reasons, *sentences]
-    reasons += [f"made with {others}: only place and texts of figures were compared"] * bool(others)
-    reasons += [LIMIT] * (status == "verified")
     remedy = ORIGINAL if foreign else ""
+    if others:  # they may draw in another way
+        versions = one_line(", ".join(map(" ".join, others)), 300)
+        reasons.append(f"made with {versions}; here are other versions")
+        remedy = remedy or f"Verify it with {versions}."
+    reasons += [LIMIT] * (status == "verified")
     return Verdict(
         status,
         tuple(reasons),
@@ -298,16 +305,6 @@ def _verify_with_log(
         redrawn,
         remedy,
     )
-
-
-def _other_libraries(submitted: Provenance, recomputed: Provenance) -> str:
-    """List the libraries whose versions differ between the report and this computer."""
-    others = (
-        f"{name} {submitted.libraries.get(name)} (here {version})"
-        for name, version in recomputed.libraries.items()
-        if submitted.libraries.get(name) != version
-    )
-    return one_line(", ".join(others), 300)
 
 
 @dataclass(frozen=True)
