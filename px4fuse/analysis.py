@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from px4fuse.comparison.causal_replays import Intervention, interventions, planned_variants
+from px4fuse.comparison.causal_replays import Intervention, planned_variants, run_interventions
 from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.difference_steps import explain_ekf2_difference, explanation_variants
 from px4fuse.comparison.estimates import (
@@ -114,7 +114,7 @@ class Analysis(Comparison):
     def causes(self) -> tuple[Intervention, ...]:
         """Re-runs with one change each, and the share of a discrepancy that each explains."""
         model = self.ekf2_model
-        tried = interventions(
+        tried = run_interventions(
             self, self.tuning, self.clock, self.heading, self.bias_scale_jump_fit, model
         )
         if isinstance(model, Model):  # frees most of the memory; later requests replay again

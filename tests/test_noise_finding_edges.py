@@ -53,12 +53,12 @@ def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
     format_kf_remedy, rerun_settings = noises.remedy.format_kf_remedy, list[Settings]()
 
     def options_only(
-        of: Any, changes: Any, more: str = "", unseen_nats: float | None = None
+        of: Any, changes: Any, more: str = "", held_out_nats: float | None = None
     ) -> str:
         text = format_kf_remedy(of, changes, more)
         typed = text.removeprefix("px4fuse compare LOG ").removesuffix(".")
         changed = rerun_settings[-1]
-        return f"[{typed}|{changed.sigma_z_m:g}|{changed.sigma_a_m_s2:g}|{unseen_nats}]."
+        return f"[{typed}|{changed.sigma_z_m:g}|{changed.sigma_a_m_s2:g}|{held_out_nats}]."
 
     monkeypatch.setattr(noises.remedy, "format_kf_remedy", options_only)
     monkeypatch.setattr(noises.remedy, "filter_errors_m", lambda _, new: rerun_settings.append(new))

@@ -12,11 +12,11 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    MAX_UNSUSPICIOUS_NIS,
+    MAX_UNREMARKABLE_NIS,
     MIN_NEES_FINDING,
-    error_beyond_reported_sigma,
+    error_above_reported_sigma,
 )
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
+from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter import settings as allowed
@@ -105,7 +105,7 @@ def ranges() -> dict[str, Any]:
         "clock-offset": list(allowed.CLOCK_OFFSET_RANGE_S),
         "lesson": _settings_data(Settings()),
         "running": [RUNNING_MEAN_COUNT, *nis_band(RUNNING_MEAN_COUNT)],
-        "hidden": [MIN_NEES_FINDING, MAX_UNSUSPICIOUS_NIS],
+        "hidden": [MIN_NEES_FINDING, MAX_UNREMARKABLE_NIS],
     }
 
 
@@ -227,12 +227,12 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
         "summary": _summary(consistency),
         "r": None,
     }
-    if isinstance(consistency.truth, AgainstTruth):
+    if isinstance(consistency.truth, ErrorsAgainstTruth):
         ekf2["summary"] |= {
             "truthP": consistency.truth.position_rmse_m,
             "truthV": consistency.truth.velocity_rmse_m_s,
         }
-    if hidden := error_beyond_reported_sigma(consistency):
+    if hidden := error_above_reported_sigma(consistency):
         ekf2["summary"]["reportedSigma"] = hidden.reported_sigma_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)

@@ -31,10 +31,10 @@ def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
     aid = remedy.aid_of(analysis)
     kind_by_change = {
         causal_replays.OUTLIERS: kinds.OUTLIERS,
-        causal_replays.CLOCK: kinds.CLOCK,
+        causal_replays.CLOCK_OFFSET: kinds.CLOCK,
         aid.delay: kinds.CLOCK,
-        causal_replays.TURN: kinds.FRAME,
-        causal_replays.FORWARD: kinds.ACCELEROMETER,
+        causal_replays.ROTATION: kinds.FRAME,
+        causal_replays.FORWARD_BIAS: kinds.ACCELEROMETER,
         causal_replays.SIGMA_Z: kinds.NOISE,
         aid.noise: kinds.NOISE,
         aid.gate: kinds.GATE,
@@ -79,17 +79,17 @@ def format_remedy(analysis: Analysis, cause: Intervention) -> str:
     if change.pop(causal_replays.OUTLIERS, None):
         check = "place of the antenna" if is_gnss else "line of sight, anchor survey"
         actions.append(f"Remove the outliers ({check}). Do not increase a noise for outliers.")
-    if change.pop(causal_replays.FORWARD, None) is not None:
+    if change.pop(causal_replays.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
-        change.pop(causal_replays.RIGHT)
-    if turn_deg := change.pop(causal_replays.TURN, None):
+        change.pop(causal_replays.RIGHT_BIAS)
+    if turn_deg := change.pop(causal_replays.ROTATION, None):
         # GNSS positions refer to true north, so EKF2's heading is wrong
         actions.append(
             f"Calibrate the magnetometer (heading error {turn_deg:+.0f}°), away from metal."
             if is_gnss
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
-    settings = (causal_replays.SIGMA_Z, causal_replays.SIGMA_A, causal_replays.CLOCK)
+    settings = (causal_replays.SIGMA_Z, causal_replays.SIGMA_A, causal_replays.CLOCK_OFFSET)
     options = [f"{OPTIONS[name].name} {change.pop(name):g}" for name in settings if name in change]
     if change:
         actions.append(f"Set {remedy.format_settings(change)}.")
@@ -125,14 +125,14 @@ def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> st
     match name:
         case causal_replays.OUTLIERS:
             return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
-        case causal_replays.CLOCK:
+        case causal_replays.CLOCK_OFFSET:
             offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             late = "late" if offset_s < 0 else "early"
             return f"timestamps corrected ({abs(offset_s):.2g} s {late})"
-        case causal_replays.FORWARD:
-            right = cause.change[causal_replays.RIGHT]
+        case causal_replays.FORWARD_BIAS:
+            right = cause.change[causal_replays.RIGHT_BIAS]
             return f"accelerometer bias removed ({value:+.2f} m/s² forward, {right:+.2f} right)"
-        case causal_replays.TURN:
+        case causal_replays.ROTATION:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
             mean = " on average" if is_drifting else ""
             return (

@@ -4,7 +4,7 @@ import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.comparison.causal_replays import cause_of
+from px4fuse.comparison.causal_replays import find_cause
 from px4fuse.ekf2_parameters import GNSS_POS, Aid
 from px4fuse.findings.cause_text import format_remedy_of_ekf2
 from px4fuse.findings.model import Finding, Findings, finding, format_percent, zero_length_spans
@@ -82,5 +82,5 @@ def _remedy(analysis: Analysis, axis: str) -> str:
         return fallback
     if isinstance(model, Unavailable):
         return f"{fallback} {remedy.format_not_replayed(model)}"
-    cause = cause_of(analysis.causes, "ekf2", axis)
+    cause = find_cause(analysis.causes, "ekf2", axis)
     return fallback if cause is None else format_remedy_of_ekf2(analysis, cause)

@@ -13,12 +13,12 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.causal_replays import (
-    ErrorBeyondSigma,
+    ErrorAboveSigma,
     Intervention,
-    cause_of,
-    error_beyond_reported_sigma,
+    error_above_reported_sigma,
+    find_cause,
 )
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison, FilterName
+from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth, FilterName
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -57,7 +57,7 @@ GNSS_REMEDY = (
 )
 
 
-def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorBeyondSigma]]:
+def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
     """Find errors larger than the reported σ that innovations do not show.
 
     Returns filter, axis and numbers of each, the largest mean NEES first.
@@ -66,7 +66,7 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
-        if (error := error_beyond_reported_sigma(summary))
+        if (error := error_above_reported_sigma(summary))
     ]
     return sorted(errors, key=lambda entry: -entry[2].nees)
 
@@ -80,7 +80,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def make_error_finding(
-    analysis: Analysis, hidden: list[tuple[FilterName, str, ErrorBeyondSigma]]
+    analysis: Analysis, hidden: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
     """Make the finding of large errors, with numbers of the worst axis of each filter."""
     (worst_filter, main_axis, worst), may_drift = hidden[0], analysis.source.origin.may_drift
@@ -96,7 +96,7 @@ def make_error_finding(
                 f"{filter_name}_position_rmse_m": error.rmse_m,
                 f"{filter_name}_sigma_p_m": error.reported_sigma_m,
             }
-            causes[filter_name] = cause = cause_of(analysis.causes, filter_name, axis, "nees")
+            causes[filter_name] = cause = find_cause(analysis.causes, filter_name, axis, "nees")
             along = analysis.axes[axis].axis.called
             sentences.append(
                 f"{label} along {along}: position RMSE {error.rmse_m:.2f} m, reported σ "
@@ -107,7 +107,7 @@ def make_error_finding(
                 sentences.append(f"{capitalise_first(format_rerun(analysis, cause))}.")
     kf_truth = analysis.axes[main_axis].filters["kf"].truth
     is_kf_better = (
-        isinstance(kf_truth, AgainstTruth)
+        isinstance(kf_truth, ErrorsAgainstTruth)
         and kf_truth.position_rmse_m < MAX_KF_ERROR_RATIO * worst.rmse_m
     )
     is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden)

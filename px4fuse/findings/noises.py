@@ -19,8 +19,8 @@ from px4fuse.comparison.causal_replays import (
     SIGMA_Z,
     SMALLEST_SIGMA_Z_M,
     Intervention,
-    cause_of,
-    interventions_on,
+    find_cause,
+    interventions_for,
     is_inconsistent,
     tuning_of_axis,
 )
@@ -162,7 +162,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         else axis_tuning.held_out.log_likelihood_gain_per_measurement
     )
     remedy_text, first_id = (
-        remedy.format_kf_remedy(analysis, values, unseen_nats=held_out_gain),
+        remedy.format_kf_remedy(analysis, values, held_out_nats=held_out_gain),
         None,
     )
     for name in worst_first:
@@ -299,7 +299,7 @@ def _variance_finding(
     ):
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
-        rerun = cause_of(analysis.causes, filter_name, result.axis.name)
+        rerun = find_cause(analysis.causes, filter_name, result.axis.name)
         cause, remedy_text = (
             classify_cause(analysis, rerun),
             _remedy(analysis, filter_name, result, axis_tuning, rerun),
@@ -350,7 +350,7 @@ def _format_excessive_noise(analysis: Analysis) -> str:
         analysis.ekf2_model,
         {name: float(f"{reported_m:.2g}")},
         remedy.noise_helps,
-        why=f"{prefix}. If the reported accuracy is right, ",
+        prefix=f"{prefix}. If the reported accuracy is right, ",
         fallback_remedy=f"{prefix}.",
     )
 
@@ -411,7 +411,7 @@ def _remedy_without_cause(
     axis_tuning: AxisTuning | None,
 ) -> str:
     """Format the action if no re-run explains the deviation, with the closest re-run."""
-    reruns = interventions_on(analysis.causes, filter_name, result.axis.name)
+    reruns = interventions_for(analysis.causes, filter_name, result.axis.name)
     if any(rerun.contradicts_truth for rerun in reruns):
         return KEEP_NOISES_TRUTH
     if reruns:

@@ -116,7 +116,7 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
     # GNSS timestamps are corrected by EKF2_GPS_DELAY, so detect_offset already covers that delay
     delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
     ml_delay_ms = -1e3 * clock.offset_s
-    tolerance_ms = max(1e3 * clock.three_sigma_s + remedy.UPDATE_MS, 1e3 * MIN_OFFSET_S)
+    tolerance_ms = max(1e3 * clock.three_sigma_s + remedy.PREDICTION_STEP_MS, 1e3 * MIN_OFFSET_S)
     if delay_ms is None or abs(delay_ms - ml_delay_ms) < tolerance_ms:
         return
     low_ms, high_ms = (-1e3 * end_s for end_s in reversed(clock.interval_s))

@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.flight_events import longest_s, source_gaps
+from px4fuse.comparison.flight_events import max_interval_s, source_gaps
 from px4fuse.filter.signals import within
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
@@ -41,7 +41,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         check = "line of sight to the anchors and the link"
         if analysis.source.origin.is_gnss:
             check = "the antenna's view of the sky, its cable and radio interference"
-        limit_s, count = longest_s(1.0 / rate_hz), len(spans)
+        limit_s, count = max_interval_s(1.0 / rate_hz), len(spans)
         number = "one gap" if count == 1 else f"{count} gaps"
         longest = "" if count == 1 else "the longest "
         yield warning(
@@ -123,7 +123,7 @@ def _intervals(analysis: Analysis) -> tuple[Array, float]:
     """Return the intervals (s) between positions in the segment without gaps, and the median."""
     intervals = np.diff(within(analysis.source.samples, analysis.segment).index.to_numpy())
     typical = float(np.median(intervals)) if len(intervals) else np.nan
-    return intervals[intervals <= longest_s(typical)], typical
+    return intervals[intervals <= max_interval_s(typical)], typical
 
 
 def _base_interval(intervals: Array) -> tuple[float, Array] | None:

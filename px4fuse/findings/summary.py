@@ -11,8 +11,8 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import causal_replays
-from px4fuse.comparison.causal_replays import Intervention, Statistic, cause_of, interventions_on
-from px4fuse.comparison.model import FILTERS, AgainstTruth, Difference, FilterName
+from px4fuse.comparison.causal_replays import Intervention, Statistic, find_cause, interventions_for
+from px4fuse.comparison.model import FILTERS, Difference, ErrorsAgainstTruth, FilterName
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at
@@ -64,7 +64,7 @@ def summarise(analysis: Analysis, findings: tuple[Finding, ...]) -> tuple[str, .
     """
     axis = analysis.main.axis.name
     cause_by_filter = {
-        filter_name: cause_of(
+        filter_name: find_cause(
             analysis.causes, filter_name, axis, _statistic_to_explain(analysis, filter_name)
         )
         for filter_name in FILTERS
@@ -120,7 +120,7 @@ def _statistic_to_explain(analysis: Analysis, filter_name: FilterName) -> Statis
     """Return the statistic that a cause explains: mean NEES if the error exceeds σ, else NIS."""
     return (
         "nees"
-        if causal_replays.error_beyond_reported_sigma(analysis.main.filters[filter_name])
+        if causal_replays.error_above_reported_sigma(analysis.main.filters[filter_name])
         else "nis"
     )
 
@@ -145,7 +145,7 @@ def _verdict_paragraph(
     if isinstance(result.ekf2_state, Unavailable):
         filters = ("kf",)
     elif not all(
-        isinstance(result.filters[filter_name].truth, AgainstTruth) for filter_name in filters
+        isinstance(result.filters[filter_name].truth, ErrorsAgainstTruth) for filter_name in filters
     ):
         difference_text = f"{along} KF and EKF2 are compared"
         if isinstance(result.difference, Difference):
@@ -185,10 +185,10 @@ def _filter_sentence(analysis: Analysis, filter_name: FilterName) -> str:
         size = "large" if summary.verdict == "underconfident" else "small"
         factor = format_factor(summary.sigma_error_factor)
         verdict = f"is {summary.verdict}: σ is {factor} times too {size}"
-    if not isinstance(summary.truth, AgainstTruth):
+    if not isinstance(summary.truth, ErrorsAgainstTruth):
         return f"By its innovations along {axis_label} {name} {verdict}."
     rmse = format_metres(summary.truth.position_rmse_m)
-    if error := causal_replays.error_beyond_reported_sigma(summary):
+    if error := causal_replays.error_above_reported_sigma(summary):
         verdict = f"reports σ {format_metres(error.reported_sigma_m)}"
         return f"Along {axis_label} {name} has a position RMSE of {rmse}, but {verdict}."
     return f"Along {axis_label} {name} has a position RMSE of {rmse} and {verdict}."
@@ -199,12 +199,12 @@ def _explanation(
 ) -> str:
     """Format the re-run that explains an inconsistent filter, or a note; empty if consistent."""
     summary, axis = analysis.main.filters[filter_name], analysis.main.axis.name
-    is_hidden = causal_replays.error_beyond_reported_sigma(summary)
+    is_hidden = causal_replays.error_above_reported_sigma(summary)
     if isinstance(summary, Unavailable) or (summary.verdict == "consistent" and not is_hidden):
         return ""
     if cause is not None:
         return f"{capitalise_first(format_rerun(analysis, cause))}."
-    reruns = interventions_on(
+    reruns = interventions_for(
         analysis.causes, filter_name, axis, _statistic_to_explain(analysis, filter_name)
     )
     if any(intervention.contradicts_truth for intervention in reruns):
@@ -276,7 +276,7 @@ def _difference_after_change(
     reductions = [
         intervention
         for filter_name, cause in causes.items()
-        for intervention in interventions_on(
+        for intervention in interventions_for(
             analysis.causes, filter_name, analysis.main.axis.name, "difference"
         )
         if cause is not None

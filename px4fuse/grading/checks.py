@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from px4fuse.answer_form import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.comparison.model import AgainstTruth
+from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, HorizontalNis
 from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import HORIZONTAL
@@ -366,7 +366,7 @@ def _score_tuning(
 def _error_m(comparison: ComparisonResults) -> float:
     """Return the largest known error (m) of the source, by ground truth or loop; else 0."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
-    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
+    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
     if isinstance(comparison.loop, LoopResult):
         errors_m.append(comparison.loop.closure_error_m or 0.0)
     return max(errors_m, default=0.0)

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.flight_events import longest_s
+from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import flight_for_source
+from px4fuse.comparison.preparation import select_innovations
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
@@ -180,7 +180,7 @@ def take_inventory(flight: Flight) -> Inventory:
         if not isinstance(error, MissingDataError):
             remedy = "Record the whole flight: set SDLOG_MODE to 0 (logging from arming)."
     if compared is not None:
-        flight = flight_for_source(flight, compared.source)
+        flight = select_innovations(flight, compared.source)
     log = flight.log
     is_cut = log.ends_in_flight and not log.damage
     return Inventory(
@@ -276,7 +276,7 @@ def _gaps(frame: pd.DataFrame, *, of_imu: bool) -> Gaps:
     limit_s = (
         max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))
         if of_imu
-        else float(longest_s(1.0 / sample_rate(frame)))
+        else float(max_interval_s(1.0 / sample_rate(frame)))
     )
     long_intervals = intervals[intervals > limit_s]
     return Gaps(

@@ -8,7 +8,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
+from px4fuse.comparison.causal_replays import error_above_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, within
@@ -91,7 +91,7 @@ def _write_verdict(page: Page, analysis: Analysis) -> None:
         is_judged = isinstance(one, Consistency)
         column, _ = halves()
         large_text = format_verdict(one)
-        if excess := error_beyond_reported_sigma(one):
+        if excess := error_above_reported_sigma(one):
             rmse, sigma = (format_number(m, 2) for m in (excess.rmse_m, excess.reported_sigma_m))
             large_text = f"position RMSE {rmse} m, reported σ {sigma} m"
         column.write(f"{name} along {along}")

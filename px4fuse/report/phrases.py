@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
-from px4fuse.comparison.model import UnjudgedFilter as Unjudged
+from px4fuse.comparison.model import UntestedFilter as Unjudged
 from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
