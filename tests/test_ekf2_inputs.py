@@ -39,8 +39,8 @@ from px4fuse.ekf2_parameters import (
     GNSS_POS,
     PARAMETERS,
     check_parameters,
+    effective_settings,
     fuses_by_mask,
-    settings_in_force,
 )
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Reset, Unavailable
@@ -64,13 +64,15 @@ AID = ("estimator_aid_src_ev_pos",)
 
 def test_settings_in_force_use_px4_defaults():
     """Defaults of PX4's module.yaml and params_*.yaml, by fused aid."""
-    vision, gnss = settings_in_force({}), settings_in_force({}, GNSS_POS)
+    vision, gnss = effective_settings({}), effective_settings({}, GNSS_POS)
     for names, other_names, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
         assert {*names} - {*other_names} == {name for name in PARAMETERS if name.startswith(begin)}
-    assert settings_in_force({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
-    assert settings_in_force({})["EKF2_EV_DELAY"] == 0.0
-    assert settings_in_force({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
-    assert settings_in_force({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
+    assert effective_settings({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
+    assert effective_settings({})["EKF2_EV_DELAY"] == 0.0
+    assert effective_settings({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
+    assert (
+        effective_settings({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
+    )
     assert not fuses_by_mask({"EKF2_AID_MASK": 8.0, "EKF2_EV_CTRL": 15.0})
 
 

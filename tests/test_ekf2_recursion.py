@@ -37,7 +37,7 @@ from px4fuse.ekf2.intervals import (
 )
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, effective_settings
 from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew
 
@@ -352,7 +352,7 @@ def at_rest(
         vision, correction_m=correction_m, velocity_m_s=speed_m_s, velocity_variance_m2_s2=exact
     )
     inputs = Inputs(
-        settings_in_force(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
+        effective_settings(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
         rules, 0.01, 0.1, 0.01,
         vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip

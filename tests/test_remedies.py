@@ -171,7 +171,7 @@ def test_remedy_tests_require_improvement_without_larger_rmse(after, noise, fewe
 def ekf2_remedy(analysis: Analysis, **changes: float) -> str:
     model, why, fallback_remedy = analysis.ekf2_model, "Reason: ", "Other action."
     return remedies.format_ekf2_remedy(
-        model, changes, remedies.noise_helps, difference_steps=why, fallback_remedy=fallback_remedy
+        model, changes, remedies.noise_helps, prefix=why, fallback_remedy=fallback_remedy
     )
 
 

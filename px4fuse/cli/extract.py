@@ -13,7 +13,7 @@ import click
 from px4fuse.cli.inputs import InputPath, comparison_request, options, recording_options
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError, to_one_line
-from px4fuse.input_files import check_output_folder, own_files
+from px4fuse.input_files import check_output_folder, inputs_not_registered
 from px4fuse.reading import read_text
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def extract(
 def _require_same_flight(folder: Path, sha256: str) -> None:
     """Raise an OutputError if the folder contains the tables of another log."""
     try:
-        with own_files():
+        with inputs_not_registered():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         before = json.loads(text)["log"]
         other = before["sha256"] != sha256

@@ -34,7 +34,7 @@ from px4fuse.request import (
     PositionFile,
 )
 from px4fuse.request import Option as Declared
-from px4fuse.units import NAMES, in_unit
+from px4fuse.units import NAMES, convert_to_unit
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
@@ -121,7 +121,7 @@ class TypedQuantity(click.ParamType["float | str"]):
         try:
             number = float(value)
         except ValueError:
-            parsed = in_unit(value, self.unit)
+            parsed = convert_to_unit(value, self.unit)
             example_text = f"{self.example if parsed is None else parsed:.12g}"
             self.fail(
                 f"{value!r} is not a number{unit}. Give for example {example_text}"

@@ -62,7 +62,7 @@ def sample(output: Path = FOLDER) -> None:
                 "or choose another folder (-o)."
             )
     first = next(path for path in contents if path.suffix == ".ulg")
-    command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
+    command = command_line(ComparisonRequest(log=str(first)), "compare", for_shell=True)
     page = Page()
     page.add("command", text=command, label="Run")
     write_and_print(contents, page)

@@ -325,12 +325,12 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
     """Return the parameter that R is derived from, or the reported accuracy."""
     value = log.parameters.get(aid.noise)
     if noise is None or value is None:
-        return "" if noise is None else aid.reported
+        return "" if noise is None else aid.noise_origin
     # EKF2 multiplies the noise of GNSS heights by 1.5
     for expected in (value, 1.5 * value, np.sqrt(value)):
         if abs(noise - expected) <= NOISE_TOLERANCE * expected:
             return aid.noise
-    return aid.reported or aid.noise
+    return aid.noise_origin or aid.noise
 
 
 def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, end_s: float) -> Span:

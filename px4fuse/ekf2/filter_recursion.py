@@ -725,7 +725,7 @@ def _measurements(
 ) -> tuple[Array, Array]:
     """Return measured velocity and position and their variances, both of shape (E, S, 6)."""
     received, aid = inputs.received, inputs.aid
-    offset_m = (np.stack([parameters[name] for name in aid.place], -1) - inputs.imu_offset_m)[
+    offset_m = (np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m)[
         :, :, None
     ]
     measured, noise = np.full((2, len(event_steps), len(offset_m), 6), np.nan)

@@ -16,7 +16,7 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_mean
 from px4fuse.ekf2.replay_segments import VELOCITY, ReplaySegment, SensorSamples, low_pass_weights
-from px4fuse.flight import FLOW_SHARE
+from px4fuse.flight import FLOW_FILTER_WEIGHT
 
 
 def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
@@ -33,7 +33,9 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
     count, interval_s = flow["samples"].to_numpy(), flow["interval_s"].to_numpy()
-    step, weight = low_pass_weights(segment, flow.index.to_numpy(), count, interval_s, FLOW_SHARE)
+    step, weight = low_pass_weights(
+        segment, flow.index.to_numpy(), count, interval_s, FLOW_FILTER_WEIGHT
+    )
     rotation_to_body = segment.rotation[step].swapaxes(2, 3)[:, :, :2]
     imu_velocity = np.einsum(
         "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_m_s[step]

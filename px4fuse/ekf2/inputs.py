@@ -34,8 +34,8 @@ from px4fuse.ekf2_parameters import (
     GNSS_VEL,
     MAG,
     Aid,
+    effective_settings,
     fuses_by_mask,
-    settings_in_force,
 )
 from px4fuse.flight import (
     Columns,
@@ -271,7 +271,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         return vision
     # since v1.17 each receiver has its lever arm, logged in its messages
     track = _gnss_track(flight) if is_gnss else None
-    place = {} if track is None else dict(zip(aid.place, track.lever_arm_m, strict=True))
+    lever_arm = {} if track is None else dict(zip(aid.lever_arm, track.lever_arm_m, strict=True))
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
@@ -308,7 +308,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     heights = segments[0].heights
     other_aids += [BAROMETER] if heights and BAROMETER.name in heights.fused else []
     return Inputs(
-        settings=settings_in_force(record.parameters, aid, *other_aids) | place,
+        settings=effective_settings(record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
         received=position_samples,
         rules=_rules(record, ekf2.step_s, is_gnss=is_gnss),
@@ -357,7 +357,7 @@ def _rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules
     if is_gnss:
         # resetHorizontalPositionTo, gps_control.cpp: variance doubled from v1.16 on; from main of
         # 2026 on each aid is checked separately
-        reset_scale = 2.0 if record.keeps_latitude else 1.0
+        reset_scale = 2.0 if record.stores_latitude else 1.0
         resets_together = GNSS_MODE not in record.parameters
         return FusionRules(
             np.inf,
@@ -414,7 +414,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         is_enabled = step_values_at(enabled, samples.index) > 0.0
         samples, velocities = samples[is_enabled], velocities[is_enabled]
     # the track is at measurement times; the replay subtracts the delay, which is added here
-    flown = settings_in_force(parameters, GNSS_POS)
+    flown = effective_settings(parameters, GNSS_POS)
     flown_s = flown[GNSS_POS.delay] * 1e-3
     timestamp_s = samples.index.to_numpy() + flown_s
     # m, upper limit of the GNSS position noise in EKF2 (gps_control.cpp)
@@ -541,7 +541,7 @@ def _logged_decisions(
         or not has_own_topic
     ):
         return rejected, reset
-    delay_s = settings_in_force(record.parameters, aid)[aid.delay] * 1e-3
+    delay_s = effective_settings(record.parameters, aid)[aid.delay] * 1e-3
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
     rejected[sample_row >= 0] = innovations["rejected"].to_numpy()[sample_row[sample_row >= 0]]

@@ -299,7 +299,7 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
     # the delay is already subtracted from the GNSS timestamps of KF
     applied_delay_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
-    without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.place, 0.0)}
+    without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
     aids = modelled_aids(inputs)
     other_aids = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
     kf_variant = Variant(

@@ -59,7 +59,7 @@ def vision_samples(
     is_usable &= np.isfinite(vision.position_m[:, 0])
     is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses the newer of two samples in one step
     step = step[is_usable]
-    lever_arm_m = np.array([settings[name] for name in EV_POS.place]) - inputs.imu_offset_m
+    lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
     position_m = (vision.position_m[is_usable] - segment.rotation[step] @ lever_arm_m)[:, :2]
     more_columns = measured_at_s[is_usable], time_s[step], *vision.variance_m2[is_usable, :2].T
     return samples_by_event(segment, event_steps, step, position_m, slice(0, 2), *more_columns)

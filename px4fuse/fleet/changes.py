@@ -76,9 +76,9 @@ def changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
     )
 
 
-def _compared(side: DiffInput) -> contract.Compared:
+def _compared(side: DiffInput) -> contract.DiffInput:
     log = side.results.log
-    return contract.Compared(
+    return contract.DiffInput(
         given=side.given,
         kind=side.kind,
         log=log.name,
@@ -139,7 +139,7 @@ def number_changes(
 
 def _findings(a: Results, b: Results) -> Iterator[contract.FindingChange]:
     """Yield the findings that only one of the two has, compared by id and severity."""
-    both: tuple[tuple[Results, Results, contract.Which], ...]
+    both: tuple[tuple[Results, Results, contract.DiffSide], ...]
     both = ((b, a, "B"), (a, b, "A"))
     for results, other, only_in in both:
         ids = {(finding.id, finding.severity) for finding in other.findings}

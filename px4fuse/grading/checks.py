@@ -29,7 +29,7 @@ from px4fuse.results.contract import (
     TUNED_FIELDS,
     ComparisonResults,
     LoopResults,
-    Reported,
+    ReportedResults,
     to_plain,
 )
 from px4fuse.results.reading import one_line
@@ -99,7 +99,7 @@ class Evidence:
     ``owner_id`` is the student id according to the learning platform.
     """
 
-    results: Reported
+    results: ReportedResults
     verdict: Verdict
     key: AnswerKey | None
     owner_id: str = ""

@@ -15,7 +15,7 @@ from px4fuse.assignment.roster import normalise_text
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.grading.model import GradedReport
 from px4fuse.request import LoopRequest
-from px4fuse.results.contract import LoopResults, Reported
+from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
 from px4fuse.text import capitalise_first, join_first
@@ -46,7 +46,7 @@ def page_flags(verdict: Verdict) -> Iterator[str]:
         )
 
 
-def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
+def own_flags(results: ReportedResults, handed_out: bool = False) -> Iterator[str]:
     """Flag unusual settings of one report.
 
     ``handed_out``: an answer key exists, so that simulated logs are expected.

@@ -39,7 +39,7 @@ from px4fuse.grading.class_page import html_text
 from px4fuse.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from px4fuse.grading.model import TOTAL, Entry, GradedReport, columns
 from px4fuse.grading.records import RECORDS, REDRAWN_SUFFIX
-from px4fuse.input_files import own_files
+from px4fuse.input_files import inputs_not_registered
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutralise_formulas, neutralise_id
 from px4fuse.text import join_first
@@ -167,7 +167,7 @@ def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
-        with own_files():
+        with inputs_not_registered():
             sheet = read_sheet(path)
         for row in sheet.rows:
             name, identity, student = (sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_HEAD)

@@ -63,8 +63,8 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     if not known and topics.find(px4.LAYOUTS["control_bits"]) is not None:
         bits = topics.primary_samples(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
         for aid in every if len(bits) else ():
-            if aid.bit is not None:
-                on = bits.to_numpy().astype(np.int64) >> aid.bit & 1
+            if aid.status_bit is not None:
+                on = bits.to_numpy().astype(np.int64) >> aid.status_bit & 1
                 enabled[aid.name] = pd.Series(on.astype(float), index=bits.index)
     return enabled
 
@@ -109,9 +109,9 @@ def _read_last_values(topics: Topics, aid: Aid, enabled: pd.Series[float] | None
             )
         ]
     )
-    if aid.before:
-        both = _columns("innovation", aid, aid.before)
-        squares = (field.replace("innov", "innov_var") for field in aid.before)
+    if aid.old_fields:
+        both = _columns("innovation", aid, aid.old_fields)
+        squares = (field.replace("innov", "innov_var") for field in aid.old_fields)
         both |= _columns("variance", aid, squares)
         layouts.append((Layout(px4.OLD_INNOVATIONS, both),) * 2)
     for values, variances in layouts:

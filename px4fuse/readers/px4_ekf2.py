@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from px4fuse import flight
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, settings_in_force
+from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
 from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout, expand_columns
@@ -70,7 +70,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled = read_enabled_aids(topics)
     fusing = _read_fusing(topics, enabled)
-    gate = settings_in_force(parameters)[EV_POS.gate]
+    gate = effective_settings(parameters)[EV_POS.gate]
     aids = read_aids(topics, enabled)
     innovations, innovation_topics = innovations_of(aids, fusing, gate)
     if innovation_topics:
@@ -370,7 +370,7 @@ def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.Da
     if FLOW.name in enabled:
         row = row[step_values_at(enabled[FLOW.name], times[row]) > 0.0]
     samples = np.rint((times[row] - times[row - 1]) / interval_s)
-    filter_memory = ((1.0 - flight.FLOW_SHARE) ** samples)[:, None]
+    filter_memory = ((1.0 - flight.FLOW_FILTER_WEIGHT) ** samples)[:, None]
     low_passed = speed[["forward_m_s", "right_m_s"]].to_numpy()
     forward, right = (
         (low_passed[row] - filter_memory * low_passed[row - 1]) / (1.0 - filter_memory)

@@ -10,7 +10,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
 from px4fuse.flight import (
     Columns,
     Ekf2,
@@ -112,14 +112,16 @@ def _track(
     """Make a ULog track; ``turns`` is True if it has an orientation that changes."""
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, turns=turns)
-    places = ("", "", "") if origin.aid is None else origin.aid.place
+    places = ("", "", "") if origin.aid is None else origin.aid.lever_arm
     known = {
         "description": source.description,
         "topics": used,
         "log": topics.log.name,
         "frame": "NED",
         "clock": AUTOPILOT_CLOCK,
-        "lever_arm_m": tuple(float(topics.ekf2_parameters.get(place, 0.0)) for place in places),
+        "lever_arm_m": tuple(
+            float(topics.ekf2_parameters.get(lever_arm, 0.0)) for lever_arm in places
+        ),
     }
     return make_track(name, samples, origin, **(known | more))
 
@@ -308,8 +310,8 @@ def project_to_ned(geo: pd.DataFrame, origin: GeodeticPosition | None) -> pd.Dat
     latitude, longitude, altitude = geo[GLOBAL_COLUMNS].to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin[:2])
-    place = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
-    return pd.DataFrame(place, index=geo.index)
+    lever_arm = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
+    return pd.DataFrame(lever_arm, index=geo.index)
 
 
 def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
@@ -331,7 +333,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     has_driver_times = GNSS_MODE in parameters and bool(
         np.any(published_s - gps.index > SAME_TIME_US * 1e-6)
     )
-    delay_ms = 0.0 if has_driver_times else settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
+    delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, measurement times of the receiver driver"
     if not has_driver_times:
         gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))

@@ -40,7 +40,7 @@ from px4fuse.ekf2.replay_segments import (
     downsample_imu,
     step_ends,
 )
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, effective_settings
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
@@ -88,7 +88,7 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
     """Return the flown value of all EKF2 parameters in the model, by PX4 name."""
     aid = scenario.aid
     gnss = aid == GNSS_POS
-    known = settings_in_force({}, *_fused_aids(scenario))
+    known = effective_settings({}, *_fused_aids(scenario))
     delay_ms = known[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
     of_aid: dict[str, float] = {aid.noise_mode: 1}
     if gnss:
@@ -136,7 +136,7 @@ def simulate_ekf2(
         segment = replace(segment, heights=_barometer_heights(segment, barometer))
         if not known[MAG.switch]:
             segment = _with_field(segment, magnetometer)
-    settings = settings_in_force(known, *aids)
+    settings = effective_settings(known, *aids)
     rules = GNSS_RULES if aid == GNSS_POS else RULES
     step_s = float(np.median(segment.step_s))
     length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICT_US))
