@@ -42,11 +42,11 @@ from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.correlated_noise import (
     SourceLowPass,
     TimeCorrelatedNoise,
+    fit_time_correlation,
     fit_time_correlation_to_truth,
-    time_correlation_fit,
 )
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, bias_scale_jump_fit
+from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, fit_bias_scale_jumps
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import ClockOffset
@@ -130,7 +130,7 @@ class Analysis(Comparison):
         if isinstance(horizontal, Unavailable):
             return horizontal
         axes, axis_tuning, offset_s = horizontal
-        return bias_scale_jump_fit(
+        return fit_bias_scale_jumps(
             self.flight,
             axes,
             self.settings,
@@ -159,7 +159,7 @@ class Analysis(Comparison):
         for jump in jumps:
             is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
             excluded_s = np.union1d(excluded_s, time_s[is_after_jump])
-        correlation_fit = time_correlation_fit(
+        correlation_fit = fit_time_correlation(
             self.flight,
             axes,
             self.settings,

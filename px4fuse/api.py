@@ -26,7 +26,8 @@ from px4fuse.writing import write_all
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table() and their types: fields of FilterSummary and AgainstTruth; nis_band is split
+# Columns of table() and their types: fields of FilterSummary (nis_band is split) and of
+# ErrorsAgainstTruth
 COLUMNS = {
     "count": "Int64",
     "nis_mean": "float64",

@@ -195,7 +195,7 @@ def practice_text(
         command="practice",
         heading="Find the mistakes in this flight",
         title=f"seed {seed}, level {level}",
-        rounds=count,
+        flight_count=count,
         choices=CHOICES,
     )
 

@@ -14,8 +14,6 @@ from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
-from px4fuse.record import table
-
 AUTO: Literal["auto"] = "auto"
 # Default settings of KF
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
@@ -256,42 +254,59 @@ class EvaluationRequest(_RequestBase, frozen=True, kw_only=True):
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
-class Option(msgspec.Struct, frozen=True):
-    """Option of the command line for one field of a request.
-
-    Attributes
-    ----------
-    name : str
-    meaning : str
-        Help text; empty if the command declares the option itself.
-    unit : str
-        Unit of a number, one of :data:`px4fuse.units.NAMES`.
-    example : float
-        Number in the error message if the typed text is not a number.
-    metavar : str or None
-    """
-
-    name: str
-    meaning: str = ""
-    unit: str = ""
-    example: float = 0.1
-    metavar: str | None = None
-
-
-_TABLES = table(__file__, "options.toml", dict[str, dict[str, Option]])
-# Options by topic, from options.toml
-RECORDINGS, FILTER_OPTIONS = _TABLES["recordings"], _TABLES["filter"]
-POSITION_OPTIONS, CLOCK_OPTION = _TABLES["position"], _TABLES["clock"]
-LOOP_OPTIONS, EVALUATION_OPTIONS = _TABLES["loop"], _TABLES["evaluation"]
-OPTIONS = RECORDINGS | POSITION_OPTIONS | CLOCK_OPTION | FILTER_OPTIONS
-_OPTIONS_BY_REQUEST: dict[type[msgspec.Struct], Mapping[str, Option]] = {
-    ComparisonRequest: OPTIONS,
-    PositionFile: POSITION_OPTIONS,
-    LoopRequest: LOOP_OPTIONS,
-    WhatIfRequest: RECORDINGS,
-    EvaluationRequest: EVALUATION_OPTIONS,
+_POSITION_OPTIONS = {
+    "path": "--position",
+    "frame": "--position-frame",
+    "yaw_deg": "--position-yaw",
+    "columns": "--position-columns",
+    "time_unit": "--position-time-unit",
+    "length_unit": "--position-unit",
 }
-
+# Option for each field of a request that is not an argument of the command
+OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
+    ComparisonRequest: {
+        "mavlink": "--mavlink",
+        "system": "--system",
+        "position_source": "--position-source",
+        "source_kind": "--source-kind",
+        "height": "--height",
+        "sigma_a_m_s2": "--sigma-a",
+        "sigma_z_m": "--sigma-z",
+        "dt_s": "--dt",
+        "input": "--input",
+        "axes": "--axis",
+        "heading_deg": "--heading",
+        "start_s": "--start",
+        "end_s": "--end",
+        "clock_offset_s": "--clock-offset",
+        **_POSITION_OPTIONS,
+    },
+    PositionFile: _POSITION_OPTIONS,
+    LoopRequest: {
+        "system": "--system",
+        "frame": "--frame",
+        "reference": "--reference",
+        "start_s": "--from",
+        "end_s": "--to",
+        "landed_at": "--landed-at",
+        "closed_loop": "--open",
+        "closures": "--closure",
+        "position_drift_m": "--drift",
+        "heading_drift_deg": "--heading-drift",
+        "key_frames_m": "--key-frames",
+    },
+    WhatIfRequest: {"mavlink": "--mavlink", "system": "--system"},
+    EvaluationRequest: {
+        "system": "--system",
+        "alignment": "--alignment",
+        "association": "--association",
+        "max_gap_s": "--max-gap",
+        "time_offset_s": "--time-offset",
+        "rpe": "--rpe",
+        "consecutive": "--consecutive",
+    },
+}
+COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
 # Options for arguments that are named in errors and are not fields of a request
 _ARGUMENTS = {
     "position": "--position",
@@ -300,14 +315,14 @@ _ARGUMENTS = {
 }
 
 
-def with_options(text: str, options: Mapping[str, Option] = OPTIONS) -> str:
+def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS) -> str:
     """Replace argument names in backticks by the options of the command line.
 
     >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
     '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
     """
-    names = _ARGUMENTS | {field: option.name for field, option in options.items()}
-    return re.sub(r"`(\w+)`", lambda name: names.get(name[1], name[0]), text)
+    names = {**_ARGUMENTS, **option_names}
+    return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), text)
 
 
 def command_line(
@@ -368,15 +383,15 @@ def _path_argument(path: str) -> str:
 
 def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
     """Yield options and values (None for a flag) of fields that are not at their defaults."""
-    options = _OPTIONS_BY_REQUEST[type(request)]
+    option_names = OPTION_NAMES[type(request)]
     for field in msgspec.structs.fields(request):
         value = getattr(request, field.name)
-        if field.name not in options or value == field.default:
+        if field.name not in option_names or value == field.default:
             continue
         values = value if field.name in ("axes", "closures", "rpe") else (value,)
         for single_value in values:
-            name = options[field.name].name
-            yield name, None if isinstance(single_value, bool) else _option_text(single_value)
+            text = None if isinstance(single_value, bool) else _option_text(single_value)
+            yield option_names[field.name], text
     if (position := getattr(request, "position", None)) is not None:
         yield from _all_options(position)
 

@@ -200,7 +200,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
     ),
     "another schema": (
         set_value("9.9", "schema", "version"), "cannot verify",
-        "use the px4fuse version that wrote it",
+        "read it with px4fuse",
     ),
     "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
     "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),

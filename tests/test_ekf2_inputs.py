@@ -53,7 +53,7 @@ from px4fuse.position_source import (
     RECEIVED,
     Origin,
 )
-from px4fuse.trajectory.rotation import matrix
+from px4fuse.trajectory.rotation import to_matrix
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
 AID = ("estimator_aid_src_ev_pos",)
@@ -323,7 +323,7 @@ def test_stretch_rotating_vehicle_has_expected_fields():
     steps = 10.5 + 0.01 * np.arange(101)
     assert_allclose(found.time_s, steps, atol=1e-9)
     assert_allclose(found.step_s, 0.01, atol=1e-9)
-    turned = matrix(facing(steps))
+    turned = to_matrix(facing(steps))
     assert_allclose(found.rotation, turned, atol=1e-6)
     assert_allclose(found.correction_rad, 0.0, atol=1e-6)
     # body frame at the end of the step, without bias

@@ -382,7 +382,10 @@ def test_examples_contain_rates_of_the_study() -> None:
         assert example.detection == dict(zip(faulty["condition"], faulty["rate"], strict=True))
 
 
-@pytest.mark.parametrize("typed", ["source_scale_error", "Source-Scale-Wrong"])
+@pytest.mark.parametrize(
+    "typed",
+    ["source_scale_error", "Source-Scale-Error", "source_scale_wrong"],  # former name
+)
 def test_explain_finding_prints_its_page(typed, monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)

@@ -16,7 +16,7 @@ from flights import aisle_flight, unavailable, unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_frame_rotation, estimate_noises_and_clock
-from px4fuse.filter.hypotheses import DesignMatrix, bias_scale_jump_fit, make_design_matrix
+from px4fuse.filter.hypotheses import DesignMatrix, fit_bias_scale_jumps, make_design_matrix
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -208,7 +208,7 @@ def test_scale_estimate_noise_does_not_bias_it() -> None:
     for seed in range(5):
         flown = simulate_flight(Scenario(ekf2=False, truth=False, seed=seed))
         comparison = compare(flown, RIGHT, axes=("north", "east"))
-        found = bias_scale_jump_fit(
+        found = fit_bias_scale_jumps(
             comparison.flight, tuple(result.axis for result in comparison.axes.values()), RIGHT,
             sigma_a_m_s2=0.2, sigma_z_m=0.1, outlier_time_s=np.array([]), clock_offset_s=0.0,
         )  # fmt: skip

@@ -272,7 +272,7 @@ def stream_bomb(kind: bytes) -> bytes:
     (with_attachment(bomb(8_000_000)), "larger than 5 MB"),
     (with_attachment(stream(bytes(6_000_000), b"/Type /EmbeddedFile")), "larger than 5 MB"),
     (content_bomb(1_000_000_000), "expands to more"),
-    (content_bomb(30_000_000), "expands to more"),
+    (content_bomb(30_000_000), "printed to PDF. Hand in the original"),
     (raw_pdf(CATALOG, *[bomb(15_000_000, b"")] * 8), "expands to more"),
     (stream_bomb(b"XRef"), "expands to more"),
     (stream_bomb(b"ObjStm"), "expands to more"),

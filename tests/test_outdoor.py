@@ -33,7 +33,7 @@ from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
 from px4fuse.simulation.mistakes import Mistakes, parse
 from px4fuse.simulation.scenario import Scenario, make_scenario
-from px4fuse.trajectory.rotation import interpolate, matrix
+from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 OUTDOOR = make_scenario("outdoor", seed=5)
 pytestmark = pytest.mark.usefixtures("quick_filter")
@@ -101,7 +101,7 @@ def test_simulated_field_and_height_have_stated_noise(tmp_path: Path) -> None:
         measured.index.to_numpy(), flight.truth.attitude.index.to_numpy(),
         flight.truth.attitude[Columns.QUATERNION].to_numpy(),
     )  # fmt: skip
-    expected = np.einsum("nji,j->ni", matrix(true), sensors.EARTH_FIELD_GAUSS)
+    expected = np.einsum("nji,j->ni", to_matrix(true), sensors.EARTH_FIELD_GAUSS)
     off = measured.drop(columns="fused_3d").to_numpy() - expected
     before = measured.index < 60.0
     np.testing.assert_allclose(off[before].mean(axis=0), 0.0, atol=0.008)

@@ -199,7 +199,7 @@ def test_page_source_does_not_show_answers(quiz: Path) -> None:
         flight = json.loads(content)["flight"]
         assert flight["findings"] == flight["summary"] == []
         assert "mistake" not in content
-        assert "px4fuse compare 'flight" in flight["command"]["bare"]
+        assert "px4fuse compare 'flight" in flight["command"]["base"]
     for one in answers:
         assert one["summary"]
         for mistake in one["mistakes"]:

@@ -150,6 +150,29 @@ def test_read_results_schema_violation_is_refused(values, said):
         decode_results(changed_results(**values))
 
 
+def test_read_results_fields_of_a_newer_minor_version_are_ignored():
+    known = decode_results(changed_results(schema__version="4.9999"))
+    more = changed_results(
+        schema__version="4.9999", new=1, log__new={}, axes__aisle__filters__kf__new=[0.0],
+        tuning__horizontal__held_out__new=None, source__available=[
+            {**one, "new": "x"} for one in EXAMPLE["source"]["available"]],
+    )  # fmt: skip
+    assert decode_results(more) == known
+    assert replace(known, schema=decode_results(EXAMPLE).schema) == decode_results(EXAMPLE)
+    with pytest.raises(ResultsError, match="unknown field `new`"):
+        decode_results({**more, "schema": EXAMPLE["schema"]})
+
+
+@pytest.mark.parametrize(
+    ("provenance", "said"),
+    [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "the px4fuse that wrote it.")],
+)
+def test_read_results_of_schema_3_names_the_version_to_use(provenance, said):
+    with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:
+        decode_results(changed_results(schema__version="3.0", provenance=provenance))
+    assert str(raised.value).endswith(f"Create the report again, or read it with {said}")
+
+
 def test_read_results_cleans_keys_like_texts():
     nothing = {"what": "noises", "reason": "too short", "remedy": ""}
     assert list(decode_results(changed_results(tuning={"a\u202eb": nothing})).tuning) == ["ab"]

@@ -39,7 +39,7 @@ from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
 from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, nis_band
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, nis_band
 from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.hypotheses import BiasScaleJumpFit
@@ -302,7 +302,9 @@ def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[Filter
     """Return True if the mean NIS is outside its band and σ is wrong by at least 25 %."""
     if isinstance(summary, Unavailable):
         return False
-    return summary.verdict != "consistent" and summary.sigma_error_factor >= SIGMA_FACTOR_FINDING
+    return (
+        summary.verdict != "consistent" and summary.sigma_error_factor >= MIN_FINDING_SIGMA_FACTOR
+    )
 
 
 def _find_discrepancies(summary: FilterSummary | UntestedFilter) -> list[Statistic]:

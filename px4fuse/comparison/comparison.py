@@ -21,7 +21,7 @@ from px4fuse.comparison.model import (
     Updates,
 )
 from px4fuse.comparison.preparation import Choices, prepare
-from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess_horizontal
+from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
@@ -89,7 +89,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
     variance: Frame
     innovations: Frame
     axis_difference: Difference | Unavailable
-    horizon, gate = None, GATE_SIGMA if isinstance(ekf2, Unavailable) else ekf2.gate
+    horizon, gate = None, DEFAULT_GATE if isinstance(ekf2, Unavailable) else ekf2.gate
     if isinstance(ekf2, Unavailable):
         state = variance = innovations = axis_difference = ekf2
     else:
@@ -116,7 +116,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
         ),
         filters={
             "kf": _summarise_filter(
-                updates, kf_run.steps, kf_error_statistics(kf_run, truth, state), GATE_SIGMA
+                updates, kf_run.steps, kf_error_statistics(kf_run, truth, state), DEFAULT_GATE
             ),
             "ekf2": _summarise_filter(
                 innovations, variance, error_statistics(state, variance, truth, horizon), gate

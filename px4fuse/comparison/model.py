@@ -54,7 +54,7 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
         Median reported σ over the segment; None if not logged.
     sigma_p_before_update_m, sigma_p_after_update_m : float or None
         Median reported σ before and after an update; for EKF2 from P⁻ = S - R, P⁺ = P⁻R/S.
-    truth : AgainstTruth or Unavailable
+    truth : ErrorsAgainstTruth or Unavailable
     """
 
     sigma_p_median_m: Positive | None = None
@@ -108,7 +108,7 @@ class AxisResult(Record, frozen=True, kw_only=True):
     note : str
         Origin of the direction.
     updates : Updates
-    filters : mapping from "kf" and "ekf2" to FilterSummary or UnjudgedFilter
+    filters : mapping from "kf" and "ekf2" to FilterSummary or UntestedFilter
     difference : Difference or Unavailable
     rejected_fraction : float or None
         Share of the source's samples that EKF2 rejected; None if not logged.

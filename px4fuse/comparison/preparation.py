@@ -24,7 +24,7 @@ from px4fuse.readers.px4_innovations import (
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 from px4fuse.request import HeightName
 from px4fuse.text import capitalise_first
-from px4fuse.trajectory.rotation import interpolate, matrix
+from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origins of external positions by their PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
@@ -190,7 +190,7 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
     attitude_samples = attitude.index.to_numpy(), attitude[Columns.QUATERNION].to_numpy()
-    lever_arm_ned = matrix(
+    lever_arm_ned = to_matrix(
         interpolate(track.samples.index.to_numpy(), *attitude_samples)
     ) @ np.asarray(track.lever_arm_m)
     samples = track.samples.copy()

@@ -25,7 +25,7 @@ from px4fuse.filter.signals import AISLE, make_axes
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
-from px4fuse.request import OPTIONS
+from px4fuse.request import COMPARISON_OPTIONS
 from px4fuse.text import capitalise_first
 
 # Minimum ratio of √R to EKF2_EVP_NOISE from which R counts as reported by the sender
@@ -279,7 +279,9 @@ def format_kf_remedy(
         name: float(f"{value:.3g}") for name, value in changes.items()
     }
     options_text = (
-        " ".join(f"{OPTIONS[name].name} {value:g}" for name, value in rounded_settings.items())
+        " ".join(
+            f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in rounded_settings.items()
+        )
         + suffix
     )
     changed = replace(comparison.settings, **rounded_settings)

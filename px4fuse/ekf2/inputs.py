@@ -51,7 +51,7 @@ from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
-from px4fuse.trajectory.rotation import conjugate, interpolate, matrix, multiply
+from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
 # Note in simulated logs, whose EKF2 is this model
@@ -496,7 +496,7 @@ def read_vision(
             interpolate(timestamp_s, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
             for frame in (attitude, track.orientation)
         )
-        rotation = matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
+        rotation = to_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
         position = np.einsum("nij,nj->ni", rotation, position)
         variance = np.einsum("nij,nj->ni", rotation**2, variance)
     age = record.vision_age_s

@@ -16,7 +16,7 @@ from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.notebook_display import one_line_repr
-from px4fuse.readers.px4_innovations import along as innovations_along
+from px4fuse.readers.px4_innovations import innovations_along
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
 Spans = tuple[Span, ...]

@@ -19,11 +19,11 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
+    cumulative_product,
     from_vector,
     interpolate,
-    matrix,
     multiply,
-    running_product,
+    to_matrix,
     to_vector,
 )
 
@@ -444,7 +444,9 @@ def _make_segment(
     )
     times = time[np.concatenate([[0], ends])]
     step = np.diff(times)
-    gyro = running_product(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(rotation_vectors)]))
+    gyro = cumulative_product(
+        np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(rotation_vectors)])
+    )
 
     def attitude_beyond(
         frame: pd.DataFrame, early_s: float, end_stamps: Array
@@ -469,7 +471,7 @@ def _make_segment(
     return ReplaySegment(
         time_s=times,
         step_s=step,
-        rotation=matrix(nominal),
+        rotation=to_matrix(nominal),
         correction_rad=to_vector(multiply(extra_rotation[1:], conjugate(extra_rotation[:-1]))),
         force_m_s2=velocity_increments / step[:, None],
         accelerometer_bias_m_s2=bias,

@@ -7,9 +7,10 @@ from px4fuse.comparison import causal_replays, remedy
 from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.frame_rotation import HeadingError
+from px4fuse.filter.settings import UNITS
 from px4fuse.findings import cause_grouping as kinds
 from px4fuse.flight import Unavailable
-from px4fuse.request import OPTIONS
+from px4fuse.request import COMPARISON_OPTIONS
 from px4fuse.text import capitalise_first, format_number
 
 # Findings that state the same fault as a re-run, by kind of cause; the summary omits them
@@ -90,7 +91,9 @@ def format_remedy(analysis: Analysis, cause: Intervention) -> str:
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
     settings = (causal_replays.SIGMA_Z, causal_replays.SIGMA_A, causal_replays.CLOCK_OFFSET)
-    options = [f"{OPTIONS[name].name} {change.pop(name):g}" for name in settings if name in change]
+    options = [
+        f"{COMPARISON_OPTIONS[name]} {change.pop(name):g}" for name in settings if name in change
+    ]
     if change:
         actions.append(f"Set {remedy.format_settings(change)}.")
     if options:
@@ -141,7 +144,7 @@ def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> st
                 else f"positions rotated by {value:+.0f}°{mean}"
             )
         case causal_replays.SIGMA_A | causal_replays.SIGMA_Z:
-            label, unit = name[:7].upper(), OPTIONS[name].unit
+            label, unit = name[:7].upper(), UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
     flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit

@@ -29,7 +29,7 @@ from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, Filter
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
-from px4fuse.filter.settings import Settings
+from px4fuse.filter.settings import UNITS, Settings
 from px4fuse.filter.signals import within
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
@@ -51,7 +51,6 @@ from px4fuse.findings.model import (
 )
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
-from px4fuse.request import OPTIONS
 from px4fuse.text import format_factor, format_number
 
 MIN_NOISE_RATIO = 1.5  # ratio of σ; below, the tracks hardly change
@@ -167,7 +166,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     )
     for name in worst_first:
         (value, size, severity), noise = wrong_settings[name], ml_noises[name]
-        direction, unit = "small" if chosen[name] < value else "large", OPTIONS[name].unit
+        direction, unit = "small" if chosen[name] < value else "large", UNITS[name]
         is_bound = noise.value is None
         interval = f"; 95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit}" if noise.high else ""
         setting_finding = finding(

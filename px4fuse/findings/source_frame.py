@@ -1,7 +1,7 @@
 """Frame of the source: FRD instead of NED, misalignment, EKF2 heading errors, file alignment."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.frame_rotation import MAX_DRIFT_P, HeadingError
+from px4fuse.filter.frame_rotation import MAX_DRIFT_P_VALUE, HeadingError
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Finding, Findings, Severity, finding, fraction_on, note, warning
 from px4fuse.flight import Ekf2, Unavailable
@@ -136,7 +136,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
             "from_s": first.start_s,
             "to_s": last.end_s,
             "p": max(heading.drift_p, 1e-300),
-            "p_limit": MAX_DRIFT_P,
+            "p_limit": MAX_DRIFT_P_VALUE,
         },
     )
 

@@ -22,7 +22,7 @@ from px4fuse.findings.model import Finding, format_percent
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.readers.px4_ekf2 import OTHER_AIDING
+from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 from px4fuse.text import capitalise_first, format_factor
 
 MAX_PARAGRAPHS = 3  # paragraphs of the summary
@@ -259,7 +259,7 @@ def _find_continuously_fused_aids(
 ) -> list[str]:
     """Return the labels of motion aids that EKF2 fused without a gap of half the span."""
     labels = []
-    for name in (EV_POS.name, *OTHER_AIDING):
+    for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
         log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
         if log is not None and "fused" in log.samples:
             fused = log.samples["fused"].loc[start_s:end_s]

@@ -11,7 +11,7 @@ from px4fuse.findings import finding_title
 from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, PLACES
 from px4fuse.text import format_factor, format_number, join_first
 from px4fuse.webpage import frame
-from px4fuse.webpage.frame import Cell, Column, Part, Row
+from px4fuse.webpage.frame import Cell, Column, Row, Section
 from px4fuse.webpage.safe import clean, local_link
 
 STATUS_STYLES = {DONE: "good", NOT_COMPARED: "open", FAILED: "bad"}
@@ -93,7 +93,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             if log["status"] == FAILED
             else frame.number_cell(float(len(finding_titles)), below=join_first(finding_titles, 2)),
         )
-        rows.append(Row(cells, tuple(log["tags"]), _details(log), _side_parts(log)))
+        rows.append(Row(cells, tuple(log["tags"]), _details(log), _side_sections(log)))
     return frame.page(
         title=title,
         subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}, compared with {made_with}",
@@ -122,7 +122,7 @@ def _figure(value: float | None, format_value: Callable[[float], str]) -> Cell:
     return Cell() if value is None else frame.number_cell(value, format_value(value))
 
 
-def _details(log: Log) -> tuple[Part, ...]:
+def _details(log: Log) -> tuple[Section, ...]:
     axes = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
@@ -130,22 +130,24 @@ def _details(log: Log) -> tuple[Part, ...]:
     ]
     heads = ["", *(axis["axis"] for axis in log["axes"])]
     return (
-        frame.list_part(
-            "Missing results", [reason for reason, _ in log["lacking"] if reason], warn=True
+        frame.list_section(
+            "Missing results", [reason for reason, _ in log["lacking"] if reason], is_warning=True
         ),
-        frame.list_part("Actions", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
-        frame.list_part("Summary", list(filter(None, log.get("summary", "").splitlines()))),
-        frame.list_part("Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]),
-        frame.table_part("Axes", heads if axes else (), axes, range(1, len(heads))),
+        frame.list_section("Actions", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
+        frame.list_section("Summary", list(filter(None, log.get("summary", "").splitlines()))),
+        frame.list_section(
+            "Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]
+        ),
+        frame.table_section("Axes", heads if axes else (), axes, range(1, len(heads))),
     )
 
 
-def _side_parts(log: Log) -> tuple[Part, ...]:
+def _side_sections(log: Log) -> tuple[Section, ...]:
     return (
-        frame.links_part(
+        frame.links_section(
             "Files", [(label, local_link(log.get(name, ""))) for label, name in FILE_LINKS]
         ),
-        frame.pairs_part(
+        frame.pairs_section(
             "Flight", [(name, _format_value(log.get(name, ""))) for name in LOG_COLUMNS]
         ),
     )

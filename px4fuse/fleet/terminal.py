@@ -67,7 +67,7 @@ def differences(results: ChangeResults) -> Page:
     for name, side in (("A", results.a), ("B", results.b)):
         log = side.kind if side.given == side.log else f"{side.kind} of {side.log}"
         versions = f"SHA-256 {side.log_sha256[:12]}, px4fuse {side.px4fuse}"
-        page.labelled(name, f"{side.given} ({log}), {versions}")
+        page.write_labelled(name, f"{side.given} ({log}), {versions}")
     if results.settings:
         settings = [
             (setting.name, _plain(setting.a), _plain(setting.b)) for setting in results.settings
@@ -90,9 +90,9 @@ def differences(results: ChangeResults) -> Page:
         styled = styled_text(
             f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
         )
-        page.labelled(f"Only {finding.only_in}", styled)
+        page.write_labelled(f"Only {finding.only_in}", styled)
     for text in results.worse:
-        page.labelled("Worse", styled_text(text, 8.0, RED))
+        page.write_labelled("Worse", styled_text(text, 8.0, RED))
     if not results.worse:
         page.write("No verdict is worse in B.")
     return page

@@ -19,11 +19,11 @@ from msgspec import Meta
 from px4fuse.answer_form import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.comparison.model import ErrorsAgainstTruth
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, HorizontalNis
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, HorizontalNis
 from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
-from px4fuse.loop.model import Correction, LoopResult, Way
+from px4fuse.loop.model import Correction, CorrectionName, LoopResult
 from px4fuse.record import OrUnavailable, Share
 from px4fuse.results.contract import (
     TUNED_FIELDS,
@@ -375,7 +375,7 @@ def _error_m(comparison: ComparisonResults) -> float:
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
     """Check that KF is consistent, or that no setting makes it so; zero from ``factor`` in σ."""
 
-    factor: Factor = SIGMA_FACTOR_FINDING
+    factor: Factor = MIN_FINDING_SIGMA_FACTOR
 
     def score(self, evidence: Evidence) -> Scored:
         """Score the NIS verdict on north and east together."""
@@ -474,9 +474,9 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
         return (2.0 + corrected) / 4.0, f"{statement}; the closure was accepted{comment}"
 
 
-def _score_corrections(corrections: Mapping[Way, OrUnavailable[Correction]]) -> Scored:
+def _score_corrections(corrections: Mapping[CorrectionName, OrUnavailable[Correction]]) -> Scored:
     """Return 1 for a corrected path, plus 1 for an ATE below the uncorrected one."""
-    ways: tuple[Way, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
+    ways: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
     corrected_paths = [one for one in map(corrections.get, ways) if isinstance(one, Correction)]
     if not corrected_paths:
         return 0.0, ", but the path was not corrected."

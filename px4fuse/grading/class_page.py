@@ -17,8 +17,8 @@ from px4fuse.assignment.sheet import number
 from px4fuse.grading.model import TOTAL, Entry, GradedReport, Item, Override, columns
 from px4fuse.text import format_number
 from px4fuse.webpage import frame
-from px4fuse.webpage.frame import Cell, Column, Part, Row
-from px4fuse.webpage.safe import local_link, template
+from px4fuse.webpage.frame import Cell, Column, Row, Section
+from px4fuse.webpage.safe import load_template, local_link
 
 BINS = 10
 MISSING = "no submission"
@@ -58,7 +58,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        above=_above_html(entries, counts),
+        html_above=_above_html(entries, counts),
         noun=("student", "students"),
         columns=(
             Column("Student"),
@@ -83,7 +83,7 @@ def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
     totals = [entry.total for entry in entries if entry.total is not None]
     most = max((entry.of for entry in entries if entry.of > 0.0), default=1.0)
     graded = [one for entry in entries if (one := entry.counting)]
-    return template("grading/above.html").render(
+    return load_template("grading/above.html").render(
         students=len(entries),
         counts=counts,
         averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
@@ -155,15 +155,15 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     box_parts = (_point_boxes(entry),) if entry.student_id or file else ()
     # not for pseudonyms: the file name may contain the student's name
     report = [("Redrawn from the log (PDF)", local_link(one.redrawn_name))] if one else []
-    report_parts = (frame.links_part("Report", report),)
+    report_parts = (frame.links_section("Report", report),)
     return Row(cells, tuple(_tags(entry)), (*_details(entry), *box_parts), report_parts)
 
 
-def _details(entry: Entry) -> Iterator[Part]:
+def _details(entry: Entry) -> Iterator[Section]:
     """Yield the unfolded details of a row; without names for pseudonyms."""
-    one, comment = entry.counting, frame.prose_part("Your comment", entry.comment)
+    one, comment = entry.counting, frame.prose_section("Your comment", entry.comment)
     if one is None:
-        yield frame.list_part("Missing", ["No submission."])
+        yield frame.list_section("Missing", ["No submission."])
         yield comment
         return
     verdict = one.verdict
@@ -173,22 +173,22 @@ def _details(entry: Entry) -> Iterator[Part]:
         f"{name}: {'' if is_named else 'not '}named" for name, is_named in one.mistakes.items()
     ]
     attempts = [f"{other.submission}: {other.status}" for other in entry.others]
-    yield frame.list_part("Flags", entry.flags, warn=True)
-    yield frame.list_part(
-        "Pending: action required", [one.pending] if one.pending else [], warn=True
+    yield frame.list_section("Flags", entry.flags, is_warning=True)
+    yield frame.list_section(
+        "Pending: action required", [one.pending] if one.pending else [], is_warning=True
     )
-    yield frame.list_part("Verification", verdict.reasons)
+    yield frame.list_section("Verification", verdict.reasons)
     heads = ("Value", "Report", "New run") if differ else ()
-    yield frame.table_part("First differing numbers", heads, differ)
+    yield frame.table_section("First differing numbers", heads, differ)
     title = "Points (proposed)" if one.pending else "Points"
-    yield frame.table_part(
+    yield frame.table_section(
         title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2)
     )
     yield comment
-    yield frame.list_part("Mistakes of this flight", named_texts)
-    yield frame.pairs_part("Answer form", [*form_rows(one.form)] if one.form else [])
-    yield frame.prose_part("Text of the student", one.notes)
-    yield frame.list_part("Other attempts", attempts)
+    yield frame.list_section("Mistakes of this flight", named_texts)
+    yield frame.pairs_section("Answer form", [*form_rows(one.form)] if one.form else [])
+    yield frame.prose_section("Text of the student", one.notes)
+    yield frame.list_section("Other attempts", attempts)
 
 
 def _points_cell(entry: Entry) -> Cell:
@@ -205,7 +205,7 @@ def _points_cell(entry: Entry) -> Cell:
     return Cell(text, entry.total, ", ".join(notes), "", share)
 
 
-def _point_boxes(entry: Entry) -> Part:
+def _point_boxes(entry: Entry) -> Section:
     """Input boxes for the items that the instructor scores, and for the total.
 
     Other rows of overrides.csv are included, because the download replaces the file.
@@ -223,4 +223,4 @@ def _point_boxes(entry: Entry) -> Part:
         if title not in by_hand
     ]
     owner = entry.student_id or (one.submission if one else "")
-    return frame.boxes_part("Your points and comments", owner, rows, other_rows)
+    return frame.boxes_section("Your points and comments", owner, rows, other_rows)

@@ -13,7 +13,7 @@ import msgspec
 
 from px4fuse.answer_form import MISTAKES, Answers, QuantityAnswer, StudentMistake
 from px4fuse.assignment.truth import FormTruth, TrueMistake
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR
 from px4fuse.record import table
 
 FALSE_CLAIM_POINTS, MAX_FALSE_CLAIMS = 10.0, 3
@@ -265,7 +265,7 @@ def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
         # "consistent" is half right for a small factor
         is_nearly_right = (
             known.factor is not None
-            and known.factor < SIGMA_FACTOR_FINDING
+            and known.factor < MIN_FINDING_SIGMA_FACTOR
             and answer == "consistent"
         )
         shares.append(1.0 if is_right else 0.5 if is_nearly_right else 0.0)

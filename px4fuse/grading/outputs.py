@@ -43,7 +43,7 @@ from px4fuse.input_files import inputs_not_registered
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutralise_formulas, neutralise_id
 from px4fuse.text import join_first
-from px4fuse.webpage.safe import template
+from px4fuse.webpage.safe import load_template
 from px4fuse.writing import write_all
 
 # folder of the reports redrawn from the logs, to be read instead of the handed-in PDFs
@@ -282,7 +282,7 @@ def feedback_text(entry: Entry, class_name: str = "") -> str:
     reasons = (
         (text_of(one).rstrip(".") for one in graded.verdict.reasons[:MAX_REASONS]) if graded else ()
     )
-    text = template("grading/feedback.j2").render(
+    text = load_template("grading/feedback.j2").render(
         entry=entry,
         graded=graded,
         class_name=class_name,

@@ -49,9 +49,9 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
 from px4fuse.trajectory.rotation import (
     conjugate,
+    cumulative_product,
     from_vector,
     multiply,
-    running_product,
     skew,
     to_vector,
 )
@@ -178,7 +178,7 @@ def _make_segment(
     time = step_us * 1e-6
     rotation = attitude(motion.at(time)).body_to_ned
     nominal = sensors.quaternions(rotation)
-    gyro = running_product(np.concatenate([nominal[:1], from_vector(rotation_vectors)]))
+    gyro = cumulative_product(np.concatenate([nominal[:1], from_vector(rotation_vectors)]))
     attitude_difference = multiply(nominal, conjugate(gyro))
     error = np.zeros((len(time), 3))
     error[:, HEADING] = sensors.attitude_error(scenario, mistakes, time).as_rotvec()[:, HEADING]

@@ -157,7 +157,10 @@ def _check_file(pdf: bytes) -> None:
         spent = _inflated_bytes(pdf, match.end(), min(remaining_bytes, MAX_CONTENT_BYTES))
         remaining_bytes -= spent
         if spent > MAX_CONTENT_BYTES or remaining_bytes < 0:
-            raise ResultsError("a compressed part expands to more than a report can contain.")
+            raise ResultsError(
+                "a compressed part expands to more than a report can contain: the PDF is not a "
+                "px4fuse report, or was printed to PDF. Hand in the original file."
+            )
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
