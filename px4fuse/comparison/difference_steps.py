@@ -71,7 +71,7 @@ def explain_ekf2_difference(
         outside = structs.replace(
             explanation, outside=_unreplayed_part(results[name], explanation.spans_s)
         )
-        sentences_by_axis[name] = add_sentences(outside, comparison.axes[name].axis.called, reasons)
+        sentences_by_axis[name] = add_sentences(outside, comparison.axes[name].axis.label, reasons)
     return sentences_by_axis
 
 

@@ -94,7 +94,7 @@ def error_exceeds_sigma(
                 f"{owner}_sigma_p_m": one.reported_sigma_m,
             }
             causes[owner] = cause = cause_of(analysis.causes, owner, axis, "nees")
-            along = analysis.axes[axis].axis.called
+            along = analysis.axes[axis].axis.label
             sentences.append(
                 f"{name} along {along}: position RMSE {one.rmse_m:.2f} m, reported σ "
                 f"{one.reported_sigma_m:.2g} m (mean NEES {format_factor(one.nees)}, mean NIS "

@@ -226,7 +226,7 @@ def process_noise_near_zero(analysis: Analysis) -> Found:
             "process_noise_near_zero",
             f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero. The position variance grows by only "
             f"{format_percent(growth, 1)} between updates, and the gain falls to {gain:.3f}. KF "
-            f"needs {response_s:.0f} s to follow a change (along {result.axis.called}).",
+            f"needs {response_s:.0f} s to follow a change (along {result.axis.label}).",
             f"Increase SIGMA_A.{remedy_text}",
             {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
         )
@@ -297,7 +297,7 @@ def _variance_finding(
     return finding(
         severity,
         f"{owner}_{confidence}",
-        f"{name} is {confidence} along {result.axis.called}: σ is "
+        f"{name} is {confidence} along {result.axis.label}: σ is "
         f"{format_factor(factor)} times too {'large' if over else 'small'}. The mean NIS is "
         f"{format_number(statement.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} axes)."
         f"{gate_effect}",

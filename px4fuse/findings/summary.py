@@ -127,7 +127,7 @@ def _verdict_paragraph(
 ) -> str:
     """Error and consistency of EKF2 and KF along the main axis, each with its re-run."""
     result, source = analysis.main, analysis.source
-    along = f"Along {result.axis.called}"
+    along = f"Along {result.axis.label}"
     sentences = [_limited_flight(analysis)]
     filters: tuple[FilterName, ...] = ("ekf2", "kf")
     if isinstance(result.ekf2_state, Unavailable):
@@ -158,7 +158,7 @@ def _limited_flight(analysis: Analysis) -> str:
 
 def _filter_sentence(analysis: Analysis, owner: FilterName) -> str:
     """Position RMSE and consistency of one filter, without its causes."""
-    name, statement, along = NAMES[owner], analysis.main.filters[owner], analysis.main.axis.called
+    name, statement, along = NAMES[owner], analysis.main.filters[owner], analysis.main.axis.label
     if isinstance(statement, Unavailable):
         verdict = "is not tested for consistency: the log has no innovations or too few"
     elif statement.verdict == "consistent":
