@@ -23,12 +23,12 @@ from px4fuse.card.model import (
 )
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
-from px4fuse.comparison.model import AgainstTruth, AxisComparison
+from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Finding, by_root
+from px4fuse.findings.model import Finding, group_by_root
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
@@ -64,7 +64,7 @@ def build_card(
         Name and id.
     """
     result = analysis.main
-    roots = [group[0] for group in by_root(findings)]
+    roots = [group[0] for group in group_by_root(findings)]
     verdicts = make_verdicts(result)
     ranked = rank_causes(analysis, roots)
     causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
@@ -139,7 +139,7 @@ def _effect(analysis: Analysis) -> Effect:
         position_rmse_m={
             owner: truth.position_rmse_m
             for owner, statement in result.filters.items()
-            if isinstance(truth := statement.truth, AgainstTruth)
+            if isinstance(truth := statement.truth, ErrorsAgainstTruth)
         },
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
@@ -150,7 +150,7 @@ def _effect(analysis: Analysis) -> Effect:
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
     """Format the axis with its reference: "along the aisle, 30° from north"."""
-    called, heading = result.axis.called, result.heading_deg
+    called, heading = result.axis.label, result.heading_deg
     if result.axis.name != "aisle" or heading is None:
         return f"along {called}"
     reference = "north"
@@ -164,7 +164,7 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     for owner in FILTER_NAMES:
         truths = [axis.filters[owner].truth for axis in axes]
-        known = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
+        known = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
         if len(known) == 2:
             found[owner] = math.hypot(*known)
     return found
@@ -175,7 +175,7 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
     sentences = []
     if effect.position_rmse_m:
         sentences.append(
-            f"Position RMSE against ground truth along {analysis.main.axis.called}: "
+            f"Position RMSE against ground truth along {analysis.main.axis.label}: "
             f"{_by_filter(effect.position_rmse_m)}"
             f"{_in_brackets('horizontal', effect.horizontal_rmse_m)}."
         )

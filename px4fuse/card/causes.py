@@ -13,7 +13,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, Cause, FilterName, Improvement, Rerun, Target, Verdict
 from px4fuse.comparison.causal_replays import (
-    CLOCK,
+    CLOCK_OFFSET,
     OUTLIERS,
     SIGMA_A,
     SIGMA_Z,
@@ -271,7 +271,9 @@ def _actions(
     general = Action(_target(finding), finding.remedy) if finding.remedy else None
     delay = by_kind.get(("ekf2", "delay"))
     if offset := by_kind.get(("ekf2", "time offset")) or by_kind.get(("kf", "time offset")):
-        shift = offset.change[CLOCK] - analysis.settings.clock_offset_s * (offset.filter == "kf")
+        shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
+            offset.filter == "kf"
+        )
         verb = f"subtract {-shift:.3f} s from" if shift < 0 else f"add {shift:.3f} s to"
         sender = Action("sender", f"{verb} the timestamp (usec) of each position")
         if delay is not None:
