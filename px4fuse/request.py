@@ -8,7 +8,7 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Annotated, Any, Literal, Self
 
@@ -358,8 +358,13 @@ def command_line(
             arguments += ["--without", name]
         for since in {*shown_request.without.values()} - {0.0}:
             arguments += ["--from", _option_text(since)]
-    quote = subprocess.list2cmdline if for_shell and os.name == "nt" else shlex.join
-    return quote(["px4fuse", *arguments])
+    words = ["px4fuse", *arguments]
+    return quote_command(words) if typed else shlex.join(words)
+
+
+def quote_command(words: Sequence[str]) -> str:
+    """Join the words of a command, quoted for the shell of this system."""
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
 def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
