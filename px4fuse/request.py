@@ -359,7 +359,7 @@ def command_line(
         for since in {*shown_request.without.values()} - {0.0}:
             arguments += ["--from", _option_text(since)]
     words = ["px4fuse", *arguments]
-    return quote_command(words) if typed else shlex.join(words)
+    return quote_command(words) if for_shell else shlex.join(words)
 
 
 def quote_command(words: Sequence[str]) -> str:
