@@ -12,7 +12,7 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import Intervention
-from px4fuse.comparison.model import FILTERS, AgainstTruth, FilterSummary, UnjudgedFilter
+from px4fuse.comparison.model import FILTERS, ErrorsAgainstTruth, FilterSummary, UntestedFilter
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate, Jump
 from px4fuse.filter.settings import Settings
@@ -119,7 +119,7 @@ def axis(name: str = "north", **parts: Any) -> Any:
 
 def _with_truth(one: Any, truth: Any) -> Any:
     if one is NONE:
-        return UnjudgedFilter("it", "no topic for it", "Log it.", truth=truth)
+        return UntestedFilter("it", "no topic for it", "Log it.", truth=truth)
     known = {
         name: getattr(one, name) for name in Consistency.__struct_fields__ if hasattr(one, name)
     }
@@ -152,8 +152,8 @@ def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> An
     )
 
 
-def against_truth(nees: float, rmse_m: float = 0.4) -> AgainstTruth:
-    return AgainstTruth(count=100, position_rmse_m=rmse_m, nees_position_mean=nees)
+def against_truth(nees: float, rmse_m: float = 0.4) -> ErrorsAgainstTruth:
+    return ErrorsAgainstTruth(count=100, position_rmse_m=rmse_m, nees_position_mean=nees)
 
 
 def hiding(nis: float = 1.0, nees: float = 4.0, name: str = "north", **parts: Any) -> Any:

@@ -136,5 +136,5 @@ def test_compare_answers_option_adds_form_to_page_and_results(
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)
-    assert results.student.answers.claims_no_mistake  # type: ignore[union-attr]
+    assert results.student.answers.names_no_mistake  # type: ignore[union-attr]
     assert any("Answer form" in page.extract_text() for page in reader.pages)

@@ -35,7 +35,7 @@ from px4fuse.errors import ResultsError
 from px4fuse.grading.model import GradedReport
 from px4fuse.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
 from px4fuse.report import pdf as pdf_module
-from px4fuse.results.contract import Reported
+from px4fuse.results.contract import ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -74,7 +74,7 @@ class Flight:
     key: AnswerKey
 
     def graded(
-        self, report: Reported | ResultsError, verdict: Verdict, rubric: Rubric
+        self, report: ReportedResults | ResultsError, verdict: Verdict, rubric: Rubric
     ) -> GradedReport:
         if isinstance(report, ResultsError):
             made = grade_unreadable(rubric, self.key, f"{report.reason}.", report.remedy)
@@ -245,7 +245,7 @@ def test_grade_forged_results_are_not_verified(
         flight.honest.with_results(results) if status == "page differs" else blank_page(None, text)
     )
     try:
-        report: Reported | ResultsError = read_report(pdf, "a.pdf")
+        report: ReportedResults | ResultsError = read_report(pdf, "a.pdf")
         verdict = flight.honest.verified(pdf)
     except ResultsError as error:
         report, verdict = error, cannot_verify(str(error))

@@ -14,7 +14,14 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.answer_form import CURES, MISTAKES, PANELS, Answers, StudentMistake, update_values
+from px4fuse.answer_form import (
+    CORRECTIONS,
+    MISTAKES,
+    PANELS,
+    Answers,
+    StudentMistake,
+    update_renamed_values,
+)
 from px4fuse.assignment.random_assignment import draw
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
@@ -82,7 +89,7 @@ def test_each_simulated_mistake_has_kind_panel_and_cure() -> None:
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
         offered = cures(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
-        assert {cure for cure, _, _ in offered} <= set(CURES)
+        assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
         assert max(share for _, _, share in offered) == 1.0
         assert set(panels(name)) > {"cover"}
 
@@ -193,12 +200,12 @@ def simulation_of(typed: str) -> flights.Simulation:
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
-    form = update_values(form)  # the forms use the values before schema 4
+    form = update_renamed_values(form)  # the forms use the values before schema 4
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]
-        parameter = one["parameter"] if one["parameter"] in CURES else ""
-        unit = one["value_unit"] if one["value_unit"] in CURES.get(parameter, {}) else ""
+        parameter = one["parameter"] if one["parameter"] in CORRECTIONS else ""
+        unit = one["value_unit"] if one["value_unit"] in CORRECTIONS.get(parameter, {}) else ""
         claims.append(
             StudentMistake(
                 one["kind"], one["size"],

@@ -12,7 +12,7 @@ from px4fuse.assignment.random_assignment import AssignedFlight, Kinds, draw
 from px4fuse.assignment.roster import Person, normalise_text
 from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.input_files import own_files
+from px4fuse.input_files import inputs_not_registered
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.text import to_json_types
@@ -110,7 +110,7 @@ def assign(
     OutputError
         A file exists with other content, or cannot be written.
     """
-    with own_files():
+    with inputs_not_registered():
         key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     _check_extends(

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.answer_form import update_values
+from px4fuse.answer_form import update_renamed_values
 from px4fuse.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
 from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
@@ -112,7 +112,7 @@ def read_key(path: Path) -> AnswerKey:
     """
     text = read_text(path, SettingsError, MAX_KEY_BYTES, name=str(path))
     try:
-        key = msgspec.convert(update_values(msgspec.json.decode(text)), AnswerKey)
+        key = msgspec.convert(update_renamed_values(msgspec.json.decode(text)), AnswerKey)
         if len({normalise_text(answer.student_id) for answer in key.answers}) < len(key.answers):
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:

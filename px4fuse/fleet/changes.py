@@ -76,9 +76,9 @@ def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
     )
 
 
-def _describe_input(diff_input: DiffInput) -> contract.Compared:
+def _describe_input(diff_input: DiffInput) -> contract.DiffInput:
     log = diff_input.results.log
-    return contract.Compared(
+    return contract.DiffInput(
         given=diff_input.given,
         kind=diff_input.kind,
         log=log.name,
@@ -139,7 +139,7 @@ def number_changes(
 
 def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
     """Yield the findings that only A or only B contains, compared by id and severity."""
-    sides: tuple[tuple[Results, Results, contract.Which], ...]
+    sides: tuple[tuple[Results, Results, contract.DiffSide], ...]
     sides = ((b, a, "B"), (a, b, "A"))
     for results, other, only_in in sides:
         ids = {(finding.id, finding.severity) for finding in other.findings}

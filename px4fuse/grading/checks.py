@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from px4fuse.answer_form import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.comparison.model import AgainstTruth
+from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, HorizontalNis
 from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import HORIZONTAL
@@ -29,7 +29,7 @@ from px4fuse.results.contract import (
     TUNED_FIELDS,
     ComparisonResults,
     LoopResults,
-    Reported,
+    ReportedResults,
     to_plain,
 )
 from px4fuse.results.reading import one_line
@@ -103,7 +103,7 @@ class Evidence:
     ``owner_id`` is the student id according to the learning platform.
     """
 
-    results: Reported
+    results: ReportedResults
     verdict: Verdict
     key: AnswerKey | None
     owner_id: str = ""
@@ -375,7 +375,7 @@ def _score_tuning(
 def _largest_source_error_m(comparison: ComparisonResults) -> float:
     """Return the largest error (m) by ground truth or loop closure; 0 if both are missing."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
-    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
+    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
     if isinstance(comparison.loop, LoopResult):
         errors_m.append(comparison.loop.closure_error_m or 0.0)
     return max(errors_m, default=0.0)

@@ -15,7 +15,7 @@ from px4fuse.assignment.roster import normalise_text
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.grading.model import GradedReport
 from px4fuse.request import LoopRequest
-from px4fuse.results.contract import LoopResults, Reported
+from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
 from px4fuse.text import capitalise_first, join_first
@@ -47,7 +47,7 @@ def flag_pages(verdict: Verdict) -> Iterator[str]:
         )
 
 
-def flag_settings(results: Reported, has_key: bool = False) -> Iterator[str]:
+def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[str]:
     """Flag unusual settings of one report.
 
     ``has_key``: True if there is an answer key; a simulated log is then expected.

@@ -54,7 +54,7 @@ class _Cure:
 
 
 TABLE = table(__file__, "form_points.toml", dict)
-CURES = msgspec.convert(TABLE["cures"], tuple[_Cure, ...])
+CORRECTIONS = msgspec.convert(TABLE["cures"], tuple[_Cure, ...])
 NEIGHBOURS = msgspec.convert([*TABLE["neighbours"].values()], tuple[frozenset[str], ...])
 PART_NAMES = tuple(TABLE["weights"])
 
@@ -88,7 +88,7 @@ class FormPoints:
 
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     """Compute the points of a form by comparison with the right answers."""
-    is_clean_named = not truth.mistakes and answers.claims_no_mistake
+    is_clean_named = not truth.mistakes and answers.names_no_mistake
     weights = TABLE["weights_clean" if is_clean_named else "weights"]
     shares = dict.fromkeys(PART_NAMES, 0.0)
     matches, false_claims = _match_claims(answers, truth)
@@ -277,7 +277,7 @@ def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
             bounds[row.to] if isinstance(row.to, str) else row.to,
             0.0 if row.late and size <= 0.0 else row.of[mistake.kind],
         )
-        for row in CURES
+        for row in CORRECTIONS
         if mistake.kind in row.of
     )
 

@@ -39,7 +39,7 @@ from px4fuse.grading.class_page import html_text
 from px4fuse.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from px4fuse.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
 from px4fuse.grading.records import RECORDS_FOLDER, REDRAWN_SUFFIX
-from px4fuse.input_files import own_files
+from px4fuse.input_files import inputs_not_registered
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutralise_formulas, neutralise_id
 from px4fuse.text import join_first
@@ -173,7 +173,7 @@ def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
-        with own_files():
+        with inputs_not_registered():
             sheet = read_sheet(path)
         for row in sheet.rows:
             name, identity, student = (

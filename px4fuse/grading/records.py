@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from px4fuse.errors import ResultsError
-from px4fuse.results.contract import Reported, file_hashes_in, to_json
+from px4fuse.results.contract import ReportedResults, file_hashes_in, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verdict
@@ -47,7 +47,7 @@ class VerificationRecord:
 
 def load_or_verify(
     records: Path, pdf: bytes, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
-) -> tuple[Reported, Verdict, bool]:
+) -> tuple[ReportedResults, Verdict, bool]:
     """Read and verify a report, or load its stored verification.
 
     Parameters
@@ -121,7 +121,7 @@ def _write_record(
 
 def _load_record(
     records: Path, sha256: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
-) -> tuple[Reported, Verdict] | None:
+) -> tuple[ReportedResults, Verdict] | None:
     """Load the record of a PDF; None if there is none, or its dependencies have changed."""
     try:
         content = (records / f"{sha256}.json").read_bytes()
@@ -132,4 +132,4 @@ def _load_record(
     # without a readable record, the report is verified again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
-    return (results, record.verdict) if isinstance(results, Reported) else None
+    return (results, record.verdict) if isinstance(results, ReportedResults) else None

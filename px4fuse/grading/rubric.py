@@ -23,7 +23,7 @@ from px4fuse.grading.checks import Evidence, RubricItem, Text, format_reason, sh
 from px4fuse.grading.flags import flag_pages, flag_settings
 from px4fuse.grading.model import TOTAL_TITLE, GradedReport, Item
 from px4fuse.reading import read_text
-from px4fuse.results.contract import Reported
+from px4fuse.results.contract import ReportedResults
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import cannot_verify, log_sha256
@@ -125,7 +125,11 @@ def _describe_place(path: re.Match[str]) -> str:
 
 
 def score_report(
-    results: Reported, verdict: Verdict, rubric: Rubric, key: AnswerKey | None, owner_id: str = ""
+    results: ReportedResults,
+    verdict: Verdict,
+    rubric: Rubric,
+    key: AnswerKey | None,
+    owner_id: str = "",
 ) -> GradedReport:
     """Score a report, and add flags and the action that the instructor has to take.
 

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.flight_events import longest_s
+from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import flight_for_source
+from px4fuse.comparison.preparation import select_innovations
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
@@ -186,7 +186,7 @@ def take_inventory(flight: Flight) -> Inventory:
         if not isinstance(error, MissingDataError):
             remedy = "Record the whole flight: set SDLOG_MODE to 0 (logging from arming)."
     if comparison is not None:
-        flight = flight_for_source(flight, comparison.source)
+        flight = select_innovations(flight, comparison.source)
     log = flight.log
     is_incomplete = log.ends_in_flight and not log.damage
     return Inventory(
@@ -299,7 +299,7 @@ def _gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
     limit_s = (
         max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))
         if is_imu
-        else float(longest_s(1.0 / sample_rate(samples)))
+        else float(max_interval_s(1.0 / sample_rate(samples)))
     )
     long_intervals = intervals[intervals > limit_s]
     return Gaps(
@@ -327,7 +327,7 @@ def _analysis_options(
             comparison.lines[0].acceleration,
             _ekf2_and_truth_rows(comparison),
         )
-    imu_reason = " ".join(finding.message for finding in imu.rates(flight))
+    imu_reason = " ".join(finding.message for finding in imu.detect_low_rates(flight))
     if isinstance(acceleration, Unavailable):
         imu_reason = f"{acceleration.reason}; KF assumes constant velocity"
     acceleration_text = "IMU rotated into NED with the attitude, gravity removed"
@@ -348,7 +348,7 @@ def _analysis_options(
     yield _analysis_option("aids", aids, description)
     inputs = prepare_inputs(flight)
     if not isinstance(inputs, Unavailable):
-        replayed_s = sum(float(np.ptp(stretch.time_s)) for stretch in inputs.stretches)
+        replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
         description = f"EKF2 replay with {inputs.aid.label}, {replayed_s:.0f} s"
     yield _analysis_option("what-if", inputs, description)
 
@@ -402,13 +402,23 @@ def _logging_advice(
     flight: Flight, comparison: Comparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
     """Collect the actions of findings about the recording, and of unavailable parts, each once."""
-    findings = [*recording.loss(flight), *recording.clocks_set_back(flight)]
+    findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
     actions_and_purposes = [(remedy, "position")] if remedy else []
     if comparison is not None:
-        findings += [*missing.source_as_sent(comparison), *ekf2_not_fusing.detect(comparison)]
-        findings += [*missing.innovations(comparison), *recording.dropouts(comparison)]
-    findings += imu.rates(flight)
-    actions_and_purposes += [(finding.remedy, finding_title(finding.id)) for finding in findings]
+        findings += [
+            *missing.detect_source_not_logged(comparison),
+            *ekf2_not_fusing.detect(comparison),
+        ]
+        findings += [
+            *missing.detect_missing_innovations(comparison),
+            *recording.detect_dropouts(comparison),
+        ]
+    findings += imu.detect_low_rates(flight)
+    actions_and_purposes += [
+        (finding.remedy, finding_title(finding.id))
+        for finding in findings
+        if not finding.remedy.startswith(missing.NOTHING_TO_SET)
+    ]
     # other unavailable parts can be logged by PX4 only, so their advice is for ULogs
     main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.comparison.preparation import choose_source, flight_for_source
+from px4fuse.comparison.preparation import choose_source, select_innovations
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
@@ -43,7 +43,7 @@ class DescribedTable:
 def with_best_source(flight: Flight) -> Flight:
     """Return the flight with the EKF2 innovations of the position source of compare."""
     try:
-        return flight_for_source(flight, choose_source(flight)[0])
+        return select_innovations(flight, choose_source(flight)[0])
     except MissingDataError:
         return flight
 

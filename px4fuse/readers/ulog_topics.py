@@ -22,7 +22,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import REPORTED, valid_parameters
+from px4fuse.ekf2_parameters import REPORTED, replace_invalid_parameters
 from px4fuse.errors import LogError
 from px4fuse.log import Dropout, LogInfo, Stream
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
@@ -405,7 +405,7 @@ def read_topics(name: str, content: bytes) -> Topics:
     zero_us, end_us = _data_span(time_tables, name)
     parameter_items = ulog.initial_parameters.items()
     numbers = {name: float(v) for name, v in parameter_items if isinstance(v, int | float)}
-    parameter_values, parameter_faults = valid_parameters(numbers)
+    parameter_values, parameter_faults = replace_invalid_parameters(numbers)
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),

@@ -10,7 +10,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import Statistic
-from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
+from px4fuse.comparison.model import AxisComparison, FilterSummary, UntestedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable
@@ -272,7 +272,7 @@ def _whiteness_sentence(series: list[FilterSeries]) -> str:
 
 
 def _statistic_cells(
-    _: AxisComparison, __: str, consistency: FilterSummary | UnjudgedFilter
+    _: AxisComparison, __: str, consistency: FilterSummary | UntestedFilter
 ) -> list[str]:
     if isinstance(consistency, Unavailable):
         return [""] * 5

@@ -8,11 +8,11 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
+from px4fuse.comparison.causal_replays import error_above_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.signals import AISLE, Axis, cut_to_segment
-from px4fuse.findings import Finding, by_root, finding_title
+from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.log import LogInfo
 from px4fuse.report.event_marks import LANDING_MARK, TAKE_OFF_MARK
@@ -77,7 +77,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
     page.heading("Findings", 10.5, above=12.0)
     if not findings:
         page.write("None.")
-    for findings_of_cause in by_root(findings):
+    for findings_of_cause in group_by_root(findings):
         write_finding(page, findings_of_cause)
 
 
@@ -91,7 +91,7 @@ def _write_verdict(page: Page, analysis: Analysis) -> None:
         is_judged = isinstance(consistency, Consistency)
         column, _ = halves()
         large_text = format_verdict(consistency)
-        if excess := error_beyond_reported_sigma(consistency):
+        if excess := error_above_reported_sigma(consistency):
             rmse, sigma = (
                 format_number(value_m, 2) for value_m in (excess.rmse_m, excess.reported_sigma_m)
             )

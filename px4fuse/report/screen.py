@@ -129,7 +129,7 @@ def rerun_command(request: Request, command: str, changes: Mapping[str, float]) 
             new_request = WhatIfRequest(
                 log=request.log, mavlink=request.mavlink, system=request.system
             )
-    return command_line(replace(new_request, **changes), command, typed=True)
+    return command_line(replace(new_request, **changes), command, for_shell=True)
 
 
 def _styled_text(block: Block) -> Text:

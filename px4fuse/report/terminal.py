@@ -4,7 +4,7 @@ from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.findings import by_root
+from px4fuse.findings import group_by_root
 from px4fuse.report.aids import write_aids_of_comparison, write_aids_only
 from px4fuse.report.cover import facts, write_finding
 from px4fuse.report.difference_page import write_explanation
@@ -57,7 +57,7 @@ def summary(analysis: Analysis | AidsOnlyAnalysis, results: Any, report: object 
     write_aids_of_comparison(page, analysis)
     if not results.findings:
         page.write("Findings: none.")
-    groups = by_root(results.findings)
+    groups = group_by_root(results.findings)
     for group in groups[:MAX_FINDINGS]:
         write_finding(page, group)
     if (more_count := len(groups) - MAX_FINDINGS) > 0:

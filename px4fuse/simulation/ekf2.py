@@ -22,7 +22,7 @@ from px4fuse.ekf2.filter_recursion import (
     HEADING,
     NORTH,
     POSITION_COLUMNS,
-    StretchRun,
+    SegmentRun,
     Variant,
 )
 from px4fuse.ekf2.heights import barometer_samples_inside
@@ -37,12 +37,12 @@ from px4fuse.ekf2.replay_segments import (
     THETA,
     VELOCITY,
     HeightSamples,
-    Stretch,
+    ReplaySegment,
     add_field_states,
-    down_sampled,
+    downsample_imu,
     step_ends,
 )
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, effective_settings
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
@@ -91,7 +91,7 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
     """Return the values of all EKF2 parameters of the model in this flight, by PX4 name."""
     aid = scenario.aid
     is_gnss = aid == GNSS_POS
-    defaults = settings_in_force({}, *_fused_aids(scenario))
+    defaults = effective_settings({}, *_fused_aids(scenario))
     delay_ms = defaults[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
     aid_values: dict[str, float] = {aid.noise_mode: 1}
     if is_gnss:
@@ -133,20 +133,20 @@ def simulate_ekf2(
         Parameters in the log, by PX4 name.
     """
     aid, aids = scenario.aid, _fused_aids(scenario)
-    stretch, time_us, true_quaternions = _stretch(scenario, mistakes, motion, imu)
+    segment, time_us, true_quaternions = _make_segment(scenario, mistakes, motion, imu)
     logged_values = {name: float(np.float32(v)) for name, v in log_parameters.items()}
     if other_sensors:
         magnetometer, barometer = other_sensors
-        stretch = replace(stretch, heights=_barometer_heights(stretch, barometer))
+        segment = replace(segment, heights=_barometer_heights(segment, barometer))
         if not logged_values[MAG.switch]:
-            stretch = _with_field(stretch, magnetometer)
-    settings = settings_in_force(logged_values, *aids)
+            segment = _with_field(segment, magnetometer)
+    settings = effective_settings(logged_values, *aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
-    step_s = float(np.median(stretch.step_s))
+    step_s = float(np.median(segment.step_s))
     buffer_length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US))
     inputs = Inputs(
         settings=settings,
-        stretches=(stretch,),
+        segments=(segment,),
         received=_received_positions(source),
         # ev_pos_control.cpp: without bit 0 samples are evaluated but not fused
         rules=rules
@@ -166,9 +166,9 @@ def simulate_ekf2(
     return ekf2_topics(inputs, model_run, track, scenario.attitude_rate_hz, aid_source_hz)
 
 
-def _stretch(
+def _make_segment(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
-) -> tuple[Stretch, IntArray, Array]:
+) -> tuple[ReplaySegment, IntArray, Array]:
     """Return the flight in prediction steps, times (µs) of the step ends, and true quaternions."""
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
     interval_s = np.diff(time_us) * 1e-6
@@ -177,7 +177,7 @@ def _stretch(
         imu.fields[name][1:].astype(np.float64) * interval_s[:, None]
         for name in ("gyro_rad", "accelerometer_m_s2")
     )
-    rotation_rad, velocity_increment_m_s = down_sampled(
+    rotation_rad, velocity_increment_m_s = downsample_imu(
         rotation_steps_rad, velocity_steps_m_s, step_end_indices
     )
     step_us = time_us[np.concatenate([[0], step_end_indices])]
@@ -199,7 +199,7 @@ def _stretch(
     variance = np.diagonal(covariance).copy()
     sigma = np.sqrt(variance)
     return (
-        Stretch(
+        ReplaySegment(
             time_s=time_s,
             step_s=np.diff(time_s),
             rotation=rotation,
@@ -225,19 +225,21 @@ def _stretch(
     )
 
 
-def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
+def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
     """Add earth field and magnetometer bias to the states, as aligned on the ground."""
-    taken_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(stretch.step_s))
+    measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
     fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
-    return add_field_states(stretch, taken_s, gauss, 1.0, fields, np.full(6, FIELD_SIGMA_GAUSS**2))
+    return add_field_states(
+        segment, measured_at_s, gauss, 1.0, fields, np.full(6, FIELD_SIGMA_GAUSS**2)
+    )
 
 
-def _barometer_heights(stretch: Stretch, barometer: Topic) -> HeightSamples:
+def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSamples:
     """Return the barometer heights; the barometer is the only height sensor in these flights."""
-    taken_s = sensors.time_s(barometer) - 0.5 * float(np.median(stretch.step_s))
+    measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    samples = barometer_samples_inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
+    samples = barometer_samples_inside(segment, measured_at_s, down_m, np.zeros(len(down_m)))
     return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
 
 
@@ -299,9 +301,9 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
 
 
 def _make_topic_track(
-    inputs: Inputs, model_run: StretchRun, time_us: IntArray, true_quaternions: Array
+    inputs: Inputs, model_run: SegmentRun, time_us: IntArray, true_quaternions: Array
 ) -> TopicTrack:
-    stretch = model_run.stretch
+    segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.step_s)
     state, _ = delayed_states(model_run, 0)
     resets, is_aided = _hold_without_aiding(model_run, state)
@@ -310,9 +312,9 @@ def _make_topic_track(
         reset_sum_m[step:, :2] += reset_m
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     gyro_bias_ned = np.einsum(
-        "nij,nj->ni", stretch.rotation[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
+        "nij,nj->ni", segment.rotation[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
     )
-    attitude_steps = -stretch.correction_rad - gyro_bias_ned * stretch.step_s[:, None]
+    attitude_steps = -segment.correction_rad - gyro_bias_ned * segment.step_s[:, None]
     gyro_attitude_error = state[0, THETA] + np.concatenate(
         [np.zeros((1, 3)), np.cumsum(attitude_steps, axis=0)]
     )
@@ -320,7 +322,7 @@ def _make_topic_track(
         state[:, THETA] - gyro_attitude_error, lag_steps, inputs.step_s, inputs.horizon_s
     )
     velocity, position = publish(
-        stretch, state, reset_sum_m, attitude_error, lag_steps, inputs.settings
+        segment, state, reset_sum_m, attitude_error, lag_steps, inputs.settings
     )
     return TopicTrack(
         time_us=time_us,
@@ -336,18 +338,18 @@ def _make_topic_track(
 
 
 def _hold_without_aiding(
-    model_run: StretchRun, state: Array
+    model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
     """Return position resets (step, size in m) and True for steps with an aid; change ``state``.
 
     Without an aid EKF2 fuses a fake position, which is not part of the model. Here the position in
     ``state`` is held instead, with velocity zero.
     """
-    events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
+    events, run, time = model_run.events[0], model_run, model_run.segment.time_s
     horizontal = slice(NORTH, EAST + 1)
     aid_events = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
     last_aid_s = np.zeros(len(time))
-    last_aid_s[events.end[aid_events]] = time[events.end[aid_events]]
+    last_aid_s[events.end_step[aid_events]] = time[events.end_step[aid_events]]
     is_aided = time - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
     aiding_ends = np.flatnonzero(np.diff(is_aided.astype(int)) == -1) + 1
     aiding_starts = np.flatnonzero(np.diff(is_aided.astype(int)) == 1) + 1
@@ -358,7 +360,7 @@ def _hold_without_aiding(
         state[start:end, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
     for event in np.flatnonzero(run.reset[:, 0]):
-        step = int(events.end[event])
+        step = int(events.end_step[event])
         reset_m = run.innovation[event, 0, POSITION_COLUMNS]
         if not is_aided[step - 1]:
             reset_m = state[step, horizontal] - state[step - 1, horizontal]

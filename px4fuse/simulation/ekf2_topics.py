@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.filter_recursion import EAST, NORTH, POSITION_COLUMNS, StretchRun
+from px4fuse.ekf2.filter_recursion import EAST, NORTH, POSITION_COLUMNS, SegmentRun
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.replay_segments import POSITION
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
@@ -69,7 +69,7 @@ class TopicTrack:
 
 def ekf2_topics(
     inputs: Inputs,
-    model_run: StretchRun,
+    model_run: SegmentRun,
     track: TopicTrack,
     attitude_hz: float,
     aid_source_hz: float,
@@ -78,7 +78,7 @@ def ekf2_topics(
 
     Parameters
     ----------
-    model_run : StretchRun
+    model_run : SegmentRun
         Run with one parameter set over one segment.
     attitude_hz : float
         Rate of vehicle_attitude, which is a topic of EKF2 if EKF2 fuses a magnetometer.
@@ -92,7 +92,7 @@ def ekf2_topics(
         *_barometer_topics(inputs, model_run, track),
         *(
             []
-            if model_run.stretch.field is None
+            if model_run.segment.field is None
             else _magnetometer_topics(inputs, model_run, track, attitude_hz)
         ),
         _flags_topic(inputs, model_run, track),
@@ -115,9 +115,9 @@ def _local_position_topic(track: TopicTrack, *, is_gnss: bool) -> Topic:
     return topic("vehicle_local_position", fields)
 
 
-def _states_topic(model_run: StretchRun, track: TopicTrack, *, is_gnss: bool) -> Topic:
+def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) -> Topic:
     """Return estimator_states of v1.16: variances, and states with horizontal positions of 0."""
-    end = model_run.events[0].end
+    end = model_run.events[0].end_step
     events = np.flatnonzero(np.diff(end, prepend=0) > 0)
     events = events[end[events] < len(track.time_us) - track.lag_steps]
     events = events[sensors.keep_at_rate(sensors.seconds(track.time_us[end[events]]), STATES_HZ)]
@@ -136,15 +136,17 @@ def _states_topic(model_run: StretchRun, track: TopicTrack, *, is_gnss: bool) ->
 
 
 def _aid_sources(
-    inputs: Inputs, model_run: StretchRun, track: TopicTrack, rate_hz: float
+    inputs: Inputs, model_run: SegmentRun, track: TopicTrack, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Return estimator_aid_src_* of the position source: one message per sample in time."""
     events, run, aid = model_run.events[0], model_run, inputs.aid
-    event_rows = np.flatnonzero(events.usable & (events.end < len(track.time_us) - track.lag_steps))
+    event_rows = np.flatnonzero(
+        events.usable & (events.end_step < len(track.time_us) - track.lag_steps)
+    )
     event_rows = event_rows[
-        sensors.keep_at_rate(sensors.seconds(track.time_us[events.end[event_rows]]), rate_hz)
+        sensors.keep_at_rate(sensors.seconds(track.time_us[events.end_step[event_rows]]), rate_hz)
     ]
-    rows, sample, received = events.end[event_rows], events.sample[event_rows], inputs.received
+    rows, sample, received = events.end_step[event_rows], events.sample[event_rows], inputs.received
     aid_stamps = track.timestamps(rows, events.time_s[event_rows])
     measured_m = received.position_m[sample, :2]
     north, east = measured_m.T
@@ -194,9 +196,9 @@ def _aid_sources(
     )
 
 
-def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> list[Topic]:
+def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> list[Topic]:
     """Return estimator_aid_src_baro_hgt; an empty list without a barometer."""
-    heights, end = model_run.stretch.heights, model_run.events[0].end
+    heights, end = model_run.segment.heights, model_run.events[0].end_step
     if heights is None or model_run.heights is None:
         return []
     update_rows = model_run.heights.updates(BAROMETER.name, 0, end.astype(float))
@@ -206,7 +208,7 @@ def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) 
     update_rows = update_rows[sensors.keep_at_rate(update_rows.index.to_numpy(), OTHER_AIDS_HZ)]
     innovation, variance, rejected, fused, rows = update_rows.to_numpy().T
     measured_s, step = update_rows.index.to_numpy(), rows.astype(np.intp)
-    measured = heights.down_m[np.searchsorted(heights.taken_s, measured_s)] - sensors.HOME[2]
+    measured = heights.down_m[np.searchsorted(heights.measured_at_s, measured_s)] - sensors.HOME[2]
     noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
     return [
         _aid_source(
@@ -221,10 +223,10 @@ def _barometer_topics(inputs: Inputs, model_run: StretchRun, track: TopicTrack) 
 
 
 def _magnetometer_topics(
-    inputs: Inputs, model_run: StretchRun, track: TopicTrack, attitude_hz: float
+    inputs: Inputs, model_run: SegmentRun, track: TopicTrack, attitude_hz: float
 ) -> list[Topic]:
     """Return vehicle_attitude, estimator_aid_src_mag and estimator_status."""
-    field, settings, end = model_run.stretch.field, inputs.settings, model_run.events[0].end
+    field, settings, end = model_run.segment.field, inputs.settings, model_run.events[0].end_step
     assert field is not None
     event_rows = np.flatnonzero(
         np.isfinite(model_run.field[:, 2, 0, 0]) & (end < len(track.time_us) - track.lag_steps)
@@ -300,13 +302,13 @@ def _aid_source(
     return topic(name, fields, name if aid == GNSS_POS else "estimator_aid_src")
 
 
-def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> Topic:
+def _flags_topic(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> Topic:
     """Return estimator_status_flags: once a second, and at each start and stop of fusion."""
-    events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
+    events, run, time = model_run.events[0], model_run, model_run.segment.time_s
     attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
     is_fusing = np.zeros(len(time), np.bool_)
-    stops = np.append(time[events.end[attempts]], np.inf)[1:]
-    for step, stop in zip(events.end[attempts].tolist(), stops.tolist(), strict=True):
+    stops = np.append(time[events.end_step[attempts]], np.inf)[1:]
+    for step, stop in zip(events.end_step[attempts].tolist(), stops.tolist(), strict=True):
         stop_s = time[step] + inputs.rules.stop_s
         is_fusing[step : int(np.searchsorted(time, min(stop, stop_s)))] = True
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
@@ -317,7 +319,7 @@ def _flags_topic(inputs: Inputs, model_run: StretchRun, track: TopicTrack) -> To
         "control_status_changes": np.cumsum(has_changed)[rows],
         "cs_gnss_pos": is_fusing[rows] & is_gnss,
         "cs_ev_pos": is_fusing[rows] & (not is_gnss),
-        "cs_mag_hdg" if model_run.stretch.field is None else "cs_mag_3d": True,
+        "cs_mag_hdg" if model_run.segment.field is None else "cs_mag_3d": True,
     }
     return topic(
         "estimator_status_flags", fields | ({"cs_gnss_vel": is_fusing[rows]} if is_gnss else {})

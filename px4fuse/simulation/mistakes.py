@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
 from px4fuse.simulation.scenario import KINDS, Kind, bounded_number, quantities
-from px4fuse.units import NAMES, in_unit
+from px4fuse.units import NAMES, convert_to_unit
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
             raise SettingsError(f"--mistake {text}: give {name}{mistake.usage}.")
         value_by_field[mistake.fields[0]] = mistake.default
         for field, value in zip(mistake.sizes, typed_values, strict=False):
-            bounds, size = QUANTITIES[field], in_unit(value, QUANTITIES[field].unit)
+            bounds, size = QUANTITIES[field], convert_to_unit(value, QUANTITIES[field].unit)
             if size is None:
                 value_text = f"{NAMES[bounds.unit]}, as in {name}{mistake.usage}"
                 raise SettingsError(f"--mistake {text}: {value!r}: give {value_text}.")

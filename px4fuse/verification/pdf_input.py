@@ -21,7 +21,7 @@ from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamO
 
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
-from px4fuse.results.contract import AidsResults, Reported, Results
+from px4fuse.results.contract import AidsResults, ReportedResults, Results
 from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import one_line, read_results
 from px4fuse.verification.model import BAD_VALUES
@@ -80,7 +80,7 @@ _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
-def read_report(pdf: bytes, name: str) -> Reported:
+def read_report(pdf: bytes, name: str) -> ReportedResults:
     """Read the results of a report that was handed in; ``name`` names the file in errors.
 
     Returns
@@ -93,7 +93,7 @@ def read_report(pdf: bytes, name: str) -> Reported:
         As :func:`attached_results`, or the results contain only EKF2 aids.
     """
     results = attached_results(pdf, name)
-    if not isinstance(results, Reported):
+    if not isinstance(results, ReportedResults):
         content = "no results of compare or loop"
         if isinstance(results, AidsResults):
             content = "only EKF2 aids, no KF results"

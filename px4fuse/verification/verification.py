@@ -24,7 +24,13 @@ from typing import Any
 from msgspec.structs import replace
 
 from px4fuse.errors import Px4FuseError, SettingsError
-from px4fuse.results.contract import ComparisonResults, LoopResults, Reported, to_json, to_plain
+from px4fuse.results.contract import (
+    ComparisonResults,
+    LoopResults,
+    ReportedResults,
+    to_json,
+    to_plain,
+)
 from px4fuse.results.model import LIBRARIES, Provenance
 from px4fuse.results.reading import clean_text, one_line
 from px4fuse.verification.model import Mismatch, PageStatus, Status, Verdict
@@ -72,7 +78,7 @@ MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
 # new results, and a function that draws the report with the recorded student and versions
-Recomputed = tuple[Reported, Callable[[], bytes]]
+Recomputed = tuple[ReportedResults, Callable[[], bytes]]
 _LinkFile = Callable[[str, str | None, str], str]
 
 
@@ -80,18 +86,18 @@ class NotRepeatableError(Exception):
     """Reason why an analysis cannot be repeated: arguments of :func:`cannot_verify`."""
 
 
-def log_sha256(results: Reported) -> str:
+def log_sha256(results: ReportedResults) -> str:
     """Return the SHA-256 of the log of a report."""
     return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
 
 
-def log_name(results: Reported) -> str:
+def log_name(results: ReportedResults) -> str:
     """Return the name of the log of a report, as recorded."""
     loop = isinstance(results, LoopResults)
     return split_track(results.track.name)[0] if loop else results.log.name  # type: ignore[union-attr]
 
 
-def recompute(results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdict:
+def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verdict:
     """Repeat the recorded analysis of a report.
 
     Parameters
@@ -164,7 +170,7 @@ def split_track(source: str) -> tuple[str, str]:
 
 def _repeat_comparison(
     handed_in: ComparisonResults, link_file: _LinkFile
-) -> tuple[object, Reported]:
+) -> tuple[object, ReportedResults]:
     from px4fuse.analysis import run  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
@@ -186,7 +192,7 @@ def _repeat_comparison(
     return analysis_result, results(recorded, analysis_result, handed_in.student)
 
 
-def _repeat_loop(handed_in: LoopResults, link_file: _LinkFile) -> tuple[object, Reported]:
+def _repeat_loop(handed_in: LoopResults, link_file: _LinkFile) -> tuple[object, ReportedResults]:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
     from px4fuse.results.build import loop_results  # noqa: PLC0415
 
@@ -203,7 +209,7 @@ def _repeat_loop(handed_in: LoopResults, link_file: _LinkFile) -> tuple[object, 
     return loop_result, loop_results(recorded, loop_result, handed_in.student)
 
 
-def _draw_report(subject: object, results: Reported, versions: Provenance) -> bytes:
+def _draw_report(subject: object, results: ReportedResults, versions: Provenance) -> bytes:
     """Draw the report with the versions that the submitted report states."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
 
@@ -215,11 +221,11 @@ def _draw_report(subject: object, results: Reported, versions: Provenance) -> by
 
 
 def verify(
-    results: Reported,
+    results: ReportedResults,
     pdf: bytes,
     logs: Mapping[str, Path],
     *,
-    recompute: Callable[[Reported, Mapping[str, Path]], Recomputed | Verdict] = recompute,
+    recompute: Callable[[ReportedResults, Mapping[str, Path]], Recomputed | Verdict] = recompute,
 ) -> Verdict:
     """Verify a report: repeat its analysis, compare numbers and pages, and draw it again.
 
@@ -268,7 +274,7 @@ def cannot_verify(reason: str, remedy: str = "", missing: str = "") -> Verdict:
 
 
 def _verify_with_log(
-    submitted: Reported, pdf: bytes, recomputed: Reported, draw: Callable[[], bytes]
+    submitted: ReportedResults, pdf: bytes, recomputed: ReportedResults, draw: Callable[[], bytes]
 ) -> Verdict:
     redrawn = draw()
     if redrawn == pdf:
