@@ -173,26 +173,26 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _limit_memory(memory_bytes)
-    pipe.send((True, None))
-    while True:
-        try:
-            job = pipe.recv()
-        except (EOFError, OSError):
-            return
-        try:
-            message = pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
-        except MemoryError:
-            # False ends the process: the next job would not have enough memory
-            failure = JobFailure("the memory limit for one file was exceeded.")
-            message = pickle.dumps((False, failure))
-        except Exception as error:  # noqa: BLE001 - the failure of a job is its result
-            # imported here: the import takes 2 s and is needed for errors only
-            from px4fuse.results.reading import one_line  # noqa: PLC0415
+    with suppress(EOFError, OSError):  # the parent closed the pipe, or was killed
+        pipe.send((True, None))
+        while True:
+            pipe.send_bytes(_result_of(function, pipe.recv()))
 
-            kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
-            message = pickle.dumps((True, JobFailure(one_line(f"{kind}{error}", 300))))
-        del job
-        pipe.send_bytes(message)
+
+def _result_of(function: Callable[[Any], Any], job: Any) -> bytes:
+    """Run a job; return the pickled message for :func:`_receive_result`."""
+    try:
+        return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
+    except MemoryError:
+        # the next job would not have enough memory, so the process ends
+        failure = JobFailure("the memory limit for one file was exceeded.")
+        return pickle.dumps((False, failure))
+    except Exception as error:  # noqa: BLE001 - the failure of a job is its result
+        # imported here: the import takes 2 s and is needed for errors only
+        from px4fuse.results.reading import one_line  # noqa: PLC0415
+
+        kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
+        return pickle.dumps((True, JobFailure(one_line(f"{kind}{error}", 300))))
 
 
 def _end_with_parent() -> None:

@@ -113,7 +113,7 @@ def axis(name: str = "north", **parts: Any) -> Any:
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
     }
-    axis = SimpleNamespace(name=name, called="the aisle" if name == "aisle" else name)
+    axis = SimpleNamespace(name=name, label="the aisle" if name == "aisle" else name)
     return SimpleNamespace(axis=axis, filters=filters, **usual | parts)
 
 
@@ -128,13 +128,13 @@ def _with_truth(one: Any, truth: Any) -> Any:
 
 def tried(
     owner: Any, change: dict[str, float], axis: str = "north", of: Any = "nis",
-    before: float = 9.0, explains: float = 1.0,
+    before: float = 9.0, explained_fraction: float = 1.0,
 ) -> Intervention:  # fmt: skip
     """Make the result of a re-run: the share of a statistic that a change explains."""
-    after = before ** (1.0 - explains)
+    after = before ** (1.0 - explained_fraction)
     return Intervention(
         statistic=of, filter=owner, axis=axis, change=change, before=before, after=after,
-        explained_fraction=explains, is_sufficient=explains == 1.0,
+        explained_fraction=explained_fraction, is_sufficient=explained_fraction == 1.0,
     )  # fmt: skip
 
 

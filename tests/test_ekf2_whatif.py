@@ -80,8 +80,8 @@ def test_steps_add_up_to_total_difference(model):
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == STEPS
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
-            left = getattr(axis, quantity.replace("_mean", "_left_mean"))
-            total = sum(getattr(step, quantity) for step in axis.steps) + left
+            unexplained = getattr(axis, f"unexplained_{quantity.removeprefix('position_')}")
+            total = sum(getattr(step, quantity) for step in axis.steps) + unexplained
             assert total == pytest.approx(getattr(axis, quantity), abs=1e-12)
         assert axis.unexplained_fraction < 0.03
         by_name = {step.name: step for step in axis.steps}

@@ -33,6 +33,7 @@ from findings_tools import (
 from px4fuse.comparison.model import Difference
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.consistency import classify_mean_nis
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOutCheck, Noise
 from px4fuse.findings import Finding, cause_text, hidden_errors, loops, noises
@@ -96,7 +97,7 @@ def test_setting_deviation_severity_at_limits(
 
 
 def test_deviating_settings_lists_larger_deviation_first() -> None:
-    held = made(HeldOutCheck, gain_nats=0.25)
+    held = made(HeldOutCheck, log_likelihood_gain_per_measurement=0.25)
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11), held_out=held)
     worse, other = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert (worse.id, worse.caused_by) == ("sigma_a_too_large", None)
@@ -475,7 +476,7 @@ def flight_of(result: Any, **parts: Any) -> Any:
 def along(ekf2_nis: float, kf_nis: float, name: str = "aisle", **parts: Any) -> Any:
     """Make an axis on which EKF2 and KF have these mean NIS."""
     ekf2, kf_statement = (
-        statement(nis, "consistent" if nis == 1.0 else "off") for nis in (ekf2_nis, kf_nis)
+        statement(nis, classify_mean_nis(nis, (1.0, 1.0))) for nis in (ekf2_nis, kf_nis)
     )
     frame = pd.DataFrame({"position_m": [0.0]}, index=[10.0])
     usual = {"ekf2_state": frame, "difference": NONE}

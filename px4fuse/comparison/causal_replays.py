@@ -48,10 +48,10 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
-    along,
+    cut_to_segment,
     ned_acceleration,
     project_acceleration,
-    within,
+    weighted_sum,
 )
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -532,7 +532,9 @@ class _KfRerun(_FilterRerun):
         truth, is_gnss_rotation = result.truth, ROTATION in change and source.origin.is_gnss
         if ROTATION in change:
             rotated_direction = _rotate_direction(axis.direction, change[ROTATION])
-            measured_m = along(within(source.samples, segment), Columns.POSITION, rotated_direction)
+            measured_m = weighted_sum(
+                cut_to_segment(source.samples, segment), Columns.POSITION, rotated_direction
+            )
             axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
             if (
                 is_gnss_rotation
@@ -645,8 +647,8 @@ class _Ekf2Rerun(_FilterRerun):
         weights = axis.direction[:2]
         updates = ekf2_replay.updates[inside_spans(ekf2_replay.updates.index, compared_s)]
         if statistic == "nis":
-            nu = along(updates, INNOVATION_COLUMNS, weights)
-            s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
+            nu = weighted_sum(updates, INNOVATION_COLUMNS, weights)
+            s = weighted_sum(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
             return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
         state = project(ekf2_replay.published, axis, self.comparison.segment)
         if statistic == "difference":
@@ -655,11 +657,11 @@ class _Ekf2Rerun(_FilterRerun):
             return _rms_difference(result.replay, state[inside_spans(state.index, compared_s)])
         at_s, track = (
             updates["fused_at_s"],
-            along(ekf2_replay.delayed, Columns.POSITION, axis.direction),
+            weighted_sum(ekf2_replay.delayed, Columns.POSITION, axis.direction),
         )
         horizon_columns = {
             "position_m": np.interp(at_s, ekf2_replay.delayed.index, track),
-            "position_variance_m2": along(updates, POSITION_VARIANCES, weights**2),
+            "position_variance_m2": weighted_sum(updates, POSITION_VARIANCES, weights**2),
         }
         horizon = pd.DataFrame(horizon_columns, index=pd.Index(at_s))
         return _mean_nees(error_statistics(state, result.ekf2_variance, result.truth, horizon))

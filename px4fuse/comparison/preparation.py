@@ -11,7 +11,7 @@ from px4fuse.comparison.projection import observation_variance
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
-from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
+from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.position_source import POSITION_FILE, PositionKind
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
@@ -340,7 +340,7 @@ def choose_segment(
             "--start or --end."
         )
     segment = Segment(low, high, reason)
-    count = len(within(track.samples, segment))
+    count = len(cut_to_segment(track.samples, segment))
     if count < MIN_MEASUREMENTS:
         raise SettingsError(
             f"{flight.log.name}: {track.name} has only {count} measurements between "

@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS
-from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
+from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment, weighted_sum
 from px4fuse.flight import (
     AXIS_NAMES,
     Columns,
@@ -74,7 +74,7 @@ def continuous_state(
             continue
         reset_texts = kept_resets
         if quantity == "position":  # a velocity does not depend on the frame's origin
-            samples = within(track.samples, segment)[columns].dropna()
+            samples = cut_to_segment(track.samples, segment)[columns].dropna()
             best_state = min(
                 _continuous_candidates(ekf2.state[columns], resets, axes),
                 key=partial(_median_square_distance, samples),
@@ -116,10 +116,10 @@ def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float
 
 def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Project the columns of :data:`PROJECTED_COLUMNS` onto the axis, within the segment."""
-    rows = within(frame, segment)
+    rows = cut_to_segment(frame, segment)
     available = {name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame}
     projected = {
-        name: along(rows, columns, axis.direction**power)
+        name: weighted_sum(rows, columns, axis.direction**power)
         for name, (columns, power) in available.items()
     }
     return pd.DataFrame(projected, index=rows.index)
@@ -149,7 +149,7 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
     weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
     aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
     if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
-        samples = within(aid.samples, segment)
+        samples = cut_to_segment(aid.samples, segment)
         position, variance = (
             sum(
                 weights[name] ** power * (samples[f"{a}_{name}"] - samples[f"{b}_{name}"])
@@ -186,7 +186,7 @@ def project_innovations(
         if isinstance(frame, Unavailable):
             return frame
         frames.append(frame)
-    rows = within(frames[0], segment).copy()
+    rows = cut_to_segment(frames[0], segment).copy()
     if axis.name == AISLE:
         rows = _innovations_along(rows, frames[1], axis.direction)
     if rows.empty:
@@ -250,7 +250,7 @@ def observation_variance(
     ignores_reported = track.alignment is not None or aid == BAROMETER
     if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
         return r
-    reported = within(track.samples, segment)[Columns.POSITION_VARIANCE].median()
+    reported = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
     reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))
     return max(r, reported_along)
 

@@ -478,7 +478,7 @@ def _axis_agreement(
 
 def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
     """Interpolate the component of a time-indexed vector along a direction."""
-    summed = signals.along(frame, columns, direction[: len(columns)])
+    summed = signals.weighted_sum(frame, columns, direction[: len(columns)])
     return np.asarray(np.interp(times, frame.index, summed))
 
 

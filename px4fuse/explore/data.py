@@ -28,7 +28,7 @@ from px4fuse.filter.settings import (
     SIGMA_Z_RANGE_M,
     Settings,
 )
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding, find, finding_title, group_by_root
@@ -180,7 +180,7 @@ def _axis_signals(
     """Return measurements (in and near the segment) and integrated acceleration of an axis."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
-    value = along(raw.samples, Columns.POSITION, axis.direction)
+    value = weighted_sum(raw.samples, Columns.POSITION, axis.direction)
     half_range_s = OFFSET_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
     is_in_reach = (time >= segment.start_s - half_range_s) & (time <= segment.end_s + half_range_s)
     is_in_reach &= np.isfinite(value)
@@ -204,7 +204,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
     """Return the axis description, NIS bands, EKF2 and ground truth of one axis."""
     name = result.axis.name
     return {
-        "called": result.axis.called,
+        "called": result.axis.label,
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
@@ -321,7 +321,7 @@ def _map_data(analysis: Analysis) -> dict[str, Any]:
 
 def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
     """Pack time, north and east of the source's track, or return the reason why it is missing."""
-    samples = within(comparison.source.samples, comparison.segment)
+    samples = cut_to_segment(comparison.source.samples, comparison.segment)
     track = samples[Columns.POSITION[:2]].dropna()
     if not len(track):
         return "the source has no horizontal position"

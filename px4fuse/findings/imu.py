@@ -5,7 +5,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, BiasScaleJumpFit
-from px4fuse.filter.signals import Segment, imu_gaps, within
+from px4fuse.filter.signals import Segment, cut_to_segment, imu_gaps
 from px4fuse.findings.model import MIN_SPAN_S, Findings, error, finding, warning
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
@@ -78,7 +78,7 @@ def _ekf2_bias(analysis: Analysis) -> list[float] | None:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
         return None
-    inside = within(ekf2.accelerometer_bias, analysis.segment)[Columns.SPECIFIC_FORCE]
+    inside = cut_to_segment(ekf2.accelerometer_bias, analysis.segment)[Columns.SPECIFIC_FORCE]
     return None if inside.empty else [float(median) for median in inside.median()]
 
 
@@ -102,7 +102,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
     imu = analysis.flight.imu
     if not isinstance(imu, pd.DataFrame) or "clipped" not in imu:
         return
-    samples = within(imu, analysis.segment)
+    samples = cut_to_segment(imu, analysis.segment)
     time_s = samples.index[samples["clipped"] > 0.0].to_numpy()
     total_s = len(time_s) / sample_rate(imu)
     if total_s > MAX_CLIPPED_S:

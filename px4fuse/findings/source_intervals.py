@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.flight_events import max_interval_s, source_gaps
-from px4fuse.filter.signals import within
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.position_source import ALIGNED
@@ -121,7 +121,7 @@ def detect_downsampling(analysis: Analysis) -> Findings:
 
 def _intervals(analysis: Analysis) -> tuple[Array, float]:
     """Return the intervals (s) between positions in the segment without gaps, and the median."""
-    intervals = np.diff(within(analysis.source.samples, analysis.segment).index.to_numpy())
+    intervals = np.diff(cut_to_segment(analysis.source.samples, analysis.segment).index.to_numpy())
     typical = float(np.median(intervals)) if len(intervals) else np.nan
     return intervals[intervals <= max_interval_s(typical)], typical
 

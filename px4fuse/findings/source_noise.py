@@ -12,7 +12,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
-from px4fuse.filter.signals import within
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.findings.cause_grouping import WHITE_RATIO
 from px4fuse.findings.model import Findings, error, format_percent, note, warning
@@ -82,7 +82,9 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
     if hardly_moved(analysis):
         return
     positions_m = (
-        within(analysis.source.samples, analysis.segment)[Columns.POSITION].dropna().to_numpy()
+        cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
+        .dropna()
+        .to_numpy()
     )
     is_repeated = np.all(np.diff(positions_m, axis=0) == 0.0, axis=1)
     count, share = int(is_repeated.sum()), float(is_repeated.mean()) if len(is_repeated) else 0.0

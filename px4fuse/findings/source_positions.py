@@ -14,7 +14,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
-from px4fuse.filter.signals import within
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
@@ -216,7 +216,9 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     )
     if may_be_low_passed or not isinstance(axis_tuning, AxisTuning) or not source.origin.is_vision:
         return
-    reported = within(source.samples, analysis.segment)[Columns.POSITION_VARIANCE[:2]].dropna()
+    reported = cut_to_segment(source.samples, analysis.segment)[
+        Columns.POSITION_VARIANCE[:2]
+    ].dropna()
     noise_m, low, high = (
         axis_tuning.sigma_z.value,
         axis_tuning.sigma_z.low,
@@ -268,7 +270,7 @@ def _rmse_per_axis_m(analysis: Analysis) -> float | None:
 
 def motion_range_m(comparison: Comparison) -> float:
     """Return the larger extent (m) of north and east in the segment, 5 to 95 % of the positions."""
-    samples = within(comparison.source.samples, comparison.segment)
+    samples = cut_to_segment(comparison.source.samples, comparison.segment)
     low, high = samples[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))
 
@@ -278,7 +280,9 @@ def hardly_moved(comparison: Comparison) -> bool:
 
     The noise is estimated from second differences, which constant velocity does not affect.
     """
-    positions = within(comparison.source.samples, comparison.segment)[Columns.POSITION[:2]].dropna()
+    positions = cut_to_segment(comparison.source.samples, comparison.segment)[
+        Columns.POSITION[:2]
+    ].dropna()
     second_difference_m = np.median(np.abs(np.diff(positions.to_numpy(), 2, axis=0)), axis=0)
     noise_m = float(second_difference_m.max()) / SECOND_DIFFERENCE_FACTOR
     return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, NOISE_RANGE_FACTOR * noise_m)

@@ -294,17 +294,17 @@ class Topics:
         joined_frames = pd.concat(primary_frames).sort_index()
         return joined_frames[~joined_frames.index.duplicated()]
 
-    def record_stream(self, part: str, *topics: str) -> None:
+    def record_stream(self, flight_part: str, *topics: str) -> None:
         """Record the source of a part of the flight, with measurement or publication time."""
         # The timestamp of sensor_combined is the gyro's measurement time
-        has_measurement_time = part == "imu" or any(
+        has_measurement_time = flight_part == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
             for table in self.of(topics[0])
         )
         clock = (
             f"autopilot boot clock, at {'measurement' if has_measurement_time else 'publication'}"
         )
-        self.streams[part] = Stream(topics, clock, self.log.name)
+        self.streams[flight_part] = Stream(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:

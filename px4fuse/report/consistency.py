@@ -56,7 +56,7 @@ class FilterSeries(NamedTuple):
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page: three panels of the main axis, and a table of all axes."""
     result = analysis.main
-    axis_text = result.axis.called
+    axis_text = result.axis.label
     page = Page(
         "Appendix: consistency",
         (
@@ -125,7 +125,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
             )
     if not rows:
         return
-    page.heading(f"Tested causes along {axis.called}", above=12.0)
+    page.heading(f"Tested causes along {axis.label}", above=12.0)
     head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(head, rows, right=(3, 4))
     page.write(

@@ -11,7 +11,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.causal_replays import error_above_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.signals import AISLE, Axis, within
+from px4fuse.filter.signals import AISLE, Axis, cut_to_segment
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.log import LogInfo
@@ -84,7 +84,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 def _write_verdict(page: Page, analysis: Analysis) -> None:
     """Write the verdicts along the main axis in large letters: KF left, EKF2 right."""
     result, columns = analysis.main, []
-    axis_text = result.axis.called
+    axis_text = result.axis.label
     for (name, consistency), colour in zip(
         filters_by_name(result).items(), (KF_COLOUR, EKF2_COLOUR), strict=False
     ):
@@ -227,7 +227,7 @@ def _tracks(comparison: Comparison) -> dict[str, Coordinates]:
     segment, flight = comparison.segment, comparison.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
-        inside = within(frame, segment)
+        inside = cut_to_segment(frame, segment)
         return inside["north_m"].to_numpy(), inside["east_m"].to_numpy()
 
     tracks = {"measurement": cut(comparison.source.samples)}

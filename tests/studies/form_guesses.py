@@ -26,7 +26,7 @@ from px4fuse.answer_form import (
     Answers,
     StudentMistake,
 )
-from px4fuse.assignment.assignment import fly
+from px4fuse.assignment.assignment import simulate_assigned
 from px4fuse.assignment.roster import Person
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.grading.form_points import cures, form_points, panels
@@ -39,7 +39,7 @@ GUESSES = 20
 def truth(number: int) -> FormTruth:
     """Return the correct answers for the flight of one student of a mixed class."""
     student = Person(f"s{number}")
-    _, answer = fly(SECRET, student, "mixed")
+    _, answer = simulate_assigned(SECRET, student, "mixed")
     assert answer.form is not None
     return answer.form
 
