@@ -162,7 +162,7 @@ def _draw_running_nis(axes: Axes, series: list[Series]) -> None:
     for one in series:
         number = np.arange(1, len(one.values) + 1)
         running = (one.values**2).cumsum() / number
-        draw_curve(axes, running[2:], **LINES[one.name], label=one.name)
+        draw_curve(axes, running.iloc[2:], **LINES[one.name], label=one.name)
         drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
         time = one.values.index[drawn_counts - 1]
@@ -171,7 +171,7 @@ def _draw_running_nis(axes: Axes, series: list[Series]) -> None:
         else:
             axes.plot(time, low, **_thin_line_style(one))
             axes.plot(time, high, **_thin_line_style(one), label="95 % band EKF2")
-        settled = running[len(running) // 4 :]
+        settled = running.iloc[len(running) // 4 :]
         lowest, highest = min(lowest, 0.7 * settled.min()), max(highest, 1.4 * settled.max())
     axes.axhline(1.0, color="black", lw=0.5)
     axes.set(yscale="log", ylim=(lowest, highest))
