@@ -1,7 +1,7 @@
 """Requests: the files and settings of one analysis, parsed from a command line.
 
-:func:`px4fuse.analysis.run` takes a request. The results record it, so that a report can be made
-again without its command line.
+The results contain the request, so that :func:`px4fuse.analysis.run` can repeat an analysis without
+its command line.
 """
 
 import os
@@ -14,14 +14,12 @@ from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
-from px4fuse.record import table
-
 AUTO: Literal["auto"] = "auto"
 # Default settings of KF
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
-# Kind of a position source, which the messages in a log may leave open
+# Kind of a position source; the messages in a log may not determine it
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
 # Height source of a GNSS flight
 HeightName = Literal["gnss", "barometer"]
@@ -256,42 +254,59 @@ class EvaluationRequest(_RequestBase, frozen=True, kw_only=True):
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
-class Option(msgspec.Struct, frozen=True):
-    """Option of the command line for one field of a request.
-
-    Attributes
-    ----------
-    name : str
-    meaning : str
-        Help text; empty if the command declares the option itself.
-    unit : str
-        Unit of a number, one of :data:`px4fuse.units.NAMES`.
-    example : float
-        Number in the error message if the typed text is not a number.
-    metavar : str or None
-    """
-
-    name: str
-    meaning: str = ""
-    unit: str = ""
-    example: float = 0.1
-    metavar: str | None = None
-
-
-_TABLES = table(__file__, "options.toml", dict[str, dict[str, Option]])
-# Options by topic, from options.toml
-RECORDINGS, FILTER_OPTIONS = _TABLES["recordings"], _TABLES["filter"]
-POSITION_OPTIONS, CLOCK_OPTION = _TABLES["position"], _TABLES["clock"]
-LOOP_OPTIONS, EVALUATION_OPTIONS = _TABLES["loop"], _TABLES["evaluation"]
-OPTIONS = RECORDINGS | POSITION_OPTIONS | CLOCK_OPTION | FILTER_OPTIONS
-_OF_REQUESTS: dict[type[msgspec.Struct], Mapping[str, Option]] = {
-    ComparisonRequest: OPTIONS,
-    PositionFile: POSITION_OPTIONS,
-    LoopRequest: LOOP_OPTIONS,
-    WhatIfRequest: RECORDINGS,
-    EvaluationRequest: EVALUATION_OPTIONS,
+_POSITION_OPTIONS = {
+    "path": "--position",
+    "frame": "--position-frame",
+    "yaw_deg": "--position-yaw",
+    "columns": "--position-columns",
+    "time_unit": "--position-time-unit",
+    "length_unit": "--position-unit",
 }
-
+# Option for each field of a request that is not an argument of the command
+OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
+    ComparisonRequest: {
+        "mavlink": "--mavlink",
+        "system": "--system",
+        "position_source": "--position-source",
+        "source_kind": "--source-kind",
+        "height": "--height",
+        "sigma_a_m_s2": "--sigma-a",
+        "sigma_z_m": "--sigma-z",
+        "dt_s": "--dt",
+        "input": "--input",
+        "axes": "--axis",
+        "heading_deg": "--heading",
+        "start_s": "--start",
+        "end_s": "--end",
+        "clock_offset_s": "--clock-offset",
+        **_POSITION_OPTIONS,
+    },
+    PositionFile: _POSITION_OPTIONS,
+    LoopRequest: {
+        "system": "--system",
+        "frame": "--frame",
+        "reference": "--reference",
+        "start_s": "--from",
+        "end_s": "--to",
+        "landed_at": "--landed-at",
+        "closed_loop": "--open",
+        "closures": "--closure",
+        "position_drift_m": "--drift",
+        "heading_drift_deg": "--heading-drift",
+        "key_frames_m": "--key-frames",
+    },
+    WhatIfRequest: {"mavlink": "--mavlink", "system": "--system"},
+    EvaluationRequest: {
+        "system": "--system",
+        "alignment": "--alignment",
+        "association": "--association",
+        "max_gap_s": "--max-gap",
+        "time_offset_s": "--time-offset",
+        "rpe": "--rpe",
+        "consecutive": "--consecutive",
+    },
+}
+COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
 # Options for arguments that are named in errors and are not fields of a request
 _ARGUMENTS = {
     "position": "--position",
@@ -300,18 +315,18 @@ _ARGUMENTS = {
 }
 
 
-def with_options(text: str, options: Mapping[str, Option] = OPTIONS) -> str:
+def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS) -> str:
     """Replace argument names in backticks by the options of the command line.
 
     >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
     '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
     """
-    names = _ARGUMENTS | {field: option.name for field, option in options.items()}
-    return re.sub(r"`(\w+)`", lambda name: names.get(name[1], name[0]), text)
+    names = {**_ARGUMENTS, **option_names}
+    return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), text)
 
 
 def command_line(
-    request: Request | EvaluationRequest, command: str | None = None, *, typed: bool = False
+    request: Request | EvaluationRequest, command: str | None = None, *, for_shell: bool = False
 ) -> str:
     """Format the command line that repeats an analysis, without defaults.
 
@@ -321,28 +336,30 @@ def command_line(
     command : str, optional
         Name of the command; by default ``compare``, ``loop``, ``whatif`` or
         ``evaluate``.
-    typed : bool
+    for_shell : bool
         True: with paths, quoted for the shell of this system, so that it can be pasted. False: with
         file names only, quoted for a POSIX shell.
     """
-    shown_request = request if typed else request.without_paths()
+    shown_request = request if for_shell else request.without_paths()
     # required fields are files; all other fields are options
-    needed = [field.name for field in msgspec.structs.fields(shown_request) if field.required]
-    files = [_path_argument(getattr(shown_request, name)) for name in needed]
+    required_names = [
+        field.name for field in msgspec.structs.fields(shown_request) if field.required
+    ]
+    files = [_path_argument(getattr(shown_request, name)) for name in required_names]
     arguments = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
     arguments += [word for pair in _all_options(shown_request) for word in pair if word is not None]
     if isinstance(shown_request, WhatIfRequest):
         for name, value in shown_request.changes.items():
             arguments += ["--set", f"{name}={_option_text(value)}"]
         if (sweep := shown_request.sweep) is not None:
-            ends = f"{_option_text(sweep.low)}:{_option_text(sweep.high)}:{sweep.count}"
-            arguments += ["--sweep", f"{sweep.parameter}={ends}"]
+            values = f"{_option_text(sweep.low)}:{_option_text(sweep.high)}:{sweep.count}"
+            arguments += ["--sweep", f"{sweep.parameter}={values}"]
         for name in shown_request.without:
             arguments += ["--without", name]
         for since in {*shown_request.without.values()} - {0.0}:
             arguments += ["--from", _option_text(since)]
-    join = subprocess.list2cmdline if typed and os.name == "nt" else shlex.join
-    return join(["px4fuse", *arguments])
+    quote = subprocess.list2cmdline if for_shell and os.name == "nt" else shlex.join
+    return quote(["px4fuse", *arguments])
 
 
 def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
@@ -354,8 +371,8 @@ def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) 
     name_suffix = ""
     for option, value in _all_options(request.without_paths()):
         is_file = option in ("--mavlink", "--position")
-        typed = PurePath(value).stem if is_file and value is not None else value
-        name_suffix += f"_{option[2:]}" + ("" if typed is None else f"-{typed}")
+        text = PurePath(value).stem if is_file and value is not None else value
+        name_suffix += f"_{option[2:]}" + ("" if text is None else f"-{text}")
     return re.sub(r"[^\w.,+-]+", "-", name_suffix)
 
 
@@ -366,15 +383,15 @@ def _path_argument(path: str) -> str:
 
 def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
     """Yield options and values (None for a flag) of fields that are not at their defaults."""
-    options = _OF_REQUESTS[type(request)]
+    option_names = OPTION_NAMES[type(request)]
     for field in msgspec.structs.fields(request):
         value = getattr(request, field.name)
-        if field.name not in options or value == field.default:
+        if field.name not in option_names or value == field.default:
             continue
-        several = value if field.name in ("axes", "closures", "rpe") else (value,)
-        for single in several:
-            name = options[field.name].name
-            yield name, None if isinstance(single, bool) else _option_text(single)
+        values = value if field.name in ("axes", "closures", "rpe") else (value,)
+        for single_value in values:
+            text = None if isinstance(single_value, bool) else _option_text(single_value)
+            yield option_names[field.name], text
     if (position := getattr(request, "position", None)) is not None:
         yield from _all_options(position)
 

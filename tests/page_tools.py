@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from pypdf import PdfReader
 
 from px4fuse.report import fonts
-from px4fuse.report.page import Block, Page, data
+from px4fuse.report.page import Block, Page, to_typst_data
 from px4fuse.report.pdf import compile_pdf
 
 
@@ -28,7 +28,7 @@ def texts(*pages: Page) -> list[str]:
         for block in every(page.blocks):
             label = block["label"]["text"].split("\n") if "label" in block else ()
             cells = [cell for row in block.get("rows", ()) for cell in row]
-            found += [block[key] for key in ("title", "text", "lead", "say") if block.get(key)]
+            found += [block[key] for key in ("title", "text", "lead", "caption") if block.get(key)]
             found += [*label, *(part["text"] for part in block.get("texts", ()))]
             found += [*block.get("head", ()), *(c if isinstance(c, str) else c[0] for c in cells)]
     return found
@@ -52,7 +52,7 @@ def axes_of(*pages: Page) -> list[Axes]:
 
 def set_by_typst(*pages: Page) -> list[str]:
     """Set the pages as PDF and return the text of each sheet."""
-    blocks = data([block for page in pages for block in page.blocks])
+    blocks = to_typst_data([block for page in pages for block in page.blocks])
     report = {
         "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,
         "fonts": [fonts.FONT], "blocks": blocks,

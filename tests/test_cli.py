@@ -126,7 +126,7 @@ def test_sample_existing_other_file_is_refused() -> None:
     Path("flights").mkdir()
     Path("flights/loop_slam.tum").write_text("mine")
     said = error_line("sample", "-o", "flights")
-    assert "loop_slam.tum already exists and is another file. Nothing was written." in said
+    assert "loop_slam.tum already exists with different contents. Nothing was" in said
     assert contents(Path("flights")) == {"loop_slam.tum": b"mine"}
 
 

@@ -33,7 +33,7 @@ from px4fuse.comparison.estimates import MIN_PARTS, estimate_noises_and_clock, w
 from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.imu_motion import (
-    CONSTANT_SIGMA,
+    CONSTANT_SIGMAS,
     START_PRECISION,
     Signals,
     make_signals,
@@ -92,7 +92,7 @@ def test_signals_level_vehicle_at_rest_have_no_acceleration() -> None:
     signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
     _, speed, value = np.moveaxis(signals.table, 1, 0)
-    assert signals.table.shape == (len(t), 3, 3, len(CONSTANT_SIGMA))
+    assert signals.table.shape == (len(t), 3, 3, len(CONSTANT_SIGMAS))
     np.testing.assert_allclose(signals.table[..., 0], 0.0, atol=1e-10)
     # tilt θ about north and east moves it sideways by θ × f, f = [0, 0, -g]; heading does not
     tilted = np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(t), 1, 1))
@@ -133,14 +133,14 @@ def test_motion_increments_equal_constant_acceleration() -> None:
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
     positions = moved.positions(np.array([-0.3, 0.0, 0.21]))
     way, speed = positions.delta_position_m, positions.delta_velocity_m_s
-    assert way.shape == (2, 3, 1 + len(CONSTANT_SIGMA), len(moved.time_s) - 1)
-    inside = np.flatnonzero(positions.joined)
+    assert way.shape == (2, 3, 1 + len(CONSTANT_SIGMAS), len(moved.time_s) - 1)
+    inside = np.flatnonzero(positions.is_joined)
     np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-9)
     np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
     np.testing.assert_allclose(speed[1, :, 0, inside], 1.5 * 0.25, atol=1e-9)
-    np.testing.assert_array_equal(np.flatnonzero(~positions.joined) + 1, moved.edges[1:-1])
+    np.testing.assert_array_equal(np.flatnonzero(~positions.is_joined) + 1, moved.edges[1:-1])
     # positions are relative to the first measured one of each stretch
-    for begin, end in positions.stretches:
+    for begin, end in positions.segments:
         known = positions.measurement_m[begin:end, 0]
         known = known[np.isfinite(known)]
         np.testing.assert_allclose(known, 0.25 * np.arange(len(known)), atol=1e-12)
@@ -215,7 +215,7 @@ class JointNormal:
 
 @pytest.fixture(scope="module")
 def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
-    """Return 50 s with an ideal IMU and wind that it does not measure, and its stretches."""
+    """Return 50 s with an ideal IMU and wind that it does not measure, and its segments."""
     flight, _ = made_flight(duration_s=50.0, offset_s=0.07)
     time = np.arange(0.0, 50.005, 1.0 / IMU_HZ)
     h = 0.0005
@@ -235,22 +235,22 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
         positions=(replace(track, samples=samples),),
     )
     found = estimate(flight)
-    # positions that the search can shift, in equal stretches of at most 30 s
+    # positions that the search can shift, in equal segments of at most 30 s
     used = samples[(samples.index >= 0.6) & (samples.index <= 49.4)]
     first = used.index < (used.index[0] + used.index[-1]) / 2.0
     parts = used[first], used[~first]
-    stretches = [(part.index.to_numpy(), part[Columns.POSITION].to_numpy()) for part in parts]
+    segments = [(part.index.to_numpy(), part[Columns.POSITION].to_numpy()) for part in parts]
     assert found.count == len(used)
-    return flight, found, stretches
+    return flight, found, segments
 
 
 def test_clock_profile_equals_joint_normal_density(exact_imu) -> None:
     """Both noises are maximised at each offset."""
-    _, found, stretches = exact_imu
+    _, found, segments = exact_imu
     profile, best = [], []
     within = [24, 60, 90]  # further out the Newton step is too coarse
     for offset in found.curve_s[within]:
-        normals = [JointNormal(*stretch, offset) for stretch in stretches]
+        normals = [JointNormal(*segment, offset) for segment in segments]
 
         def cost(logs: Array, normals: list[JointNormal] = normals) -> float:
             return sum(normal.solved(*np.exp(logs))[0] for normal in normals)
@@ -295,11 +295,14 @@ def test_clock_parts_and_change_follow_profiles(monkeypatch, offset_s, factor) -
 
     def fit_noises(grid: Array, *_: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
-        return SimpleNamespace(by_stretch=lambda: 0.5 * square[None])
+        return SimpleNamespace(scores_by_segment=lambda: 0.5 * square[None])
 
     monkeypatch.setattr(time_offset, "fit_noises", fit_noises)
     moved = SimpleNamespace(
-        edges=np.arange(5) * 2, time_s=np.arange(8.0), blocks=lambda grid: grid, weight=None
+        edges=np.arange(5) * 2,
+        time_s=np.arange(8.0),
+        position_batches=lambda grid: grid,
+        weight=None,
     )
     parts, p = time_offset._offset_per_part(moved, offset_s, Noises(0.1, 0.1), factor)
     # the last part has a σ above the limit
@@ -324,16 +327,16 @@ def test_clock_variance_inflation_simulates_imu_noise(monkeypatch) -> None:
         np.testing.assert_allclose(variance, 0.1**2)
         return np.arange(measured.shape[1])[None, :]
 
-    monkeypatch.setattr(time_offset, "products_by_stretch", products)
+    monkeypatch.setattr(time_offset, "products_by_segment", products)
     flight, _ = made_flight()
     samples = flight.positions[0].samples[Columns.POSITION]
     time = samples.index.to_numpy()
     moved = prepare_motion(flight, time, samples.to_numpy(), directions=np.eye(3), dt_s=DT)
-    factor = time_offset._variance_inflation(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
+    factor = time_offset._simulate_variance_factor(moved, 0.0, Noises(0.5, 0.1, 0.2), 40.0)
     size = time_offset.SIMULATION_COUNT
     assert factor == pytest.approx(1.0 + (size**2 - 1) / 12.0 / 40.0)
     error, dp, dv, speed = given
-    joined, length = moved.at(0.0).joined, np.diff(moved.time_s)
+    joined, length = moved.at(0.0).is_joined, np.diff(moved.time_s)
     for noise, expected in (
         (error, 0.1**2),
         (dv[..., joined], (0.5**2 * DT * length)[joined]),

@@ -59,7 +59,7 @@ def test_correct_by_distance_removes_linear_heading_drift() -> None:
 def test_key_frames_path_length_excludes_noise() -> None:
     position, _ = square(600, 20.0)  # 80 m, 3.3 cm a step
     noisy = position + np.random.default_rng(1).normal(0.0, 0.02, position.shape)
-    frames = closure.key_frames(noisy, closure.key_frame_spacing_m(noisy))
+    frames = closure.choose_key_frames(noisy, closure.default_key_frame_spacing_m(noisy))
     assert cumulative_distance(noisy)[-1] > 95.0
     assert abs(cumulative_distance(noisy[frames])[-1] - 80.0) < 0.8
     assert frames[0] == 0

@@ -64,7 +64,7 @@ def test_draw_marks_draws_each_kind_with_its_label(eventful: Analysis) -> None:
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.plot([6.0, 94.0], [2.0, 3.0])
     limits = axes.get_xlim(), axes.get_ylim()
-    event_marks.draw_marks(axes, eventful, strip=True)
+    event_marks.draw_marks(axes, eventful, with_mode_names=True)
     axes.autoscale()
     assert (axes.get_xlim(), axes.get_ylim()) == limits
     axes.lines[0].remove()

@@ -26,7 +26,7 @@ from px4fuse.trajectory.scores import (
     Delta,
     Interval,
     autocorrelation_time,
-    pairs,
+    find_pairs,
     relative_error,
     rmse_interval,
 )
@@ -288,9 +288,9 @@ def test_pairs_equal_their_definition(steps: list[float], value: float) -> None:
         j = int(np.argmin(miss))
         if miss[j] <= 0.1 * value:
             expected.append((i, i + 1 + j))
-    start, end = pairs(position, time, Delta(value, "m"))
+    start, end = find_pairs(position, time, Delta(value, "m"))
     assert list(zip(start.tolist(), end.tolist(), strict=True)) == expected
-    start, end = pairs(position, time, Delta(2.0, "s"), all_pairs=False)
+    start, end = find_pairs(position, time, Delta(2.0, "s"), all_pairs=False)
     np.testing.assert_array_equal(start, np.arange(0, len(along) - 2, 2))
     np.testing.assert_array_equal(end, start + 2)
 

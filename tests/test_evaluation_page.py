@@ -21,7 +21,7 @@ from px4fuse.report.evaluation import (
     quarters_sentence,
     rpe_growth_sentence,
     unaligned_sentence,
-    worst_moments_sentence,
+    worst_poses_sentence,
 )
 from px4fuse.report.page import Page
 from px4fuse.report.style import report_style
@@ -115,7 +115,7 @@ def test_quarters_of_linearly_growing_error_match_integral() -> None:
     (np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%"),
 ], ids=["even", "a peak", "none"])  # fmt: skip
 def test_worst_moments_sentence_states_share_of_worst_tenth(error, share) -> None:
-    sentence = worst_moments_sentence(evaluate_with_error(across(error.astype(np.float64))))
+    sentence = worst_poses_sentence(evaluate_with_error(across(error.astype(np.float64))))
     assert f"contribute {share} of the squared error" in sentence
 
 

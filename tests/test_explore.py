@@ -22,7 +22,7 @@ from flights import Imu, aisle_flight, unexplained
 
 from px4fuse.analysis import Analysis, run_comparison
 from px4fuse.cli.compare import compare as compare_command
-from px4fuse.cli.inputs import comparison_request, read_student
+from px4fuse.cli.options import comparison_request, read_student
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.explore import page as pages

@@ -137,13 +137,15 @@ COUNT = "document.querySelector('.count').textContent"
 
 
 def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
-    # the column shows "3 × too small" and is sorted by the factor
+    # the column shows "3 × too small" and is sorted by the σ ratio
     page.click(head("KF"))
     page.click("tbody tr:first-child .name")
-    factors = {
-        log["name"]: log["sigma_ratios"]["kf"] for log in logs_of(made_up(240)) if log["factors"]
+    ratios = {
+        log["name"]: log["sigma_ratios"]["kf"]
+        for log in logs_of(made_up(240))
+        if log["sigma_ratios"]
     }
-    assert page.names()[:3] == sorted(factors, key=lambda name: factors[name])[:3]
+    assert page.names()[:3] == sorted(ratios, key=lambda name: ratios[name])[:3]
     assert STORY.splitlines()[0] in page.ask("document.querySelector('.more').innerText")
     assert "flight%20" in page.ask("document.querySelector('.more a').href")
     page.choose("#filter-0", "status:failed")

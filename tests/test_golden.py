@@ -132,7 +132,7 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
         blocks.extend(page_blocks)
         return []
 
-    monkeypatch.setattr(pdf, "data", keep)
+    monkeypatch.setattr(pdf, "to_typst_data", keep)
     monkeypatch.setattr(pdf, "compile_pdf", lambda report: blank_page(None, report["results"]))
     return blocks
 

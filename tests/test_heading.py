@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.filter import frame_rotation
 from px4fuse.filter.frame_rotation import (
-    MAX_DRIFT_P,
+    MAX_DRIFT_P_VALUE,
     HeadingError,
     HeadingPart,
     estimate_heading_error,
@@ -76,7 +76,7 @@ def test_heading_drifting_misalignment_is_followed(by):
     found = estimate(flight)
     assert found.by == by
     assert found.drifts
-    assert found.drift_p < MAX_DRIFT_P
+    assert found.drift_p < MAX_DRIFT_P_VALUE
     for part in found.parts:
         middle = (part.start_s + part.end_s) / 2.0
         expected = -np.interp(middle, flight.attitude.index, turn)

@@ -16,7 +16,7 @@ from px4fuse.findings import find_loop
 from px4fuse.flight import Unavailable
 from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
-from px4fuse.loop.corrections import BY_DISTANCE, POSITIONS_ONLY, SINGLE_LOOP
+from px4fuse.loop.corrections import BY_DISTANCE, POSITIONS_ONLY, SINGLE_LOOP_REASON
 from px4fuse.loop.model import Loop, OdometryNoise
 from px4fuse.loop.odometry import odometry_variances
 from px4fuse.loop.tracks import LoopSource, read_source, split_part
@@ -112,7 +112,7 @@ def test_loop_sample_corrections_reduce_ate_and_end_error(sample_loop):
     for way in ("pose_graph_dcs", "pose_graph_gnc"):
         robust = sample_loop.corrections[way]  # type: ignore[index]
         assert isinstance(robust, Unavailable)
-        assert robust.reason == SINGLE_LOOP
+        assert robust.reason == SINGLE_LOOP_REASON
 
 
 def test_loop_lesson_example_2_equals_lesson_output() -> None:

@@ -17,8 +17,8 @@ from scipy.stats import norm
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
-    FIRST_SHARE,
-    FIRST_WIDTH,
+    START_OUTLIER_SHARE,
+    START_OUTLIER_WIDTH,
     Likelihood,
     NoiseFit,
     Noises,
@@ -42,7 +42,7 @@ from px4fuse.filter.marginal_likelihood import (
     expected_squares,
     factorise,
     fit_positions,
-    products_by_stretch,
+    products_by_segment,
 )
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.settings import Settings
@@ -147,10 +147,10 @@ def with_constants(offsets: int = 3) -> Positions:
     initial = np.zeros((COUNT, 2))
     initial[START] = WEAK
     return Positions(
-        measurement_m=measured, start=START, length_s=length,
+        measurement_m=measured, segment_starts=START, length_s=length,
         noise_unit=0.1 * np.stack(continuous_noise_unit(length)),
         noise_fixed=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
-        initial=initial, constant_sigma=np.array([0.3, 1.0, 0.1]),
+        prior_precision=initial, constant_sigma=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
         delta_velocity_m_s=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
     )  # fmt: skip
@@ -158,9 +158,11 @@ def with_constants(offsets: int = 3) -> Positions:
 
 def arguments(positions: Positions, noises: Noises, weight: Array) -> tuple[Any, float, Array]:
     """Return the arguments of :func:`fit_positions`."""
-    if noises.slow_m:
-        positions = replace(positions, slow=(noises.slow_m, noises.tau_s))
-    scaled, variance = positions.over(1.0, noises.walk_m, weight / noises.sigma_z_m**2)
+    if noises.correlated_sigma_m:
+        positions = replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
+    scaled, variance = positions.in_sigma_z_units(
+        1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
+    )
     return scaled, noises.sigma_a_m_s2, variance
 
 
@@ -173,7 +175,7 @@ def stretch_normal(
     # position and velocity for the signals of data and constants
     means = [np.zeros((2, 4))]
     cross = {(0, 0): np.diag(1.0 / WEAK)}  # covariance of each state with all earlier ones
-    for k, row in enumerate(rows[1:], start=1):
+    for k, row in enumerate(rows[1:], segment_starts=1):
         length = part.length_s[row - 1]
         f = np.array([[1.0, length], [0.0, 1.0]])
         legs = part.delta_position_m, part.delta_velocity_m_s
@@ -181,7 +183,7 @@ def stretch_normal(
         for j in range(k):
             cross[k, j] = f @ cross[k - 1, j]
             cross[j, k] = cross[k, j].T
-        walk = np.diag([noises.walk_m**2 * length, 0.0])
+        walk = np.diag([noises.random_walk_m**2 * length, 0.0])
         cross[k, k] = f @ cross[k - 1, k - 1] @ f.T + q[row - 1] + walk
     used = [k for k, row in enumerate(rows) if np.isfinite(part.measurement_m[row, axis])]
     used = used if len(used) > 1 else []
@@ -189,10 +191,12 @@ def stretch_normal(
     signals = np.array([-means[k][0] for k in used]).reshape(-1, 4)
     signals[:, 0] += part.measurement_m[kept, axis]
     covariance = np.array([cross[k, j][0, 0] for k in used for j in used])
-    if noises.slow_m:
+    if noises.correlated_sigma_m:
         time = np.concatenate([[0.0], np.cumsum(part.length_s)])[kept]
-        slow = noises.slow_m**2 * np.exp(-np.abs(time[:, None] - time) / noises.tau_s)
-        covariance = covariance + slow.ravel()
+        correlated_noise = noises.correlated_sigma_m**2 * np.exp(
+            -np.abs(time[:, None] - time) / noises.tau_s
+        )
+        covariance = covariance + correlated_noise.ravel()
     return kept, signals, covariance.reshape(len(used), len(used)) + np.diag(variance[kept])
 
 
@@ -221,13 +225,13 @@ def test_fit_positions_constants_act_as_covariance() -> None:
     expected = np.array([[dense(noises, at) for at in range(3)] for noises in SOME_NOISES])
     assert np.ptp(expected) > 1000.0
     found_values = np.array(
-        [fit_positions(*arguments(part, noises, WEIGHT)).totals()[0] for noises in SOME_NOISES]
+        [fit_positions(*arguments(part, noises, WEIGHT)).scores()[0] for noises in SOME_NOISES]
     )
     np.testing.assert_allclose(
         found_values - found_values[0, 0], expected - expected[0, 0], rtol=1e-5, atol=1e-3
     )
     # in units of SIGMA_Z, which changes only negligible priors
-    scaled = np.array([fit_noises([part], noises, WEIGHT).totals()[0] for noises in SOME_NOISES])
+    scaled = np.array([fit_noises([part], noises, WEIGHT).scores()[0] for noises in SOME_NOISES])
     np.testing.assert_allclose(
         scaled - scaled[0, 0], found_values - found_values[0, 0], rtol=1e-5, atol=1e-3
     )
@@ -238,13 +242,13 @@ def test_fit_positions_single_measurement_has_no_effect(start_known: bool) -> No
     """A single position in a stretch has the same likelihood as none."""
     part = with_constants()
     if not start_known:
-        part = replace(part, initial=np.zeros((COUNT, 2)))
+        part = replace(part, prior_precision=np.zeros((COUNT, 2)))
     without = part.measurement_m.copy()
     without[15, 2] = np.nan
     for noises in SOME_NOISES:
         both = part, replace(part, measurement_m=without)
         one, none = (fit_positions(*arguments(each, noises, np.ones(COUNT))) for each in both)
-        np.testing.assert_allclose(one.totals(), none.totals(), rtol=1e-12)
+        np.testing.assert_allclose(one.scores(), none.scores(), rtol=1e-12)
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
 
@@ -281,14 +285,14 @@ def test_products_by_stretch_equal_dense_covariance() -> None:
     still = np.zeros((3, 2, COUNT - 1))
     first, second = signal.transpose(1, 2, 0), signal[..., [1, 1]].transpose(1, 2, 0)
     given = arguments(part, noises, np.ones(COUNT))
-    found_values = products_by_stretch(*given, (first, still, still), second)
+    found_values = products_by_segment(*given, (first, still, still), second)
     # a path that agrees with the increments has no effect
     legs = np.random.default_rng(9).normal(0.0, 1.0, (2, *still.shape))
     path, speed = np.zeros((2, *first.shape))
-    for at in np.flatnonzero(part.joined):
+    for at in np.flatnonzero(part.is_joined):
         path[..., at + 1] = path[..., at] + part.length_s[at] * speed[..., at] + legs[0, ..., at]
         speed[..., at + 1] = speed[..., at] + legs[1, ..., at]
-    moved = products_by_stretch(*given, (first + path, *legs), second)
+    moved = products_by_segment(*given, (first + path, *legs), second)
     np.testing.assert_allclose(moved, found_values, rtol=1e-3, atol=1e-3)
     for stretch in range(2):
         _, covariance, made = joint_normal(part, noises, given[2], stretch)
@@ -300,7 +304,7 @@ def test_products_by_stretch_equal_dense_covariance() -> None:
 def test_centre_on_path_keeps_likelihood() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
-    plain, found_values = (fit_positions(*each).totals()[0] for each in given)
+    plain, found_values = (fit_positions(*each).scores()[0] for each in given)
     assert np.ptp(plain) > 1.0
     np.testing.assert_allclose(found_values, plain, rtol=1e-7)
     # the signal of the scale is the path of each offset
@@ -327,7 +331,7 @@ def test_likelihood_interpolation_equals_direct_value(which: str) -> None:
     # far from the maximum the weak prior of the initial state has an effect
     for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
         score = Likelihood(parts, WEIGHT, 0.1, rough)
-        assert score.tabulated
+        assert score.is_tabulated
         found_values = np.array([score(Noises(*pair)) for pair in some])
         expected = np.array(direct) - direct[0]
         np.testing.assert_allclose(found_values - found_values[0], expected, rtol=error, atol=1e-3)
@@ -505,9 +509,16 @@ def test_outlier_probability_rises_from_prior_to_one() -> None:
     """Bayes: ε N(e; 0, w²σ²) against (1 - ε) N(e; 0, σ²), over all axes."""
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):
-        narrow = (1.0 - FIRST_SHARE) * norm.pdf(error) ** axes
-        wide = FIRST_SHARE * norm.pdf(error, scale=FIRST_WIDTH) ** axes
-        got = _outlier_probability(axes * error**2, np.full(25, axes), FIRST_SHARE, FIRST_WIDTH)
+        narrow = (1.0 - START_OUTLIER_SHARE) * norm.pdf(error) ** axes
+        wide = START_OUTLIER_SHARE * norm.pdf(error, scale=START_OUTLIER_WIDTH) ** axes
+        got = _outlier_probability(
+            axes * error**2, np.full(25, axes), START_OUTLIER_SHARE, START_OUTLIER_WIDTH
+        )
         np.testing.assert_allclose(got, wide / (wide + narrow), rtol=1e-9)
     # where the density underflows
-    assert _outlier_probability(np.array([1e200]), np.ones(1), FIRST_SHARE, FIRST_WIDTH) == 1.0
+    assert (
+        _outlier_probability(
+            np.array([1e200]), np.ones(1), START_OUTLIER_SHARE, START_OUTLIER_WIDTH
+        )
+        == 1.0
+    )

@@ -249,7 +249,7 @@ def test_read_frames_counts_unknown_frames_and_bad_bytes(
 @pytest.mark.parametrize(("share", "is_stated"), [(0.002, False), (0.005, True)])
 def test_damage_above_limit_of_bad_bytes_is_stated(tmp_path, share: float, is_stated: bool):
     content = Aisle(seconds=40.0).record().raw()
-    junk = b"\x00" * round(share * len(content) + 2 * is_stated * mavlink_frames.LONGEST_FRAME)
+    junk = b"\x00" * round(share * len(content) + 2 * is_stated * mavlink_frames.MAX_FRAME_BYTES)
     at = len(content) // 2
     (tmp_path / "made.tlog").write_bytes(content[:at] + junk + content[at:])
     log = read_log(tmp_path / "made.tlog").log
@@ -272,7 +272,7 @@ def test_damage_truncated_recording_is_stated(tmp_path, stamped: bool, missing: 
 @pytest.mark.parametrize("rest", [b"\x00" * 50, raw_frame(40_000, b"abcdefg", seed=7)])
 def test_in_frame_other_bytes_at_end_is_false(read, rest: bytes):
     """Invalid bytes and a complete frame of an unknown dialect are not a truncated frame."""
-    assert not read(b"".join(beats(6)) + rest).in_frame
+    assert not read(b"".join(beats(6)) + rest).ends_in_frame
 
 
 @pytest.mark.parametrize("junk", JUNK.values(), ids=JUNK)
@@ -334,7 +334,7 @@ def test_read_frames_damaged_receive_times_are_interpolated(read):
         times[at] = wrong
     content = b"".join(stamp(us) + part for us, part in zip(times, parts, strict=True))
     frames = read(content)
-    assert frames.bad_stamps == 3
+    assert frames.damaged_receive_times == 3
     assert frames.received_us.tolist() == [START_US + 1000 * i for i in range(9)]
 
 

@@ -15,7 +15,7 @@ from trajectory_tools import GTSAM_ORDER, gtsam_optimiser, gtsam_problem, noisy_
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.covariance import gate
+from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.initialisation import _chordal, initialise
 from px4fuse.trajectory.graph.model import (
     FROM_CHORDAL,
@@ -301,7 +301,7 @@ def test_solve_robust_removes_false_closure() -> None:
             assert solution.converged or method == "none"
             off[method].append(ate(solution.poses, truth) / known - 1.0)
             assert np.all((solution.weights >= 0.0) & (solution.weights <= 1.0))
-            assert np.all(solution.weights[graph.successive] == 1.0)
+            assert np.all(solution.weights[graph.is_successive] == 1.0)
             squared = residuals(graph, solution.poses).chi2
             assert solution.cost == pytest.approx(0.5 * np.sum(solution.weights * squared))
             if method != "none":
@@ -323,10 +323,10 @@ def test_solve_robust_reweights_given_loops_only() -> None:
     graph, _, true = laps(0)
     plain = solve(graph).cost
     for method in ("dcs", "gnc"):
-        sure = solve(graph, robust=method, loops=np.zeros(len(true), dtype=bool))
+        sure = solve(graph, robust=method, is_closure=np.zeros(len(true), dtype=bool))
         np.testing.assert_array_equal(sure.weights, 1.0)
         assert sure.cost == plain
-        told = solve(graph, robust=method, loops=~true)
+        told = solve(graph, robust=method, is_closure=~true)
         np.testing.assert_array_equal(told.weights[true], 1.0)
         assert told.weights[~true].max() < 0.05
 
@@ -373,7 +373,7 @@ def test_gate_p_value_of_true_closures_is_uniform(dimension, information, freedo
     edge = len(graph.first) - 1
     if information is not None:
         graph.information[edge] = information
-    found = [gate(simulated(graph, seed), [edge])[0] for seed in range(300)]
+    found = [gate_edges(simulated(graph, seed), [edge])[0] for seed in range(300)]
     assert {each.degrees_of_freedom for each in found} == {freedom}
     assert kstest([each.p for each in found], "uniform").pvalue > 0.01
     assert np.mean([each.accepted for each in found]) > 0.995
@@ -385,7 +385,7 @@ def test_gate_distance_uses_covariance_of_gtsam(dimension: int, is_back: bool) -
     """For an exact closure the distance depends on the odometry covariance only."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
-    chain = graph.select_edges(graph.successive)
+    chain = graph.select_edges(graph.is_successive)
     factors, values = gtsam_problem(gtsam, chain)
     kind, free = "Pose2" if dimension == 2 else "Pose3", TANGENT[dimension]
     held = getattr(values, f"at{kind}")(0)
@@ -406,7 +406,7 @@ def test_gate_distance_uses_covariance_of_gtsam(dimension: int, is_back: bool) -
             ]),
             information=np.concatenate([chain.information, 1e18 * np.eye(free)[None]]),
         )  # fmt: skip
-        found = gate(closure, [len(chain.first)])[0]
+        found = gate_edges(closure, [len(chain.first)])[0]
         assert found.d2 == pytest.approx(off @ np.linalg.solve(covariance, off), rel=1e-4)
 
 
@@ -415,7 +415,7 @@ def test_gate_without_odometry_edge_raises_error() -> None:
     edge = len(graph.first) - 1
     gap = graph.select_edges(np.arange(len(graph.first)) != 10)
     with pytest.raises(TrajectoryError, match="No odometry edge connects vertices 10 and 11"):
-        gate(gap, [edge - 1])
+        gate_edges(gap, [edge - 1])
     for at, direction, said in (
         (12, 2, "has no information in one direction"),
         (edge, slice(None), "it has no information"),
@@ -423,8 +423,8 @@ def test_gate_without_odometry_edge_raises_error() -> None:
         information = graph.information.copy()
         information[at, direction, :] = information[at, :, direction] = 0.0
         with pytest.raises(TrajectoryError, match=said):
-            gate(replace(graph, information=information), [edge])
-    assert gate(graph, []) == []
+            gate_edges(replace(graph, information=information), [edge])
+    assert gate_edges(graph, []) == []
 
 
 def test_information_eigenvectors_restore_information() -> None:

@@ -458,7 +458,7 @@ def test_read_position_csv_missing_column_is_named(read):
     (table({"time": UNIX_S, "x": X, "b": Y}), "no header"),
     (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no header"),
     (table({"t": UNIX_S, "lat": X, "lon": Y}), "no header"),
-    (table(PLAIN, decimal=","), "has 4 columns, but the rows have 8. Export it with"),
+    (table(PLAIN, decimal=","), "has 4 columns, but the rows have 8. Export the file with"),
     ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but the rows have 5"),
     (table({**PLAIN, "time": ["12.5"] * ROWS}), "1 usable rows"),
 ])  # fmt: skip

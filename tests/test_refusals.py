@@ -73,7 +73,8 @@ REFUSED = {
     "no such source": ("compare a.ulg --position-source nonsense", "no such source"),
     "notes that nest": (
         "compare a.ulg --notes deep.md",
-        "--notes deep.md: 251 levels of nesting, at most 100 are allowed",
+        "--notes deep.md: emphasis, lists and quotes are nested 251 levels deep; at most 100 "
+        "levels are allowed",
     ),
     "no notes": ("compare a.ulg --notes absent.md", "absent.md"),
     "no report": ("compare a.ulg -o report.txt", "report.txt"),

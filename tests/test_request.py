@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from px4fuse import request as requests
 from px4fuse.cli.compare import compare
-from px4fuse.cli.inputs import comparison_request
 from px4fuse.cli.loop import loop, loop_request
+from px4fuse.cli.options import comparison_request
 from px4fuse.request import ComparisonRequest, LoopRequest, PositionFile, Request, command_line
 
 NAMES = st.text("abc ü'\"$-_.", min_size=1, max_size=12).map(lambda text: f"f{text}x")
@@ -117,8 +117,8 @@ def test_request_invalid_json_is_refused(recorded: object, says: str) -> None:
 @pytest.mark.parametrize(
     ("command", "declared", "kinds"),
     [
-        (compare, requests.OPTIONS, (ComparisonRequest, PositionFile)),
-        (loop, requests.LOOP_OPTIONS, (LoopRequest,)),
+        (compare, requests.COMPARISON_OPTIONS, (ComparisonRequest, PositionFile)),
+        (loop, requests.OPTION_NAMES[LoopRequest], (LoopRequest,)),
     ],
 )
 def test_request_has_a_field_for_every_option(command, declared, kinds) -> None:
@@ -128,7 +128,7 @@ def test_request_has_a_field_for_every_option(command, declared, kinds) -> None:
         "--tum", "--g2o", "--robust", "--max-size", "--show",
     }  # fmt: skip
     options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
-    request_options = {option.name for option in declared.values()}
+    request_options = {*declared.values()}
     # --open means an open loop in px4fuse loop, and opens the output in other commands
     assert options - about_outputs - ({"--open"} - request_options) == request_options
     assert set(declared) <= {field for kind in kinds for field in kind.__struct_fields__}

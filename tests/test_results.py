@@ -12,7 +12,7 @@ from results_tools import EXAMPLE, LOOP, changed_results, decode_results
 import px4fuse
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import UnjudgedFilter
+from px4fuse.comparison.model import UntestedFilter
 from px4fuse.errors import ResultsError
 from px4fuse.flight import Flight
 from px4fuse.report.pdf import render
@@ -75,7 +75,7 @@ def test_results_too_few_updates_have_reason_not_zero(sample_flight):
     """One second of flight is too short for a test of consistency."""
     _, made = document(sample_flight, start_s=40.0, end_s=41.0)
     north = made.axes["north"]
-    assert isinstance(north.filters["kf"], UnjudgedFilter)
+    assert isinstance(north.filters["kf"], UntestedFilter)
     assert "only 4 innovations" in north.filters["kf"].reason
     assert "nis_mean" not in to_json(north.filters["kf"])
     assert_valid(to_json(made))
@@ -150,6 +150,29 @@ def test_read_results_schema_violation_is_refused(values, said):
         decode_results(changed_results(**values))
 
 
+def test_read_results_fields_of_a_newer_minor_version_are_ignored():
+    known = decode_results(changed_results(schema__version="4.9999"))
+    more = changed_results(
+        schema__version="4.9999", new=1, log__new={}, axes__aisle__filters__kf__new=[0.0],
+        tuning__horizontal__held_out__new=None, source__available=[
+            {**one, "new": "x"} for one in EXAMPLE["source"]["available"]],
+    )  # fmt: skip
+    assert decode_results(more) == known
+    assert replace(known, schema=decode_results(EXAMPLE).schema) == decode_results(EXAMPLE)
+    with pytest.raises(ResultsError, match="unknown field `new`"):
+        decode_results({**more, "schema": EXAMPLE["schema"]})
+
+
+@pytest.mark.parametrize(
+    ("provenance", "said"),
+    [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "the px4fuse that wrote it.")],
+)
+def test_read_results_of_schema_3_names_the_version_to_use(provenance, said):
+    with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:
+        decode_results(changed_results(schema__version="3.0", provenance=provenance))
+    assert str(raised.value).endswith(f"Create the report again, or read it with {said}")
+
+
 def test_read_results_cleans_keys_like_texts():
     nothing = {"what": "noises", "reason": "too short", "remedy": ""}
     assert list(decode_results(changed_results(tuning={"a\u202eb": nothing})).tuning) == ["ab"]
@@ -174,7 +197,7 @@ def test_results_number_outside_bounds_is_absent_with_reason():
     wrong = replace(axis, filters={"kf": kf, "ekf2": ekf2})
     found = within_bounds(replace(results, axes={"aisle": wrong}))
     filters = found.axes["aisle"].filters
-    assert isinstance(filters["kf"], UnjudgedFilter)
+    assert isinstance(filters["kf"], UntestedFilter)
     assert filters["kf"].reason == "axes.aisle.filters.kf.nis_mean is -3 (allowed: 0 to 1e+06)"
     assert filters["kf"].truth == kf.truth
     assert filters["ekf2"] == replace(ekf2, sigma_p_median_m=None)

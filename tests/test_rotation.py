@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from px4fuse.trajectory.rotation import (
+    cumulative_product,
     from_vector,
     interpolate,
-    matrix,
     multiply,
-    running_product,
     skew,
+    to_matrix,
     to_vector,
 )
 
@@ -26,7 +26,7 @@ def test_to_vector_tiny_rotation_keeps_angle() -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 10, 50])
 def test_running_product_equals_repeated_multiplication(count: int) -> None:
     turns = from_vector(np.random.default_rng(count).normal(0.0, 1.0, (count, 3)))
-    product, one = running_product(turns), np.array([1.0, 0.0, 0.0, 0.0])
+    product, one = cumulative_product(turns), np.array([1.0, 0.0, 0.0, 0.0])
     for row, turn in zip(product, turns, strict=True):
         one = multiply(one, turn)
         np.testing.assert_allclose(row, one, atol=1e-12)
@@ -45,11 +45,11 @@ def test_rotation_functions_equal_scipy() -> None:
     turns = rng.normal(0.0, 0.7, (50, 3))
     q = from_vector(turns)
     theirs = Rotation.from_rotvec(turns)
-    assert matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
+    assert to_matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
     assert to_vector(q) == pytest.approx(turns, abs=1e-12)
     assert to_vector(-q) == pytest.approx(turns, abs=1e-12)
     assert to_vector(from_vector(np.zeros((1, 3)))) == pytest.approx(np.zeros((1, 3)))
     both = multiply(q[:25], q[25:])
-    assert matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
+    assert to_matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
     v, u = rng.normal(size=(2, 3))
     assert skew(v) @ u == pytest.approx(np.cross(v, u))

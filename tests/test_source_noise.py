@@ -12,12 +12,12 @@ from scipy.interpolate import CubicSpline
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter import correlated_noise
-from px4fuse.filter.correlated_noise import time_correlation_fit
+from px4fuse.filter.correlated_noise import fit_time_correlation
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.cause_grouping import SETTINGS
-from px4fuse.findings.source_noise import detect, noise_variation
+from px4fuse.findings.source_noise import detect, detect_noise_variation
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
@@ -233,7 +233,7 @@ def test_noise_variation_fused_outliers_are_not_reported() -> None:
     """At 2 Hz outliers pull KF away, so most innovations within 13 s are large."""
     analysis = analysed(partial(errors.with_outliers, share=0.05), 2.0, seed=13)
     assert {"source_outliers"} == set(root_findings(analysis))
-    assert list(noise_variation(analysis)) == []
+    assert list(detect_noise_variation(analysis)) == []
 
 
 def test_time_correlation_few_samples_or_no_imu_is_unavailable() -> None:
@@ -241,11 +241,11 @@ def test_time_correlation_few_samples_or_no_imu_is_unavailable() -> None:
     axis, given = analysis.axes["north"].axis, {"outlier_time_s": NONE, "clock_offset_s": 0.0}
     few = replace(axis, measurement_time_s=axis.measurement_time_s[:99],
                   measurement_m=axis.measurement_m[:99])  # fmt: skip
-    found = time_correlation_fit(analysis.flight, (few,), RIGHT, Noises(0.3, 0.1), **given)
+    found = fit_time_correlation(analysis.flight, (few,), RIGHT, Noises(0.3, 0.1), **given)
     assert isinstance(found, Unavailable)
     assert "99" in found.reason
     blind = replace(analysis.flight, imu=Unavailable("IMU", "no IMU", ""))
-    assert time_correlation_fit(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
+    assert fit_time_correlation(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
 
 
 def test_time_correlation_fit_tries_zero_and_estimated_offset(
@@ -259,7 +259,7 @@ def test_time_correlation_fit_tries_zero_and_estimated_offset(
 
     monkeypatch.setattr(correlated_noise, "_best_of_grid", none_better)
     for offset_s in (0.0, 0.3, -0.2):
-        time_correlation_fit(
+        fit_time_correlation(
             analysis.flight, (analysis.axes["north"].axis,), RIGHT, Noises(0.3, 0.1),
             outlier_time_s=NONE, clock_offset_s=offset_s,
         )  # fmt: skip

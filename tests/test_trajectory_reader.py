@@ -194,10 +194,10 @@ INVALID_FILES: dict[str, tuple[str | bytes, str]] = {
     "too many columns": (changed(11, TUM_ROWS[0] + " 1"), "line 11: '1403636579.763555584 "),
     "zero quaternion": (changed(12, TUM_ROWS[9].split()[0] + " 1 2 3 0 0 0 0"), "line 12: columns"),
     "no quaternion": (text([f"{i} 1 2 3 4 5 6 7" for i in range(9)]), "line 1: columns 5 to 8"),
-    "back in time": (changed(13, TUM_ROWS[2]), "line 13: its timestamp is before that of the line"),
+    "back in time": (changed(13, TUM_ROWS[2]), "line 13: the timestamp is before that of the line"),
     "equal timestamps": (
         text([f"{i // 2} 1 2 3 0 0 0 1" for i in range(99)]),
-        "line 2: its timestamp equals",
+        "line 2: the timestamp is the same as in the line above",
     ),
     "odd unit": (
         text([f"{i * 33_000} 1 2 3 0 0 0 1" for i in range(9)]),

@@ -10,7 +10,7 @@ from flights import line
 from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
-from px4fuse.cli.tune import noise_text
+from px4fuse.cli.tune import format_noise_estimate
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
@@ -196,7 +196,7 @@ def test_tune_separates_biases_and_tilt_from_noise() -> None:
     assert without.sigma_a == without.sigma_a_two_state
     assert without.sigma_a.value == pytest.approx(found.sigma_a_two_state.value, rel=0.1)
     assert len(found.outlier_time_s) == 0
-    assert found.noises.walk_m == 0.0
+    assert found.noises.random_walk_m == 0.0
 
 
 def test_tune_weak_motion_scale_does_not_bias_sigma_a() -> None:
@@ -217,7 +217,7 @@ def test_tune_drifting_source_gets_random_walk() -> None:
     samples[Columns.POSITION] += np.cumsum(steps, axis=0)
     drifting = replace(flight, positions=(replace(track, samples=samples),))
     with_walk, without_walk = horizontal(drifting, drifts=True), horizontal(drifting)
-    assert with_walk.noises.walk_m == pytest.approx(0.1, rel=0.25)
+    assert with_walk.noises.random_walk_m == pytest.approx(0.1, rel=0.25)
     assert with_walk.noises.sigma_z_m == pytest.approx(0.1, rel=0.15)
     assert without_walk.noises.sigma_a_m_s2 > 1.5 * with_walk.noises.sigma_a_m_s2
 
@@ -250,4 +250,4 @@ def test_format_noise_at_search_end_is_a_bound(noise: Noise, said: str) -> None:
     ],
 )
 def test_tune_noise_text_has_interval_or_bound(noise: Noise, expected: str) -> None:
-    assert noise_text(noise) == expected
+    assert format_noise_estimate(noise) == expected

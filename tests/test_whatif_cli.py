@@ -16,7 +16,7 @@ from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Flight
-from px4fuse.report.whatif import NOT_PREDICTABLE, column_heads, reading, rows, sweep_table
+from px4fuse.report.whatif import NOT_PREDICTABLE, column_heads, rows, sweep_notes, sweep_table
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
 from px4fuse.results.reading import read_results
@@ -100,7 +100,7 @@ def test_whatif_sweep_keeps_set_parameters(swept: WhatIfAnalysis) -> None:
     assert nis == sorted(nis, reverse=True)
     assert sweep_table(swept)[0][0] == "EKF2_EVP_NOISE (m)"
     assert [row[0] for row in sweep_table(swept)[1]] == ["0.05", "0.1", "0.2"]
-    best, error, *_ = reading(swept)
+    best, error, *_ = sweep_notes(swept)
     assert "closest to 1 at EKF2_EVP_NOISE 0.1" in best
     least = min(values, key=lambda value: value.position_rmse_to_truth_m)
     assert f"smallest at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
@@ -182,7 +182,7 @@ def test_unpredictable_change_has_no_numbers(sample_flight: Flight) -> None:
     assert {line[3] for line in table} == {NOT_PREDICTABLE}
     assert all(NOT_PREDICTABLE not in line[:3] for line in table)
     assert [line[1] for line in sweep_table(told)[1]] == [NOT_PREDICTABLE] * 2
-    said = " ".join(reading(told))
+    said = " ".join(sweep_notes(told))
     assert "Not predictable: more than 35% of the samples would be rejected" in said
     assert "2 mm of position noise would change the result" in said
     assert "closest to 1" not in said

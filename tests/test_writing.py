@@ -168,7 +168,7 @@ def test_write_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -
     path.write_bytes(b"old")
     at_rename_to(path, monkeypatch, deny)
     for locks, said in ((True, "Close the program that has it open, or c"), (False, "C")):
-        monkeypatch.setattr(writing, "LOCKS", locks)
+        monkeypatch.setattr(writing, "LOCKS_OPEN_FILES", locks)
         with pytest.raises(OutputError, match=rf"\. {said}hoose another"):
             write_all({path: b"new"})
         assert path.read_bytes() == b"old"
@@ -216,6 +216,31 @@ def test_signal_while_writing_names_the_written_files(desk, name, code) -> None:
     assert (process.returncode, out) == (code, b"")
     assert err == b"px4fuse: interrupted; already written: c.tum.\n"
     assert names(desk) == ["c.tum", "l.ulg", "pipe", "s.tum"]
+
+
+# A finaliser in which the signal arrives; Python ignores exceptions of finalisers
+SIGNAL_IN_FINALISER = """
+import click, signal, sys, time
+from px4fuse.cli import main
+class Dying:
+    def __del__(self):
+        signal.raise_signal(signal.SIGTERM)
+def work(*_):
+    Dying()
+    time.sleep(60)
+click.Group.invoke = work
+sys.argv = ["px4fuse", "info"]
+main()
+"""
+
+
+@posix
+def test_signal_in_finaliser_ends_run(tmp_path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SIGNAL_IN_FINALISER], capture_output=True, timeout=50, check=False
+    )
+    assert done.returncode == 143
+    assert done.stderr == b"px4fuse: interrupted; nothing was written.\n"
 
 
 def test_signal_after_writing_names_the_written_files(desk, monkeypatch, capsys) -> None:
@@ -369,7 +394,7 @@ def test_output_closed_stdout_exits_with_0(words: str) -> None:
 def test_write_pipe_without_reader_ends_after_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_log: Path
 ) -> None:
-    monkeypatch.setattr("px4fuse.writing.READER_S", 0.1)
+    monkeypatch.setattr("px4fuse.writing.READER_TIMEOUT_S", 0.1)
     os.mkfifo(tmp_path / "pipe")
     pipe = tmp_path / "pipe"
     assert "the pipe has no reader" in error_line("info", sample_log, "--json", pipe)

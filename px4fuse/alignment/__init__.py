@@ -1,1 +1,1 @@
-"""Joining of two recordings of a flight, and alignment of a position file with a flight."""
+"""Joining of two recordings of one flight, and alignment of a position file with a flight."""

@@ -7,34 +7,39 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.alignment import time_and_pose_fit, tracks
-from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, RESIDUAL_FLOOR_M, Fit, Peak
+from px4fuse.alignment.time_and_pose_fit import (
+    GRID_RESIDUAL_M,
+    MIN_CONCORDANCE,
+    CorrelationPeak,
+    Fit,
+)
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.trajectory.time_offset import MIN_SECOND_PEAK_RATIO, STEP_S
+from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
-# frames to try if yaw is free; nwu is enu rotated by 90°
+# frames to try if yaw is estimated; nwu is not tried because it is enu rotated by 90°
 YAW_FREE_FRAMES = ("ned", "enu")
 MAX_SPAN_S = 86400.0  # a day of positions takes five seconds
 # concordance correlation below which a match gets a warning and does not overrule options
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
-MAX_CLOCK_SIGMA_S = 0.5  # standard deviation of a time offset above which it is rejected
-FRAME_RATIO = 1.3  # smallest ratio of the residuals in the second best and the best frame
-# residual without and with free yaw and origin: above this ratio and size (m) the frame is
-# misaligned
-ROTATION_RATIO, ROTATION_RMS_M = 2.0, 0.3
+MAX_CLOCK_SIGMA_S = 0.5  # a time offset with a larger standard deviation is rejected
+MIN_FRAME_RATIO = 1.3  # smallest ratio of the residuals in the second best and the best frame
+# the frame is misaligned if a free yaw and origin reduce the residual by more than this ratio, and
+# the residual is above this size (m)
+MIN_ROTATION_RATIO, MIN_ROTATION_RMS_M = 2.0, 0.3
 
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Position file with the known alignment parameters; None is estimated.
+    """Position file with the given alignment parameters; parameters that are None are estimated.
 
     Attributes
     ----------
     samples : DataFrame
-        Positions of the file, on its clock.
+        Positions of the file, on the clock of the file.
     frame : str or None
     yaw_rad : float or None
-        Rotation of the frame of the file relative to EKF2's.
+        Rotation of the frame of the file relative to the frame of EKF2.
     lag_s : float or None
         Flight time of the first sample of the file.
     """
@@ -47,13 +52,13 @@ class AlignmentProblem:
 
 @dataclass(frozen=True)
 class Match:
-    """Match of the file with one reference.
+    """Result of matching the file with one reference.
 
     Attributes
     ----------
     reference : SampledTrack
     frame : str
-    misfits_m : dict from frame to float
+    residuals_m : dict from frame to float
         Residual in each frame that was tried, best first.
     fit : Fit
         Fit with the given yaw, or with free yaw if none was given.
@@ -63,46 +68,54 @@ class Match:
         True if the frame of the file is misaligned; the time offset is then that of
         ``free_yaw_fit``.
     better_frame : str
-        Frame in which the file fits without rotation, if not the given one.
+        Frame in which the file fits without rotation; "" if that is the given frame or none.
     """
 
     reference: SampledTrack
     frame: str
-    misfits_m: dict[str, float]
+    residuals_m: dict[str, float]
     fit: Fit
     free_yaw_fit: Fit
     is_rotated: bool
     better_frame: str = ""
 
     @property
-    def clock(self) -> Fit:
+    def time_offset_fit(self) -> Fit:
         """Fit that determines the time offset."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
-    def misfits(self) -> str:
+    def residuals_text(self) -> str:
         """Residual in each frame, as text."""
-        return ", ".join(f"{name} {misfit:.2f} m" for name, misfit in self.misfits_m.items())
+        return ", ".join(
+            f"{name} {residual_m:.2f} m" for name, residual_m in self.residuals_m.items()
+        )
 
 
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
-    """Match with the first suitable reference; None if none is suitable and nothing is estimated.
+    """Match the file with the first suitable reference.
+
+    None if no reference is suitable, and no parameter has to be estimated.
 
     Raises
     ------
     NoMatchError
-        With its remedy.
+        A parameter cannot be estimated; the error has a remedy.
     """
-    known = {"clock_offset_s": problem.lag_s, "frame": problem.frame, "yaw_deg": problem.yaw_rad}
-    missing_options = [f"`{name}`" for name, value in known.items() if value is None]
+    given_parameters = {
+        "clock_offset_s": problem.lag_s,
+        "frame": problem.frame,
+        "yaw_deg": problem.yaw_rad,
+    }
+    missing_options = [f"`{name}`" for name, value in given_parameters.items() if value is None]
     reasons = []
-    # if all is given, only compare with EKF2; the band-passed IMU is not sufficient for that
-    reference_kinds = (tracks.ekf2_references, tracks.imu_references)
+    # given parameters are only checked against EKF2: the band-passed IMU is not sufficient for that
+    reference_kinds = (tracks.make_ekf2_references, tracks.make_imu_references)
     for references in reference_kinds if missing_options else reference_kinds[:1]:
         try:
             match = _match(references(flight), problem)
             _check_match(match)
-            return _fit_across_resets(flight, match, problem)
+            return _refit_with_corrected_resets(flight, match, problem)
         except NoMatchError as error:
             if error.remedy and missing_options:
                 raise
@@ -115,11 +128,11 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
 
 
 def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
-    """Match with the best of the references, in the best of the frames."""
+    """Match with the reference and the frame that give the smallest residual."""
     samples, frame, yaw_rad = problem.samples, problem.frame, problem.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
         raise NoMatchError("the position file spans more than one day; cut it to the flight")
-    if tracks.horizontal_range_m(tracks.file_track(samples, "ned")) < tracks.MIN_MOTION_M:
+    if tracks.horizontal_range_m(tracks.convert_to_ned(samples, "ned")) < tracks.MIN_MOTION_M:
         raise NoMatchError("the positions in the file hardly change")
     frames = (frame,) if frame else YAW_FREE_FRAMES if yaw_rad is None else tuple(tracks.FRAMES)
     matches = []
@@ -127,35 +140,41 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
         name = reference.name
         fit_frame = partial(_best_fit, problem, reference)
         fits = {tried_frame: fit_frame(tried_frame, yaw_rad) for tried_frame in frames}
-        misfits = {
+        residuals_m = {
             tried_frame: fits[tried_frame].rms_m
             for tried_frame in sorted(fits, key=lambda f: fits[f].rms_m)
         }
-        best = next(iter(misfits))
-        fit = fits[best]
-        free_yaw_fit = fit if yaw_rad is None else fit_frame(best, None)
+        best_frame = next(iter(residuals_m))
+        fit = fits[best_frame]
+        free_yaw_fit = fit if yaw_rad is None else fit_frame(best_frame, None)
         is_rotated = is_good_fit(free_yaw_fit, name) and (
             fit.concordance < MIN_CONCORDANCE[name]
             or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, name)
         )
-        better = ""
+        better_frame = ""
         if is_rotated and frame and yaw_rad is not None:
-            others = {
+            other_fits = {
                 tried_frame: fit_frame(tried_frame, yaw_rad)
                 for tried_frame in tracks.FRAMES
                 if tried_frame != frame
             }
-            other, other_fit = min(others.items(), key=lambda item: item[1].rms_m)
-            fits_well = other_fit.concordance >= GOOD_CONCORDANCE[name]
-            better = other if fits_well and ROTATION_RATIO * other_fit.rms_m < fit.rms_m else ""
-        matches.append(Match(reference, best, misfits, fit, free_yaw_fit, is_rotated, better))
-    return min(matches, key=lambda match: match.clock.rms_m)
+            other_frame, other_fit = min(other_fits.items(), key=lambda item: item[1].rms_m)
+            is_other_fit_good = other_fit.concordance >= GOOD_CONCORDANCE[name]
+            better_frame = (
+                other_frame
+                if is_other_fit_good and MIN_ROTATION_RATIO * other_fit.rms_m < fit.rms_m
+                else ""
+            )
+        matches.append(
+            Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated, better_frame)
+        )
+    return min(matches, key=lambda match: match.time_offset_fit.rms_m)
 
 
 def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -> bool:
-    """Return True if a free yaw and origin clearly reduce the residual."""
-    return horizontal_rms_m > ROTATION_RATIO * free_yaw_fit.horizontal_rms_m and (
-        horizontal_rms_m > ROTATION_RMS_M or reference == IMU
+    """Return True if a free yaw and origin reduce the residual by MIN_ROTATION_RATIO."""
+    return horizontal_rms_m > MIN_ROTATION_RATIO * free_yaw_fit.horizontal_rms_m and (
+        horizontal_rms_m > MIN_ROTATION_RMS_M or reference == IMU
     )
 
 
@@ -169,42 +188,46 @@ def is_good_fit(fit: Fit, reference: str) -> bool:
 
 def _check_match(match: Match) -> None:
     """Raise NoMatchError if the match is poor or ambiguous."""
-    name, fit = match.reference.name, match.clock
+    name, fit = match.reference.name, match.time_offset_fit
     if fit.concordance < MIN_CONCORDANCE[name]:
         raise NoMatchError(
             f"the position file does not match the {name} (concordance correlation "
             f"{fit.concordance:.2f}; at least {MIN_CONCORDANCE[name]:g} needed)"
         )
-    clock_open = ""
+    ambiguity = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
         difference_s = abs(fit.second_peak_s)
-        clock_open = f"; offsets that differ by {difference_s:.1f} s fit the {name} equally well"
+        ambiguity = f"; offsets that differ by {difference_s:.1f} s fit the {name} equally well"
     elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
-        clock_open = f" (its standard deviation exceeds {MAX_CLOCK_SIGMA_S:g} s)"
-    if clock_open:
+        ambiguity = f" (its standard deviation exceeds {MAX_CLOCK_SIGMA_S:g} s)"
+    if ambiguity:
         raise NoMatchError(
-            f"the time offset cannot be estimated from this path{clock_open}",
+            f"the time offset cannot be estimated from this path{ambiguity}",
             "Give `clock_offset_s`",
         )
-    if len(match.misfits_m) > 1:
-        best, second = (np.hypot(m, RESIDUAL_FLOOR_M) for m in [*match.misfits_m.values()][:2])
-        if second < FRAME_RATIO * best:
+    if len(match.residuals_m) > 1:
+        best_m, second_m = (np.hypot(m, GRID_RESIDUAL_M) for m in [*match.residuals_m.values()][:2])
+        if second_m < MIN_FRAME_RATIO * best_m:
             raise NoMatchError(
-                f"no frame fits the {name} significantly better than the others ({match.misfits})",
+                f"no frame fits the {name} significantly better than the others "
+                f"({match.residuals_text})",
                 f"Give `frame`{' or `yaw_deg` auto' if match.is_rotated else ''}",
             )
 
 
-def _fit_across_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
-    """Repeat the fit to EKF2, with its resets corrected as in the comparison."""
-    ekf2, clock = flight.ekf2, match.clock
+def _refit_with_corrected_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
+    """Repeat the fit to EKF2, with EKF2's resets corrected as in the comparison."""
+    ekf2, clock = flight.ekf2, match.time_offset_fit
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
     samples, frame = problem.samples, match.frame
-    placed = tracks.placed_samples(samples, frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
-    track, file = tracks.continuous_track(ekf2, placed), tracks.file_track(samples, frame)
+    aligned = tracks.align_samples(samples, frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
+    track, file_track = (
+        tracks.ekf2_track_without_resets(ekf2, aligned),
+        tracks.convert_to_ned(samples, frame),
+    )
     fit_again = partial(
-        time_and_pose_fit.least_squares_fit, file, track, clock_free=problem.lag_s is None
+        time_and_pose_fit.fit_by_least_squares, file_track, track, is_lag_free=problem.lag_s is None
     )
     free_yaw_fit = fit_again(match.free_yaw_fit, None)
     fit = free_yaw_fit if problem.yaw_rad is None else fit_again(match.fit, problem.yaw_rad)
@@ -214,19 +237,21 @@ def _fit_across_resets(flight: Flight, match: Match, problem: AlignmentProblem) 
 def _best_fit(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> Fit:
-    """Find the lag, unless it is given, then fit."""
-    file, lag_s = tracks.file_track(problem.samples, frame), problem.lag_s
-    coarse = tracks.resample_to_grid(tracks.remove_spikes(file))
+    """Find the lag by correlation, unless the lag is given; then fit by least squares."""
+    track, lag_s = tracks.convert_to_ned(problem.samples, frame), problem.lag_s
+    grid_track = tracks.resample_to_grid(tracks.remove_spikes(track))
     if reference.name == IMU:
-        if len(coarse.time_s) * STEP_S < tracks.MIN_OVERLAP_S:
+        if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
             raise NoMatchError("the file is too short for a match with the IMU")
-        band_passed_twice = tracks.band_pass(tracks.band_pass(coarse.position_m))
-        file = coarse = tracks.remove_edges(replace(coarse, position_m=band_passed_twice))
+        band_passed_twice = tracks.band_pass(tracks.band_pass(grid_track.position_m))
+        track = grid_track = tracks.mark_transients(
+            replace(grid_track, position_m=band_passed_twice)
+        )
     peak = (
-        time_and_pose_fit.correlation_peak(coarse, reference, yaw_rad)
+        time_and_pose_fit.find_correlation_peak(grid_track, reference, yaw_rad)
         if lag_s is None
-        else Peak(lag_s)
+        else CorrelationPeak(lag_s)
     )
-    return time_and_pose_fit.least_squares_fit(
-        file, reference, peak, yaw_rad, clock_free=lag_s is None
+    return time_and_pose_fit.fit_by_least_squares(
+        track, reference, peak, yaw_rad, is_lag_free=lag_s is None
     )

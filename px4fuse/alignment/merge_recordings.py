@@ -1,4 +1,4 @@
-"""Joining of two recordings of one flight: missing data are taken from the second."""
+"""Joining of two recordings of one flight: missing data are taken from the second recording."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -13,11 +13,11 @@ from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preferenc
 from px4fuse.log import InputFile
 from px4fuse.readers.common import collect_unavailable
 
-# names of fields that contain times
-TIMES = ("time_s", "start_s", "end_s")
+# names of record fields that contain times
+TIME_FIELDS = ("time_s", "start_s", "end_s")
 # s; smallest overlap of the recordings
 MIN_OVERLAP_S = 2.0
-# m; larger differences of the EKF2 positions are not due to interpolation: different flights
+# m; a larger difference of the EKF2 positions is not due to interpolation, but to another flight
 MAX_POSITION_DIFFERENCE_M = 0.5
 MIN_COMMON_SAMPLES = 5
 
@@ -28,9 +28,9 @@ def join(flight: Flight, other: Flight) -> Flight:
     Parameters
     ----------
     flight : Flight
-        Keeps its time zero and all of its data.
+        Recording whose time zero and data are kept.
     other : Flight
-        Adds data that ``flight`` lacks, and all of its position tracks.
+        Recording from which missing data and all position tracks are added.
 
     Raises
     ------
@@ -43,15 +43,18 @@ def join(flight: Flight, other: Flight) -> Flight:
             "Give the other recording of the flight.",
         )
     shift_s = other.log.boot_time_s - flight.log.boot_time_s
-    low, high = max(0.0, shift_s), min(flight.log.duration_s, shift_s + other.log.duration_s)
-    if high - low < MIN_OVERLAP_S:
+    common_start_s, common_end_s = (
+        max(0.0, shift_s),
+        min(flight.log.duration_s, shift_s + other.log.duration_s),
+    )
+    if common_end_s - common_start_s < MIN_OVERLAP_S:
         raise MissingDataError(
             f"{flight.log.name} and {other.log.name} do not overlap in time: "
-            f"{_span(flight)} and {_span(other)} on the autopilot's boot clock.",
+            f"{_format_span(flight)} and {_format_span(other)} on the autopilot's boot clock.",
             "Give recordings of the same flight.",
         )
     shifted = shift_times(other, shift_s)
-    agreement = _agreement(flight, shifted)
+    comparison_note = _compare_ekf2_positions(flight, shifted)
     parts_taken: dict[str, Any] = {}
     streams = dict(flight.streams)
     for part in ("imu", "attitude", "ekf2", "truth", "airborne", "modes"):
@@ -60,15 +63,15 @@ def join(flight: Flight, other: Flight) -> Flight:
             parts_taken[part] = other_part
             streams |= {k: v for k, v in shifted.streams.items() if k.startswith(part)}
     joined = replace(flight, **parts_taken)
-    missing_parts_found = collect_unavailable(
-        joined.imu, joined.attitude, joined.ekf2, joined.truth
-    )
+    missing_parts = collect_unavailable(joined.imu, joined.attitude, joined.ekf2, joined.truth)
     log, other_log = flight.log, other.log
     unix_s = log.start_unix_s
     if unix_s is None and other_log.start_unix_s is not None:
         unix_s = other_log.start_unix_s - shift_s
+    common_s = common_end_s - common_start_s
     join_note = (
-        f"joined with {other_log.name} on the boot clock, {high - low:.1f} s in common; {agreement}"
+        f"joined with {other_log.name} on the boot clock, {common_s:.1f} s in common; "
+        f"{comparison_note}"
     )
     return replace(
         joined,
@@ -93,7 +96,7 @@ def join(flight: Flight, other: Flight) -> Flight:
             },
         ),
         positions=sort_by_preference((*flight.positions, *shifted.positions)),
-        missing=(*missing_parts_found, *(part for part in flight.missing if part.source)),
+        missing=(*missing_parts, *(part for part in flight.missing if part.source)),
         streams=streams,
         clocks=(*flight.clocks, *other.clocks),
         unused=(*flight.unused, *other.unused),
@@ -104,7 +107,7 @@ def join(flight: Flight, other: Flight) -> Flight:
     )
 
 
-def _span(flight: Flight) -> str:
+def _format_span(flight: Flight) -> str:
     start = flight.log.boot_time_s
     return f"{start:.1f} s to {start + flight.log.duration_s:.1f} s"
 
@@ -128,7 +131,7 @@ def shift_times(part: Any, shift_s: float) -> Any:
     shifted = {}
     for name in (field.name for field in fields(part)):
         value = getattr(part, name)
-        shifted[name] = value + shift_s if name in TIMES else shift_times(value, shift_s)
+        shifted[name] = value + shift_s if name in TIME_FIELDS else shift_times(value, shift_s)
     if isinstance(part, Ekf2):
         shifted["instances"] = tuple((time + shift_s, number) for time, number in part.instances)
     if isinstance(part, Flight) and not isinstance(part.airborne, Unavailable):
@@ -137,30 +140,29 @@ def shift_times(part: Any, shift_s: float) -> Any:
     return replace(part, **shifted)
 
 
-def _agreement(flight: Flight, other: Flight) -> str:
+def _compare_ekf2_positions(flight: Flight, other: Flight) -> str:
     """Compare the EKF2 positions of two recordings; raise MissingDataError if they differ.
 
-    Overlap in time alone does not prove that the flight is the same, because each flight may count
-    from its own boot.
+    Overlap in time does not prove that the flight is the same, because times count from boot.
     """
     if isinstance(flight.ekf2, Ekf2) and isinstance(other.ekf2, Ekf2):
-        state_here, other_state = flight.ekf2.state, other.ekf2.state
+        own_state, other_state = flight.ekf2.state, other.ekf2.state
         common_s = other_state.index[
-            (other_state.index >= state_here.index[0]) & (other_state.index <= state_here.index[-1])
+            (other_state.index >= own_state.index[0]) & (other_state.index <= own_state.index[-1])
         ]
         if len(common_s) >= MIN_COMMON_SAMPLES:
             position = np.column_stack(
-                [np.interp(common_s, state_here.index, state_here[c]) for c in Columns.POSITION]
+                [np.interp(common_s, own_state.index, own_state[c]) for c in Columns.POSITION]
             )
             distance_m = np.linalg.norm(
                 position - other_state.loc[common_s, Columns.POSITION].to_numpy(), axis=1
             )
-            median = float(np.median(distance_m))
-            if median > MAX_POSITION_DIFFERENCE_M:
+            median_m = float(np.median(distance_m))
+            if median_m > MAX_POSITION_DIFFERENCE_M:
                 raise MissingDataError(
                     f"{flight.log.name} and {other.log.name} are different flights: their EKF2 "
-                    f"positions differ by {median:.2f} m (median).",
+                    f"positions differ by {median_m:.2f} m (median).",
                     "Give recordings of the same flight.",
                 )
-            return f"EKF2 positions of both differ by {median:.3f} m (median)"
-    return "not verified that both are of the same flight: EKF2 is not in both"
+            return f"EKF2 positions of both differ by {median_m:.3f} m (median)"
+    return "not verified that both are of the same flight: EKF2 data are not in both"

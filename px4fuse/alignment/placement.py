@@ -2,12 +2,12 @@
 
 A UWB computer records on its own clock and in its own frame. The track of the file is matched with
 a reference in the log: EKF2's position or, if this is not suitable, the acceleration of the IMU
-integrated twice, with both sides band-passed.
+integrated twice, with track and reference band-passed.
 
-Horizontal positions are complex numbers, north + i·east, so a yaw is a factor e^{iψ}. The time
-offset is found by masked cross-correlation over all lags (FFT, Padfield 2012), then refined below
-one sample by robust least squares. It is relative to the reference: if EKF2 fused late positions,
-EKF2 is late, and the time offset includes that.
+Horizontal positions are complex numbers, north + i·east, so a rotation in yaw is a factor e^{iψ}.
+The time offset is found by masked cross-correlation over all lags (FFT, Padfield 2012), then
+refined by robust least squares. The time offset is relative to the reference: if EKF2 fused late
+positions, EKF2 is late, and the time offset includes this delay.
 """
 
 from collections.abc import Iterator
@@ -30,15 +30,15 @@ from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
 
-# ratio of residuals below which another lag fits nearly as well
-NEAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}  # IMU noise gives ratios of 1.4 to 1.7
-MIN_MIRRORED_CORRELATION = 0.8  # heights with a correlation below minus this have opposite z axes
+# ratio of residuals below which another lag fits nearly as well (warning)
+MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}  # IMU noise gives ratios of 1.4 to 1.7
+MIN_MIRRORED_CORRELATION = 0.8  # z axes are opposite if the correlation of heights is below -0.8
 MAX_UNIX_DIFFERENCE_S = 60.0  # clocks of computers in a lab differ by less
 
 
 def align_position_file(
     flight: Flight,
-    file: PositionRecording,
+    recording: PositionRecording,
     *,
     frame: str | None = None,
     yaw_deg: float | Literal["auto"] | None = None,
@@ -72,55 +72,62 @@ def align_position_file(
         A parameter cannot be estimated, or file and log do not overlap in time.
     """
     _check_options(frame, yaw_deg, clock_offset_s)
-    samples = finite_rows(file.samples, ["x_m", "y_m"])
+    samples = finite_rows(recording.samples, ["x_m", "y_m"])
     if len(samples) < tracks.MIN_SAMPLES:
         raise MissingDataError(
-            f"{file.name} contains {len(samples)} positions; at least "
+            f"{recording.name} contains {len(samples)} positions; at least "
             f"{tracks.MIN_SAMPLES} are needed. Check the file and the segment (--start, "
             "--end)."
         )
     start_s, end_s = float(samples.index[0]), float(samples.index[-1])
     boot_s = flight.log.boot_time_s
-    spans = (
+    spans_text = (
         f"the log covers {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s of the boot "
-        f"clock, the file {start_s:.2f} s to {end_s:.2f} s of its {file.clock} clock"
+        f"clock, the file {start_s:.2f} s to {end_s:.2f} s of its {recording.clock} clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
         raise MissingDataError(
-            f"{file.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
-            f"overlap the log ({spans}).",
-            "Correct the offset, or omit it: px4fuse then estimates it.",
+            f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
+            f"overlap the log ({spans_text}).",
+            "Correct --clock-offset, or omit it: px4fuse then estimates the time offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
-        problem = AlignmentProblem(samples, frame or file.frame, yaw_rad, lag_s)
+        problem = AlignmentProblem(samples, frame or recording.frame, yaw_rad, lag_s)
         match = matching.find_match(flight, problem)
     except NoMatchError as error:
-        raise MissingDataError(f"{file.name}: {error}; {spans}", f"{error.remedy}.") from None
-    alignment, placed = _describe_alignment(
-        flight, file, problem, match, frame, yaw_deg, clock_offset_s
+        raise MissingDataError(
+            f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
+        ) from None
+    alignment, aligned_samples = _describe_alignment(
+        flight, recording, problem, match, frame, yaw_deg, clock_offset_s
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     track = PositionTrack(
-        name=file.name,
+        name=recording.name,
         origin=POSITION_FILE,
-        description=f"external position file, {len(placed)} samples, {alignment.frame}"
+        description=f"external position file, {len(aligned_samples)} samples, {alignment.frame}"
         f"{rotation_text}",
-        samples=placed,
+        samples=aligned_samples,
         frame="NED",
-        clock=f"{file.clock} clock of the file, {alignment.clock_offset_s:+.3f} s to the boot "
+        clock=f"{recording.clock} clock of the file, {alignment.clock_offset_s:+.3f} s to the boot "
         f"clock, {clock_source}",
-        topics=(file.name,),
-        log=file.name,
+        topics=(recording.name,),
+        log=recording.name,
         alignment=alignment,
     )
-    reader_notes = tuple(f"{file.name}: {text}" for text in (*file.detected, *file.notes))
-    dropped = {file.name: file.dropped} if file.dropped else {}
+    reader_notes = tuple(
+        f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)
+    )
+    dropped = {recording.name: recording.dropped} if recording.dropped else {}
     notes, dropped = (*flight.log.notes, *reader_notes), {**flight.log.dropped, **dropped}
     log = structs.replace(flight.log, notes=notes, dropped=dropped)
-    inputs = (*flight.inputs, InputFile(file.name, file.sha256, file.size_bytes, "position"))
+    inputs = (
+        *flight.inputs,
+        InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),
+    )
     return replace(flight, log=log, positions=(track, *flight.positions), inputs=inputs)
 
 
@@ -140,7 +147,7 @@ def _check_options(
 
 def _describe_alignment(
     flight: Flight,
-    file: PositionRecording,
+    recording: PositionRecording,
     problem: AlignmentProblem,
     match: Match | None,
     frame_option: str | None,
@@ -160,8 +167,8 @@ def _describe_alignment(
         frame_reason = "given with --position-frame"
     if match:
         frame, reference = match.frame, match.reference.name
-        if not (frame_option or file.frame):
-            frame_reason = f"fits {reference} best; residuals: {match.misfits}"
+        if not (frame_option or recording.frame):
+            frame_reason = f"fits {reference} best; residuals: {match.residuals_text}"
             if is_yaw_free and frame == "enu":
                 frame_reason += "; nwu differs from enu only in yaw, which was estimated"
         if is_yaw_free:
@@ -170,26 +177,30 @@ def _describe_alignment(
             yaw_reason = f"estimated against {reference}"
             origin_m = match.fit.origin_m if reference == EKF2_POSITION else origin_m
         if clock_offset_s is None:
-            lag_s, clock_sigma_s = match.clock.lag_s, match.clock.lag_sigma_s
+            lag_s, clock_sigma_s = match.time_offset_fit.lag_s, match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
             clock_reason = f"estimated against {reference}; includes the delay of {reference}"
-        correlation = float((np.exp(-1j * yaw_rad) * match.clock.coherence).real)
-    placed = tracks.placed_samples(samples, frame, yaw_rad, origin_m, lag_s)
-    comparison = None if reference == IMU else _compare(flight, placed)
-    if comparison:
-        reference, correlation = EKF2_POSITION, comparison[1]
-    frame_conflicts = [] if is_yaw_free else [*_frame_conflicts(match, comparison, yaw_rad)]
-    unexplained_correlation = comparison[1] if comparison and not frame_conflicts else None
-    warnings = _warnings(
+        correlation = float((np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real)
+    aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
+    ekf2_comparison = None if reference == IMU else _compare_with_ekf2(flight, aligned_samples)
+    if ekf2_comparison:
+        reference, correlation = EKF2_POSITION, ekf2_comparison[1]
+    frame_conflicts = (
+        [] if is_yaw_free else [*_find_frame_conflicts(match, ekf2_comparison, yaw_rad)]
+    )
+    unexplained_correlation = (
+        ekf2_comparison[1] if ekf2_comparison and not frame_conflicts else None
+    )
+    warnings = _find_warnings(
         flight,
-        file,
+        recording,
         match,
         is_yaw_free,
         correlation=unexplained_correlation,
         clock_offset_s=clock_offset_s,
     )
     if not (match and match.better_frame):
-        frame_conflicts += _height_conflicts(flight, placed)
+        frame_conflicts += _find_height_conflicts(flight, aligned_samples)
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
@@ -202,15 +213,19 @@ def _describe_alignment(
         clock_reason=clock_reason,
         reference=reference,
         correlation=correlation,
-        residual_rms_m=float(np.sqrt(np.mean(comparison[0] ** 2) / 2.0)) if comparison else None,
+        residual_rms_m=float(np.sqrt(np.mean(ekf2_comparison[0] ** 2) / 2.0))
+        if ekf2_comparison
+        else None,
         misplaced=tuple(frame_conflicts),
         warnings=tuple(warnings),
     )
-    return alignment, placed
+    return alignment, aligned_samples
 
 
-def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None] | None:
-    """Return the horizontal distances (m) from EKF2, and the correlation with it.
+def _compare_with_ekf2(
+    flight: Flight, aligned_samples: pd.DataFrame
+) -> tuple[Array, float | None] | None:
+    """Return the horizontal distances (m) of the file from EKF2, and the correlation of both.
 
     The correlation is None if EKF2 hardly moves; the result is None if EKF2 has no position at the
     times of the file.
@@ -218,13 +233,17 @@ def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None]
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
-        ekf2, known = tracks.continuous_track(flight.ekf2, placed).at(placed.index.to_numpy())
+        ekf2, is_known = tracks.ekf2_track_without_resets(flight.ekf2, aligned_samples).at(
+            aligned_samples.index.to_numpy()
+        )
     except NoMatchError:
         return None
-    if np.count_nonzero(known) < tracks.MIN_SAMPLES:
+    if np.count_nonzero(is_known) < tracks.MIN_SAMPLES:
         return None
-    file_position = (placed["north_m"].to_numpy() + 1j * placed["east_m"].to_numpy())[known]
-    ekf2_position = (ekf2[:, 0] + 1j * ekf2[:, 1])[known]
+    file_position = (
+        aligned_samples["north_m"].to_numpy() + 1j * aligned_samples["east_m"].to_numpy()
+    )[is_known]
+    ekf2_position = (ekf2[:, 0] + 1j * ekf2[:, 1])[is_known]
     distance_m = np.abs(file_position - ekf2_position)
     file_position, ekf2_position = (
         file_position - np.mean(file_position),
@@ -237,12 +256,12 @@ def _compare(flight: Flight, placed: pd.DataFrame) -> tuple[Array, float | None]
     ) / power if has_motion and power > 0.0 else None
 
 
-def _height_conflicts(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
+def _find_height_conflicts(flight: Flight, aligned_samples: pd.DataFrame) -> Iterator[str]:
     """Yield a message if the heights of file and EKF2 have opposite signs."""
     if isinstance(flight.ekf2, Unavailable):
         return
     down = flight.ekf2.state["down_m"]
-    file_down_m = placed["down_m"].loc[down.index[0] : down.index[-1]].dropna()
+    file_down_m = aligned_samples["down_m"].loc[down.index[0] : down.index[-1]].dropna()
     if len(file_down_m) < tracks.MIN_SAMPLES:
         return
     ekf2_down_m = np.interp(file_down_m.index, down.index, down)
@@ -257,7 +276,7 @@ def _height_conflicts(flight: Flight, placed: pd.DataFrame) -> Iterator[str]:
         )
 
 
-def _frame_conflicts(
+def _find_frame_conflicts(
     match: Match | None, comparison: tuple[Array, float | None] | None, yaw_rad: float
 ) -> Iterator[str]:
     """Yield a message if the frame of the file is misaligned with that of EKF2."""
@@ -275,18 +294,18 @@ def _frame_conflicts(
             f"{match.better_frame}. Give --position-frame {match.better_frame}."
         )
     elif is_rotated:
-        yaw = np.degrees(np.angle(np.exp(1j * (match.free_yaw_fit.yaw_rad - yaw_rad))))
-        shift = np.hypot(*match.free_yaw_fit.origin_m[:2])
-        shift_text = f" and shifted by {shift:.1f} m" if comparison else ""
+        yaw_deg = np.degrees(np.angle(np.exp(1j * (match.free_yaw_fit.yaw_rad - yaw_rad))))
+        shift_m = np.hypot(*match.free_yaw_fit.origin_m[:2])
+        shift_text = f" and shifted by {shift_m:.1f} m" if comparison else ""
         yield (
-            f"The frame of the file is rotated by {yaw:.1f}°{shift_text} relative to the {name}. "
-            "Give --position-yaw auto."
+            f"The frame of the file is rotated by {yaw_deg:.1f}°{shift_text} relative to the "
+            f"{name}. Give --position-yaw auto."
         )
 
 
-def _warnings(
+def _find_warnings(
     flight: Flight,
-    file: PositionRecording,
+    recording: PositionRecording,
     match: Match | None,
     is_yaw_free: bool,
     *,
@@ -295,17 +314,17 @@ def _warnings(
 ) -> Iterator[str]:
     """Yield warnings on a poor or ambiguous match, limits of the IMU, and different flights."""
     if match:
-        name, fit = match.reference.name, match.clock
+        name, fit = match.reference.name, match.time_offset_fit
         if fit.concordance < matching.GOOD_CONCORDANCE[name]:
             yield (
                 f"The position file matches the {name} only roughly (concordance correlation "
                 f"{fit.concordance:.2f})."
             )
-        if fit.second_peak_ratio < NEAR_RESIDUAL_RATIO[name]:
+        if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[name]:
             yield (
                 f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well "
-                f"(residual {fit.second_peak_ratio:.1f} times larger). If this one is wrong, give "
-                "--clock-offset SECONDS."
+                f"(residual {fit.second_peak_ratio:.1f} times larger). If the estimated offset is "
+                "wrong, give --clock-offset SECONDS."
             )
         if is_yaw_free and name == IMU:
             yield (
@@ -319,7 +338,7 @@ def _warnings(
         )
     # a large difference of UNIX times indicates another flight
     start_s = flight.log.start_unix_s
-    if file.clock == "UNIX" and start_s is not None and clock_offset_s is not None:
+    if recording.clock == "UNIX" and start_s is not None and clock_offset_s is not None:
         difference_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
         if difference_s >= MAX_UNIX_DIFFERENCE_S:
             yield (

@@ -9,19 +9,19 @@ from px4fuse.alignment import tracks
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
 from px4fuse.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
-from px4fuse.trajectory.time_offset import STEP_S
+from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-WINDOW_S = 1.0  # largest shift of the least squares from the correlation peak
+MAX_LAG_SHIFT_S = 1.0  # largest distance of the fitted lag from the correlation peak
 # concordance correlation below which a match is rejected
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-MIN_MISFIT = 1e-4  # lower limit of 1 - concordance; of better matches the longer one counts
-SEPARATE_LAG_S = 3.0  # distance of two lags that count as separate peaks
-RESIDUAL_FLOOR_M = 0.05  # residual of a perfect match, because of the grid
-MAX_DISTANCE_M = 1.0  # limit of residuals in the comparison of fits; larger ones may be outliers
+MIN_DISCORDANCE = 1e-4  # lower limit of 1 - concordance; of better matches the longest is chosen
+MIN_PEAK_DISTANCE_S = 3.0  # smallest distance of the lags of separate peaks
+GRID_RESIDUAL_M = 0.05  # residual of a perfect match, caused by the grid
+MAX_RESIDUAL_M = 1.0  # residuals are limited to this value, because larger ones may be outliers
 
 
 @dataclass(frozen=True)
-class Peak:
+class CorrelationPeak:
     """Peak of the cross-correlation between position file and reference.
 
     Attributes
@@ -29,12 +29,12 @@ class Peak:
     lag_s : float
         Flight time of the first sample of the file.
     concordance : float
-        Concordance correlation 2·Re(e^{-iψ}cov) / (var + var): 1 if the tracks are equal up to an
-        offset; smaller if their extents differ. NaN if the lag was given.
+        Concordance correlation 2·Re(e^{-iψ}cov) / (sum of both variances): 1 if the tracks are
+        equal up to an offset, smaller if their extents differ. NaN if the lag was given.
     second_peak_s : float
-        Best lag elsewhere, relative to this one; NaN without another peak.
+        Lag of the second peak minus lag of this peak; NaN without a second peak.
     second_peak_ratio : float
-        Residual (RMS) of that lag over the residual of the peak.
+        Residual (RMS) at the second peak over the residual at this peak.
     """
 
     lag_s: float
@@ -44,13 +44,13 @@ class Peak:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(Peak):
-    """Least-squares fit of e^{iψ}·file(t) + origin to reference(t + lag), near a peak.
+class Fit(CorrelationPeak):
+    """Least-squares fit of e^{iψ}·file(t) + origin to reference(t + lag), near a correlation peak.
 
     Attributes
     ----------
     concordance : float
-        Value of the peak; if the time offset was given, value of the fit.
+        Concordance at the peak; if the time offset was given, concordance of the fit.
     yaw_rad : float
     lag_sigma_s, yaw_sigma_rad : float or None
         Standard deviations; None if the parameter was given.
@@ -59,8 +59,8 @@ class Fit(Peak):
     coherence : complex
         Normalised covariance of reference and file before rotation; its angle is the best yaw.
     horizontal_rms_m, rms_m : float
-        RMS of the truncated residuals: per horizontal axis, and of the vector (with height if both
-        contain it).
+        RMS of the truncated residuals: per horizontal axis, and of the vector (with height if file
+        and reference have a height).
     """
 
     lag_sigma_s: float | None
@@ -72,26 +72,34 @@ class Fit(Peak):
     rms_m: float
 
 
-def correlation_peak(file: SampledTrack, reference: SampledTrack, yaw_rad: float | None) -> Peak:
-    """Find the lag with the greatest likelihood gain on the grid; yaw is free if None.
+def find_correlation_peak(
+    file_track: SampledTrack, reference: SampledTrack, yaw_rad: float | None
+) -> CorrelationPeak:
+    """Find the lag with the greatest likelihood gain on the grid; yaw is estimated if None.
 
-    With a free origin the residual sum of squares over an overlap of N grid points is
-    Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). Relative to two independent tracks the log-likelihood
-    increases by -N·ln(1 - concordance), which is maximised. A long overlap with an excellent match
-    is preferred to a short one in which two straight lines match equally well.
+    With a free origin the residual sum of squares of file f and reference g over an overlap of N
+    grid points is Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). The log-likelihood exceeds that of two
+    independent tracks by -N·ln(1 - concordance), which is maximised. A long overlap with an
+    excellent match is preferred to a short overlap in which two straight lines match equally well.
 
     Raises
     ------
     NoMatchError
         No lag has sufficient overlap.
     """
-    if not file.valid.any() or not reference.valid.any():
+    if not file_track.is_valid.any() or not reference.is_valid.any():
         raise NoMatchError("too few samples between gaps to match the tracks")
-    found = moments(file.horizontal_m, reference.horizontal_m, file.valid, reference.valid)
-    count, covariance, power = found.count, found.covariance, found.power_a + found.power_b
-    min_count = min(np.count_nonzero(file.valid), np.count_nonzero(reference.valid))
+    track_moments = moments(
+        file_track.horizontal_m, reference.horizontal_m, file_track.is_valid, reference.is_valid
+    )
+    count, covariance, power = (
+        track_moments.count,
+        track_moments.covariance,
+        track_moments.power_a + track_moments.power_b,
+    )
+    min_count = min(np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid))
     has_overlap = count >= max(
-        tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / STEP_S, min_count / 2.0)
+        tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, min_count / 2.0)
     )
     if not has_overlap.any():
         raise NoMatchError("too few samples between gaps to match the tracks")
@@ -101,85 +109,112 @@ def correlation_peak(file: SampledTrack, reference: SampledTrack, yaw_rad: float
     )
     concordance = np.zeros_like(power)
     concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / power[has_overlap]
-    gain = -count * np.log(np.maximum(1.0 - concordance, MIN_MISFIT))
-    best = int(np.argmax(np.where(has_overlap, gain, -np.inf)))
+    likelihood_gain = -count * np.log(np.maximum(1.0 - concordance, MIN_DISCORDANCE))
+    best_index = int(np.argmax(np.where(has_overlap, likelihood_gain, -np.inf)))
 
-    def lag(index: int) -> float:
-        return float(reference.time_s[0]) + (index - len(file.valid) + 1) * STEP_S
+    def lag_at(index: int) -> float:
+        return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
-    # another peak: the concordance falls to one half in between, or the lag is far away
-    outside = np.flatnonzero(concordance < 0.5 * concordance[best])
-    low = np.max(outside[outside < best], initial=-1)
-    high = np.min(outside[outside > best], initial=len(count))
-    is_other_peak = (count >= 0.5 * count[best]) & (power >= 0.25 * power[best]) & has_overlap
+    # lags on this peak: up to half of its concordance, and at least MIN_PEAK_DISTANCE_S around it
+    low_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
+    peak_start = np.max(low_indices[low_indices < best_index], initial=-1)
+    peak_end = np.min(low_indices[low_indices > best_index], initial=len(count))
+    is_other_peak = (
+        (count >= 0.5 * count[best_index]) & (power >= 0.25 * power[best_index]) & has_overlap
+    )
     is_other_peak &= concordance >= MIN_CONCORDANCE[reference.name]
-    far = round(SEPARATE_LAG_S / STEP_S)
-    is_other_peak[max(low + 1, best - far) : min(high, best + far + 1)] = False
-    peak = Peak(lag(best), float(concordance[best]))
+    min_distance = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
+    is_other_peak[
+        max(peak_start + 1, best_index - min_distance) : min(
+            peak_end, best_index + min_distance + 1
+        )
+    ] = False
+    peak = CorrelationPeak(lag_at(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
-    # per axis; the floor makes two perfect matches equal
-    square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
-    residual = np.sqrt(square + RESIDUAL_FLOOR_M**2)
+    # residual per axis; with GRID_RESIDUAL_M added, two perfect matches are equally good
+    mean_square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
+    residual = np.sqrt(mean_square + GRID_RESIDUAL_M**2)
     second_peak = int(np.argmin(np.where(is_other_peak, residual, np.inf)))
-    ratio = float(residual[second_peak] / residual[best])
-    return replace(peak, second_peak_s=lag(second_peak) - lag(best), second_peak_ratio=ratio)
+    ratio = float(residual[second_peak] / residual[best_index])
+    return replace(
+        peak, second_peak_s=lag_at(second_peak) - lag_at(best_index), second_peak_ratio=ratio
+    )
 
 
-def least_squares_fit(
-    file: SampledTrack,
+def fit_by_least_squares(
+    file_track: SampledTrack,
     reference: SampledTrack,
-    peak: Peak,
+    peak: CorrelationPeak,
     yaw_rad: float | None,
     *,
-    clock_free: bool,
+    is_lag_free: bool,
 ) -> Fit:
     """Fit origin and, if free, lag and yaw by robust least squares (soft L1).
 
-    The origin is always free, even if it is not used: otherwise an offset of the file would be
-    mistaken for a lag if the vehicle flies mostly in one direction. Covariance: σ²(JᵀJ)⁻¹ at the
-    optimum, with σ from the median residual, times 1 + 2Σρ for autocorrelated residuals (ρ summed
-    to its first zero).
+    The origin is always fitted, even if the result is not used: otherwise an offset of the file
+    would be mistaken for a lag if the vehicle flies mostly in one direction. The covariance is
+    σ²(JᵀJ)⁻¹ at the optimum, with σ from the median residual, times 1 + 2Σρ for autocorrelated
+    residuals (sum to the first zero of ρ).
 
     Raises
     ------
     NoMatchError
         Too few samples overlap the reference.
     """
-    start, is_known = reference.at(file.time_s + peak.lag_s)
-    used = is_known & file.valid
-    if np.count_nonzero(used) < tracks.MIN_SAMPLES:
+    reference_m, is_known = reference.at(file_track.time_s + peak.lag_s)
+    is_used = is_known & file_track.is_valid
+    if np.count_nonzero(is_used) < tracks.MIN_SAMPLES:
         raise NoMatchError(
-            f"only {np.count_nonzero(used)} positions of the file overlap the reference in time"
+            f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
         )
-    time = file.time_s[used] + peak.lag_s
-    z, target = file.horizontal_m[used], (start[:, 0] + 1j * start[:, 1])[used]
-    centre = np.mean(z)
-    z = z - centre  # makes yaw and origin uncorrelated
-    power = float(np.sqrt(np.var(z) * np.var(target)))
-    coherence = complex(np.vdot(z, target) / len(z) / power) if power > 0 else 0j
-    mean_square = float(np.var(z) + np.var(target)) / 2.0
+    time = file_track.time_s[is_used] + peak.lag_s
+    file_m, target_m = (
+        file_track.horizontal_m[is_used],
+        (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used],
+    )
+    centre_m = np.mean(file_m)
+    file_m = file_m - centre_m  # makes yaw and origin uncorrelated
+    power = float(np.sqrt(np.var(file_m) * np.var(target_m)))
+    coherence = complex(np.vdot(file_m, target_m) / len(file_m) / power) if power > 0 else 0j
+    mean_square = float(np.var(file_m) + np.var(target_m)) / 2.0
     horizontal = reference.horizontal_m
 
-    def unpack(x: Array) -> tuple[complex, float, float]:
-        """Return origin, lag relative to the start, and yaw."""
-        shift = float(x[2]) if clock_free else 0.0
-        return complex(x[0], x[1]), shift, float(x[-1]) if yaw_rad is None else yaw_rad
+    def unpack(parameters: Array) -> tuple[complex, float, float]:
+        """Return origin, lag relative to the peak, and yaw."""
+        lag_shift_s = float(parameters[2]) if is_lag_free else 0.0
+        return (
+            complex(parameters[0], parameters[1]),
+            lag_shift_s,
+            float(parameters[-1]) if yaw_rad is None else yaw_rad,
+        )
 
-    def residual(x: Array) -> Array:
-        origin, shift, yaw = unpack(x)
-        r = np.exp(1j * yaw) * z + origin - np.interp(time + shift, reference.time_s, horizontal)
-        return np.concatenate([r.real, r.imag])
+    def residuals_at(parameters: Array) -> Array:
+        origin, lag_shift_s, yaw = unpack(parameters)
+        residuals = (
+            np.exp(1j * yaw) * file_m
+            + origin
+            - np.interp(time + lag_shift_s, reference.time_s, horizontal)
+        )
+        return np.concatenate([residuals.real, residuals.imag])
 
-    start_at = complex(np.mean(target))
+    start_origin = complex(np.mean(target_m))
     # free parameters: origin, lag, yaw
-    free_parameters = [True, True, clock_free, yaw_rad is None]
-    x0 = np.array([start_at.real, start_at.imag, 0.0, float(np.angle(coherence))])[free_parameters]
-    limit = np.array([np.inf, np.inf, WINDOW_S, np.inf])[free_parameters]
-    scale = _robust_scale(residual(x0))
-    solution = least_squares(residual, x0, bounds=(-limit, limit), loss="soft_l1", f_scale=scale)
-    (origin, shift, yaw), r = unpack(solution.x), residual(solution.x)
-    r_complex = r[: len(z)] + 1j * r[len(z) :]
+    is_free = [True, True, is_lag_free, yaw_rad is None]
+    start_parameters = np.array(
+        [start_origin.real, start_origin.imag, 0.0, float(np.angle(coherence))]
+    )[is_free]
+    bounds = np.array([np.inf, np.inf, MAX_LAG_SHIFT_S, np.inf])[is_free]
+    residual_scale = _robust_scale(residuals_at(start_parameters))
+    solution = least_squares(
+        residuals_at,
+        start_parameters,
+        bounds=(-bounds, bounds),
+        loss="soft_l1",
+        f_scale=residual_scale,
+    )
+    (origin, lag_shift_s, yaw), residuals = unpack(solution.x), residuals_at(solution.x)
+    complex_residuals = residuals[: len(file_m)] + 1j * residuals[len(file_m) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
     information += 1e-9 * np.diag(
@@ -187,25 +222,25 @@ def least_squares_fit(
     )  # a singular matrix gives a huge variance
     variance = (
         np.diag(np.linalg.inv(information))
-        * _robust_scale(r) ** 2
-        * _autocorrelation_factor(r_complex)
+        * _robust_scale(residuals) ** 2
+        * _autocorrelation_factor(complex_residuals)
     )
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    is_at_limit = clock_free and abs(shift) > 0.99 * WINDOW_S
-    ned, _ = reference.at(time + shift)
-    down = ned[:, 2] - file.position_m[used, 2]
-    down = down[np.isfinite(down)]
-    origin_down = float(np.median(down)) if len(down) else 0.0
-    horizontal_rms = truncated_rms(np.abs(r_complex)) / np.sqrt(2.0)
-    vertical_rms = truncated_rms(down - origin_down) if len(down) else 0.0
+    is_at_limit = is_lag_free and abs(lag_shift_s) > 0.99 * MAX_LAG_SHIFT_S
+    ned, _ = reference.at(time + lag_shift_s)
+    down_difference = ned[:, 2] - file_track.position_m[is_used, 2]
+    down_difference = down_difference[np.isfinite(down_difference)]
+    origin_down = float(np.median(down_difference)) if len(down_difference) else 0.0
+    horizontal_rms = truncated_rms(np.abs(complex_residuals)) / np.sqrt(2.0)
+    vertical_rms = truncated_rms(down_difference - origin_down) if len(down_difference) else 0.0
     concordance = peak.concordance
     if np.isnan(concordance):
         real_covariance = float((np.exp(-1j * yaw) * coherence).real)
         concordance = real_covariance * power / mean_square if power > 0 else 0.0
-    origin -= np.exp(1j * yaw) * centre
+    origin -= np.exp(1j * yaw) * centre_m
     return Fit(
-        lag_s=peak.lag_s + shift,
-        lag_sigma_s=(np.inf if is_at_limit else float(sigma[2])) if clock_free else None,
+        lag_s=peak.lag_s + lag_shift_s,
+        lag_sigma_s=(np.inf if is_at_limit else float(sigma[2])) if is_lag_free else None,
         concordance=concordance,
         second_peak_s=peak.second_peak_s,
         second_peak_ratio=peak.second_peak_ratio,
@@ -224,7 +259,7 @@ def _robust_scale(residual: Array) -> float:
 
 
 def _autocorrelation_factor(residual: Complex) -> float:
-    """Return 1 + 2Σρ: number of correlated residuals per independent one."""
+    """Return 1 + 2Σρ: number of correlated residuals per independent residual."""
     limit = 3.0 * _robust_scale(np.abs(residual))
     clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
     rho = autocovariance(clipped)
@@ -236,5 +271,5 @@ def _autocorrelation_factor(residual: Complex) -> float:
 
 
 def truncated_rms(values_m: Array) -> float:
-    """Return the RMS with values limited to MAX_DISTANCE_M."""
-    return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_DISTANCE_M) ** 2)))
+    """Return the RMS of values that are limited to MAX_RESIDUAL_M."""
+    return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_RESIDUAL_M) ** 2)))

@@ -1,4 +1,4 @@
-"""Tracks of a position file and of its references, on one time grid, in north, east, down."""
+"""Tracks of a position file and of its references, in north, east, down."""
 
 from dataclasses import dataclass, replace
 
@@ -15,9 +15,9 @@ from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable
 from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
-from px4fuse.trajectory.time_offset import STEP_S
+from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-# indices of north, east, down in x, y, z, and their signs
+# by frame: indices of north, east, down in x, y, z, and signs
 FRAMES = {
     "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
     "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
@@ -25,19 +25,19 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-GAP_S = 0.5  # longest interval that is interpolated, or three median intervals
+MIN_GAP_LIMIT_S = 0.5  # a gap is longer than this and than three median intervals
 MIN_MOTION_M = 0.5
 MIN_SAMPLES = 10
-MIN_OVERLAP_S = 10.0  # smallest overlap, or half of the shorter track
-# s; EKF2's output has steps at its updates; this smoothing has no delay
+MIN_OVERLAP_S = 10.0  # smallest overlap; for short tracks half of the shorter track
+# s; σ of the smoothing of steps at EKF2's updates; the smoothing has no delay
 SMOOTHING_S = 0.2
-# band in which acceleration integrated twice equals a position; it drifts below
+# band in which acceleration integrated twice equals position; the integral drifts below the band
 BAND_HZ = (0.1, 1.0)
-BAND_EDGE_S, BAND_PADDING_S = 2.0, 10.0  # length of the filter transients, and padding
+TRANSIENT_S, BAND_PADDING_S = 2.0, 10.0  # length of the filter transients, and padding
 
 
 class NoMatchError(Exception):
-    """Reason why a reference does not match; with a remedy if other references are no better."""
+    """Reason why a reference does not match; with a remedy if no other reference can match."""
 
     def __init__(self, reason: str, remedy: str = "") -> None:
         super().__init__(reason)
@@ -46,7 +46,7 @@ class NoMatchError(Exception):
 
 @dataclass(frozen=True)
 class SampledTrack:
-    """Positions over time, of the file or of its reference.
+    """Positions over time, of the position file or of a reference.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class SampledTrack:
         Flight time; for the file the time since its first sample.
     position_m : ndarray, shape (n, 3)
         North, east, down; down may be NaN.
-    valid : ndarray of bool, shape (n,)
+    is_valid : ndarray of bool, shape (n,)
         False inside gaps.
     name : str
         Name of a reference.
@@ -62,7 +62,7 @@ class SampledTrack:
 
     time_s: Array
     position_m: Array
-    valid: BoolArray
+    is_valid: BoolArray
     name: str = ""
 
     @property
@@ -71,14 +71,14 @@ class SampledTrack:
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
-        """Interpolate the position; also return the mask of times outside of gaps."""
+        """Interpolate the position; return also a mask of the times outside of gaps."""
         position = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
-        valid = np.interp(time_s, self.time_s, self.valid.astype(float), 0.0, 0.0) > 0.999
-        return np.stack(position, axis=1), valid
+        is_valid = np.interp(time_s, self.time_s, self.is_valid.astype(float), 0.0, 0.0) > 0.999
+        return np.stack(position, axis=1), is_valid
 
 
-def file_track(samples: pd.DataFrame, frame: str) -> SampledTrack:
-    """Convert the axes of the file to north, east, down; time since its first sample."""
+def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
+    """Convert the axes of the file to north, east, down; times count from the first sample."""
     order, sign = FRAMES[frame]
     time = samples.index.to_numpy()
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
@@ -87,49 +87,51 @@ def file_track(samples: pd.DataFrame, frame: str) -> SampledTrack:
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
     """Resample a track to a regular grid, with gaps marked."""
-    grid = np.arange(track.time_s[0], track.time_s[-1], STEP_S)
-    known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, GAP_S))
-    return SampledTrack(grid, track.at(grid)[0], known)
+    grid = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
+    is_known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, MIN_GAP_LIMIT_S))
+    return SampledTrack(grid, track.at(grid)[0], is_known)
 
 
-def remove_spikes(track: SampledTrack, window: int = 3) -> SampledTrack:
-    """Remove single outliers by a median filter; a longer window removes more."""
-    return replace(track, position_m=median_filter(track.position_m, size=(window, 1)))
+def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
+    """Remove single outliers by a median filter; a longer window removes longer outliers."""
+    return replace(track, position_m=median_filter(track.position_m, size=(window_size, 1)))
 
 
 def band_pass(position_m: Array) -> Array:
     """Band-pass positions without delay."""
-    sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / STEP_S, output="sos")
-    padding = min(round(BAND_PADDING_S / STEP_S), len(position_m) - 1)
+    sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
+    padding = min(round(BAND_PADDING_S / GRID_STEP_S), len(position_m) - 1)
     return sosfiltfilt(sos, position_m, axis=0, padlen=padding)
 
 
-def remove_edges(track: SampledTrack) -> SampledTrack:
-    """Mark the filter transients at the ends and gaps as invalid."""
-    edge = round(BAND_EDGE_S / STEP_S)
-    return replace(track, valid=binary_erosion(track.valid, np.ones(2 * edge + 1, dtype=bool)))
+def mark_transients(track: SampledTrack) -> SampledTrack:
+    """Mark the transients of the band-pass filter at ends and gaps as invalid."""
+    edge = round(TRANSIENT_S / GRID_STEP_S)
+    return replace(
+        track, is_valid=binary_erosion(track.is_valid, np.ones(2 * edge + 1, dtype=bool))
+    )
 
 
 def horizontal_range_m(track: SampledTrack) -> float:
-    """Return the larger horizontal range (m), without noise and outliers."""
+    """Return the larger of the ranges (m) of north and east, without noise and outliers."""
     return float(np.max(np.ptp(remove_spikes(track, 5).position_m[:, :2], axis=0)))
 
 
-def _ekf2_track(state: pd.DataFrame) -> SampledTrack:
+def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
     """Return EKF2's position on the grid, smoothed."""
-    known = finite_rows(state, Columns.POSITION[:2])
-    if len(known) < MIN_SAMPLES:
+    finite_state = finite_rows(state, Columns.POSITION[:2])
+    if len(finite_state) < MIN_SAMPLES:
         raise NoMatchError("no horizontal EKF2 position in the log")
-    time, position = known.index.to_numpy(), known[Columns.POSITION].to_numpy()
-    grid = resample_to_grid(SampledTrack(time, position, np.ones(len(known), dtype=bool)))
-    smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / STEP_S, axis=0, mode="nearest")
+    time, position = finite_state.index.to_numpy(), finite_state[Columns.POSITION].to_numpy()
+    grid = resample_to_grid(SampledTrack(time, position, np.ones(len(finite_state), dtype=bool)))
+    smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / GRID_STEP_S, axis=0, mode="nearest")
     return replace(grid, position_m=smooth, name=EKF2_POSITION)
 
 
-def ekf2_references(flight: Flight) -> list[SampledTrack]:
-    """Return EKF2's position as published and, with horizontal resets, also without them.
+def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
+    """Return EKF2's position as published and, if there are horizontal resets, without these.
 
-    The height is always as published: most of its resets correct an error from before take-off.
+    The height is as published: most height resets correct an error from before take-off.
     """
     if isinstance(flight.ekf2, Unavailable):
         raise NoMatchError("the log has no EKF2 position")
@@ -142,13 +144,13 @@ def ekf2_references(flight: Flight) -> list[SampledTrack]:
         )
         reset_sum_m = is_after_reset @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
         states.append(state.assign(**(state[Columns.POSITION] - reset_sum_m)))
-    references = [_ekf2_track(state) for state in states]
+    references = [_smooth_ekf2_track(state) for state in states]
     if max(map(horizontal_range_m, references)) < MIN_MOTION_M:
         raise NoMatchError("the EKF2 position hardly changes")
     return references
 
 
-def imu_references(flight: Flight) -> list[SampledTrack]:
+def make_imu_references(flight: Flight) -> list[SampledTrack]:
     """Return the acceleration integrated twice, band-passed after each integration."""
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
@@ -156,33 +158,37 @@ def imu_references(flight: Flight) -> list[SampledTrack]:
     time = acceleration.index.to_numpy()
     velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
     grid = resample_to_grid(SampledTrack(time, velocity, np.ones(len(time), dtype=bool)))
-    if len(grid.time_s) * STEP_S < MIN_OVERLAP_S:
+    if len(grid.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError("the IMU data are too short")
-    position = cumulative_trapezoid(band_pass(grid.position_m), dx=STEP_S, axis=0, initial=0)
-    return [remove_edges(replace(grid, position_m=band_pass(position), name=IMU))]
+    position = cumulative_trapezoid(band_pass(grid.position_m), dx=GRID_STEP_S, axis=0, initial=0)
+    return [mark_transients(replace(grid, position_m=band_pass(position), name=IMU))]
 
 
-def placed_samples(
+def align_samples(
     samples: pd.DataFrame, frame: str, yaw_rad: float, origin_m: Array, lag_s: float
 ) -> pd.DataFrame:
-    """Return NED positions R·C·p + origin, and variances: diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ."""
-    track = file_track(samples, frame)
+    """Return the samples in NED: positions R·C·p + origin, and variances.
+
+    R is the rotation by ``yaw_rad``, C converts the axes of ``frame`` to NED. The variances are the
+    diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ.
+    """
+    track = convert_to_ned(samples, frame)
     position = track.position_m.copy()
     order, _ = FRAMES[frame]
     variance = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, order] ** 2
     if yaw_rad:  # without rotation a missing sigma of one axis does not affect the other
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-        turn = np.array([[c, -s], [s, c]])
-        position[:, :2] = position[:, :2] @ turn.T
-        variance[:, :2] = variance[:, :2] @ (turn**2).T
+        rotation = np.array([[c, -s], [s, c]])
+        position[:, :2] = position[:, :2] @ rotation.T
+        variance[:, :2] = variance[:, :2] @ (rotation**2).T
     columns = Columns.POSITION + Columns.POSITION_VARIANCE
     values = np.hstack([position + origin_m, variance])
     times = pd.Index(track.time_s + lag_s, name="time_s")
     return pd.DataFrame(dict(zip(columns, values.T, strict=True)), index=times)
 
 
-def continuous_track(ekf2: Ekf2, placed: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's track with its resets corrected for the comparison with the placed file."""
-    track = PositionTrack("", POSITION_FILE, "", placed, "NED", "", ())
-    segment = Segment(float(placed.index[0]), float(placed.index[-1]), "")
-    return _ekf2_track(continuous_state(ekf2, track, segment)[0])
+def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
+    """Return EKF2's track with resets corrected as for a comparison with the aligned file."""
+    track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
+    segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
+    return _smooth_ekf2_track(continuous_state(ekf2, track, segment)[0])

@@ -7,6 +7,7 @@ import importlib
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 
 import click
@@ -16,11 +17,11 @@ from px4fuse.errors import OutputError, Px4FuseError, SettingsError, to_one_line
 from px4fuse.input_files import inputs_protected
 from px4fuse.threads import ONE_THREAD
 
-# Commands with their help; --help must not import the modules of the commands, which are slow
+# Help text of each command; --help does not import the modules of the commands, which is slow
 COMMANDS = {
     "compare": "Check EKF2 against a two-state Kalman filter and report mistakes.",
     "batch": "Run compare on many logs and collect one table.",
-    "diff": "List differences between two flights or two settings of the filter.",
+    "diff": "List differences between two flights or reports.",
     "answers": "Write the answer form for a flight.",
     "explore": "Write an interactive page with sliders for the filter settings.",
     "practice": "Write a quiz page with simulated flights and hidden mistakes.",
@@ -41,16 +42,20 @@ COMMANDS = {
 
 
 #: Signals that end a run: Ctrl-C, termination, and a closed terminal (except on Windows)
-STOPPING = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
+TERMINATION_SIGNALS = (
+    signal.SIGINT,
+    signal.SIGTERM,
+    *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []),
+)
 
-HELP = ["-h", "--help"]
-# Removed from the environment: an invalid value stops the import of matplotlib or pymavlink, and no
-# output depends on them (figures are SVG without a date)
-UNUSED = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
-# bytes of address space; the report of the sample log needs 0.7 GB with all libraries
-LEAST_BYTES = 800_000_000
+HELP_OPTIONS = ["-h", "--help"]
+# Environment variables that px4fuse removes: an invalid value stops the import of matplotlib or
+# pymavlink, and no output depends on them (figures are SVG without a date)
+IGNORED_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
+# The report of the sample log needs 0.7 GB with all libraries
+MIN_ADDRESS_SPACE_BYTES = 800_000_000
 
-# pandas imports pyarrow (70 MB) if it is installed; only these commands need it
+# Only these commands need pyarrow (70 MB), which pandas imports if it is installed
 PARQUET_COMMANDS = ("batch", "extract")
 
 
@@ -96,10 +101,10 @@ class LazyGroup(click.Group):
             error.args = (_with_option_names(str(error), ctx.invoked_subcommand),)
             raise
         except BrokenPipeError as error:
-            # a new error without errno: for EPIPE, click would end with exit code 1
+            # The new error has no errno, because click ends with exit code 1 for EPIPE
             raise BrokenPipeError from error
-        except KeyboardInterrupt as stopped:  # click would print an empty line
-            raise Interrupted(stopped, written_so_far(ctx)) from None
+        except KeyboardInterrupt as interrupt:  # click itself would print an empty line
+            raise Interrupted(interrupt, written_so_far(ctx)) from None
         except MemoryError as error:
             raise _system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
         except OSError as error:
@@ -111,7 +116,9 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": HELP, "show_default": True})
+@click.group(
+    cls=LazyGroup, context_settings={"help_option_names": HELP_OPTIONS, "show_default": True}
+)
 @click.version_option(package_name="px4fuse")
 def cli() -> None:
     """Analyse PX4 flight logs: compare EKF2 with a two-state Kalman filter (KF).
@@ -121,7 +128,7 @@ def cli() -> None:
 
 
 def _system_error(error: OSError, written: str) -> Px4FuseError:
-    """Turn an error of the operating system into an error of px4fuse with its cause."""
+    """Turn an error of the operating system into an error of px4fuse that states the cause."""
     if error.errno == errno.ENOMEM:
         return Px4FuseError(
             f"not enough memory; {written}", "Close other programs, or raise the limit (ulimit -v)."
@@ -140,83 +147,85 @@ def _system_error(error: OSError, written: str) -> Px4FuseError:
 def _check_memory() -> None:
     """Reject a memory limit (ulimit -v) below LEAST_BYTES.
 
-    Below it, libraries end the process without a message.
+    With less memory, libraries end the process without a message.
     """
     try:
         import resource
     except ImportError:  # Windows has no memory limit for a process
         return
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < LEAST_BYTES:
+    if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_BYTES:
         raise SettingsError(
             f"the memory limit is {limit / 1e6:.0f} MB; px4fuse needs at least "
-            f"{LEAST_BYTES / 1e6:.0f} MB of address space",
+            f"{MIN_ADDRESS_SPACE_BYTES / 1e6:.0f} MB of address space",
             "Raise the limit, for example with ulimit -v unlimited.",
         )
 
 
 def main() -> None:
     """Run the command line; an error is one line on standard error and exit code 2."""
-    # garbage collection takes 10 % of the run time of one short job, and again as much at its end
+    # Garbage collection takes 10 % of the run time of a short command, and as much again at its end
     gc.disable()
     atexit.register(gc.freeze)
     _prepare_libraries()
-    _open_streams()
+    _redirect_closed_streams()
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a legacy Windows code page has no σ and ν
+        if hasattr(stream, "reconfigure"):  # legacy Windows code pages have no σ and ν
             stream.reconfigure(errors="replace")
-    for number in STOPPING:
-        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
-            signal.signal(number, _interrupt)
+    for signal_number in TERMINATION_SIGNALS:
+        if signal.getsignal(signal_number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+            signal.signal(signal_number, _interrupt)
+    if hasattr(signal, "pthread_kill"):  # not on Windows
+        sys.unraisablehook = _interrupt_again
     try:
-        if not {*HELP, "--version"} & set(sys.argv):
+        if not {*HELP_OPTIONS, "--version"} & set(sys.argv):
             _check_memory()
-        code = cli.main(standalone_mode=False)
+        exit_code = cli.main(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
-        code = 2
+        exit_code = 2
     except click.UsageError as error:
         command_name = error.ctx.command_path if error.ctx else "px4fuse"
         _print_error(f"{error.format_message()} See {command_name} --help.")
-        code = 2
+        exit_code = 2
     except Px4FuseError as error:
         _print_error(str(error))
-        code = 2
-    except Interrupted as stopped:
-        _print_error(str(stopped))
-        code = stopped.exit_code
+        exit_code = 2
+    except Interrupted as interrupt:
+        _print_error(str(interrupt))
+        exit_code = interrupt.exit_code
     except BrokenPipeError:  # the reader of the pipe has ended (| head); the files are written
         _abandon_output()
-        code = 0
+        exit_code = 0
     except OSError as error:  # from --help and --version, which click writes
         _print_error(f"standard output: cannot be written ({error.strerror}); nothing was written.")
-        code = 2
-    sys.exit(_flush_output(code if isinstance(code, int) else 0))
+        exit_code = 2
+    sys.exit(_flush_output(exit_code if isinstance(exit_code, int) else 0))
 
 
 def _prepare_libraries() -> None:
     """Set the environment variables that libraries read at their import."""
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)
-    for name in UNUSED:
+    for name in IGNORED_VARIABLES:
         os.environ.pop(name, None)
     if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # as if not installed
 
 
-def _flush_output(code: int) -> int:
+def _flush_output(exit_code: int) -> int:
     """Flush standard output and return the exit code, 2 if that is impossible."""
     try:
         sys.stdout.flush()
     except OSError as error:
         _abandon_output()
-        if code == 0:  # otherwise an error was printed already
+        if exit_code == 0:  # with another code, an error is printed already
             _print_error(f"standard output: cannot be written ({error.strerror}).")
             return 2
-    return code
+    return exit_code
 
 
-def _open_streams() -> None:
+def _redirect_closed_streams() -> None:
     """Redirect a closed standard stream (``>&-``) to the null device."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
@@ -229,19 +238,36 @@ def _open_streams() -> None:
 
 def _with_option_names(text: str, command: str | None) -> str:
     """Replace the argument names in an error by the options of the command."""
-    from px4fuse.request import EVALUATION_OPTIONS, LOOP_OPTIONS, OPTIONS, with_options
+    from px4fuse.request import (
+        COMPARISON_OPTIONS,
+        OPTION_NAMES,
+        EvaluationRequest,
+        LoopRequest,
+        with_options,
+    )
 
-    tables = {"loop": LOOP_OPTIONS, "evaluate": EVALUATION_OPTIONS}
-    return with_options(text, tables.get(command or "", OPTIONS))
+    option_names = {"loop": OPTION_NAMES[LoopRequest], "evaluate": OPTION_NAMES[EvaluationRequest]}
+    return with_options(text, option_names.get(command or "", COMPARISON_OPTIONS))
 
 
 def _print_error(text: str) -> None:
     click.echo(f"px4fuse: {to_one_line(text)}", err=True)
 
 
-def _interrupt(number: int, _: object) -> None:
+def _interrupt(signal_number: int, _: object) -> None:
     """Handle a termination signal like Ctrl-C, so that temporary files are deleted."""
-    raise KeyboardInterrupt(number)
+    raise KeyboardInterrupt(signal_number)
+
+
+def _interrupt_again(ignored: "sys.UnraisableHookArgs") -> None:
+    """Repeat a signal that arrived in a finaliser or callback, whose exceptions Python ignores."""
+    stopped = ignored.exc_value
+    if isinstance(stopped, KeyboardInterrupt):
+        number = stopped.args[0] if stopped.args else signal.SIGINT
+        # 0.1 s later the callback has ended; a signal also ends a wait of the main thread
+        threading.Timer(0.1, signal.pthread_kill, [threading.main_thread().ident, number]).start()
+    else:
+        sys.__unraisablehook__(ignored)
 
 
 def _abandon_output() -> None:

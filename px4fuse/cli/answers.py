@@ -5,13 +5,13 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import InputPath, options
+from px4fuse.cli.options import InputPath, output_option
 from px4fuse.cli.outputs import write_new
 
 
 @click.command()
 @click.argument("log", type=InputPath())
-@options("answers")
+@output_option("FILE.toml", "Output file.  [default: LOG.answers.toml beside LOG]")
 def answers(log: Path, output: Path | None) -> None:
     """Write the answer form for a flight.
 

@@ -10,30 +10,60 @@ from typing import Any, Literal
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
 FAILED = "failed"
-# For --scheduler NAME, batch prints NAME.txt of this folder: how to start such a cluster
+# --scheduler NAME prints NAME.txt of this folder: instructions to start such a cluster
 CLUSTERS = ("slurm", "kubernetes")
 
 
 @click.command()
 @click.argument("logs", nargs=-1, metavar="LOGS...")
-@inputs.options("batch")
-@inputs.settings_options
-@inputs.options("batch-ends")
-@inputs.open_option
+@options.output_option("DIR", "Output folder for the table and the results of each log.")
+@click.option("--reports", is_flag=True, help="Also write a PDF report for each log.")
+@click.option(
+    "--timeout",
+    type=click.FloatRange(1.0),
+    metavar="SECONDS",
+    default=TIMEOUT_S,
+    help="Time limit for each log.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Number of logs processed in parallel on this computer.  [default: number of cores]",
+)
+@click.option(
+    "--memory",
+    type=click.FloatRange(1.0),
+    metavar="GB",
+    default=4.0,
+    help="Memory limit for each log, in GB (Linux only).",
+)
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Address of a running Dask scheduler (tcp://host:8786). slurm or kubernetes prints how to "
+    "start one.",
+)
+@options.settings_options
+@options.fail_option(
+    (FAILED, *SEVERITIES),
+    "Exit with 1 if a log failed or has a finding of at least this severity.",
+)
+@options.open_option
 def batch(
     logs: tuple[str, ...],
     *,
     output: Path | None,
     reports: bool,
-    timeout: float = TIMEOUT_S,
+    timeout: float,
     workers: int | None,
-    memory: float = 4.0,
+    memory: float,
     scheduler: str | None,
     fail_on: Literal["failed", Severity] | None,
     **option_values: Any,
@@ -54,11 +84,11 @@ def batch(
     if scheduler is not None and workers is not None:
         raise SettingsError("--workers applies to this computer. Omit it with --scheduler.")
     from px4fuse.fleet.run import run
-    from px4fuse.fleet.terminal import summary
+    from px4fuse.fleet.terminal import format_summary
 
-    gc.enable()  # the run is long, and Dask leaves reference cycles
+    gc.enable()  # Dask leaves reference cycles, which would fill the memory in a long run
     try:
-        with outputs.progress() as step:
+        with outputs.progress() as show_progress:
             fleet = run(
                 logs,
                 output,
@@ -67,13 +97,13 @@ def batch(
                 scheduler=scheduler,
                 workers=workers,
                 memory_gb=memory,
-                progress=partial(_show_rate, step, time.monotonic()),
+                progress=partial(_show_rate, show_progress, time.monotonic()),
                 **option_values,
             )
-    except KeyboardInterrupt as stopped:
+    except KeyboardInterrupt as interrupt:
         message = f"finished results are in {output}. Run the same command to continue."
-        raise outputs.Interrupted(stopped, message) from None
-    outputs.write_and_print({}, summary(fleet), written=fleet.written)
+        raise outputs.Interrupted(interrupt, message) from None
+    outputs.write_and_print({}, format_summary(fleet), written=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
     if failed or fleet.severities & set(severities):
@@ -81,9 +111,13 @@ def batch(
 
 
 def _show_rate(
-    step: outputs.ShowStep, start_s: float, activity: str, done_count: int, total_count: int
+    show_progress: outputs.ShowProgress,
+    start_s: float,
+    activity: str,
+    done_count: int,
+    total_count: int,
 ) -> None:
-    """Show the progress with the number of logs per minute; ``start_s`` is monotonic time."""
+    """Show the progress with the logs per minute; ``start_s`` is the monotonic start time."""
     per_minute = 60.0 * done_count / (time.monotonic() - start_s)
     text = f"{activity}, {per_minute:.3g} per minute" if done_count else activity
-    step(text, done_count, total_count)
+    show_progress(text, done_count, total_count)

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.request import settings_name
 
 Severity = Literal["error", "warning", "note"]
@@ -14,14 +14,19 @@ SEVERITIES = get_args(Severity)
 
 
 @click.command()
-@click.argument("log", type=inputs.InputPath())
-@inputs.analysis_options
-@inputs.person_options
-@inputs.report_options(
+@click.argument("log", type=options.InputPath())
+@options.analysis_options
+@options.person_options
+@options.report_options(
     "Output report.  [default: reports/LOG.pdf; changed settings are part of the name]"
 )
-@inputs.options("compare")
-@inputs.open_option
+@options.fail_option(SEVERITIES, "Exit with 1 on a finding of at least this severity.")
+@click.option(
+    "--checks",
+    is_flag=True,
+    help="Exit with 1 if an EKF2 aid is overconfident, biased or not fused for a long time.",
+)
+@options.open_option
 def compare(
     log: Path,
     output: Path | None,
@@ -42,21 +47,21 @@ def compare(
     from px4fuse.report.terminal import summary
     from px4fuse.results.build import outcome_results
 
-    person = inputs.read_student(option_values)
-    request = inputs.comparison_request(log, option_values)
-    outputs.report_paths(output, json_path)  # fail early if the output cannot be written
-    with outputs.progress(json_path) as step:
-        outcome = run_or_evaluate_aids(request, step)
-        results = outcome_results(request, outcome, person)
-        release_free_memory()  # the import of the report modules needs memory
+    student = options.read_student(option_values)
+    request = options.comparison_request(log, option_values)
+    outputs.report_paths(output, json_path)  # report an impossible output before the long analysis
+    with outputs.progress(json_path) as show_progress:
+        outcome = run_or_evaluate_aids(request, show_progress)
+        results = outcome_results(request, outcome, student)
+        release_free_memory()  # importing the report modules needs memory
         if output is None and json_path is None:
             output = outputs.default_report(log.stem, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, outcome, step)
+        contents = outputs.result_files(results, json_path, output, outcome, show_progress)
     outputs.write_and_print(contents, summary(outcome, results, output), request)
-    bad = failed_checks(outcome) if checks else {}
-    for name, verdict in bad.items():
+    failed = failed_checks(outcome) if checks else {}
+    for name, verdict in failed.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
-    if bad:
+    if failed:
         sys.exit(1)
     if fail_on is not None:
         failing_severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1]

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 
 
 @click.command()
-@click.argument("a", type=inputs.InputPath())
-@click.argument("b", type=inputs.InputPath())
-@inputs.max_size_option
-@inputs.json_option
+@click.argument("a", type=options.InputPath())
+@click.argument("b", type=options.InputPath())
+@options.max_size_option
+@options.json_option
 def diff(a: Path, b: Path, json_path: Path | None) -> None:
     """List the settings, numbers and findings that differ from A to B.
 
@@ -24,12 +24,12 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
     NEES if σ is at most 1.5 times too small or too large. Otherwise the exit code is 0; 2 for bad
     input.
     """
-    from px4fuse.fleet.changes import diff as compared
-    from px4fuse.fleet.terminal import differences
+    from px4fuse.fleet.changes import diff as compare_inputs
+    from px4fuse.fleet.terminal import format_differences
 
-    outputs.check_targets([json_path])  # fail early if the output cannot be written
-    with outputs.progress(json_path) as step:
-        results = compared(a, b, progress=step)
-    outputs.write_and_print(outputs.result_files(results, json_path), differences(results))
+    outputs.check_targets([json_path])  # report an impossible output before the long analysis
+    with outputs.progress(json_path) as show_progress:
+        results = compare_inputs(a, b, progress=show_progress)
+    outputs.write_and_print(outputs.result_files(results, json_path), format_differences(results))
     if results.worse:
         sys.exit(1)

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.request import EVALUATION_OPTIONS, EvaluationRequest, settings_name
+from px4fuse.request import EvaluationRequest, settings_name
 
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
 MAX_DELTA = 1e6  # m, s or frames
-# Options that the function evaluate takes under the same name
+# Parameters that the function evaluate has under the same name
 SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
-def delta(text: str) -> Delta:
+def parse_delta(text: str) -> Delta:
     """Parse an RPE delta: a distance, a time or a number of frames (``5m``, ``10s``, ``1f``)."""
     from px4fuse.trajectory.scores import Delta
 
@@ -35,13 +35,51 @@ def delta(text: str) -> Delta:
 
 
 @click.command()
-@click.argument("estimate", type=inputs.InputPath())
-@click.argument("reference", type=inputs.InputPath())
-@inputs.options("evaluate", rpe={"type": delta, "multiple": True})
-@inputs.request_options(EvaluationRequest, EVALUATION_OPTIONS)
-@inputs.max_size_option
-@inputs.report_options("Output report.  [default: reports/A_against_B.pdf]")
-@inputs.open_option
+@click.argument("estimate", type=options.InputPath())
+@click.argument("reference", type=options.InputPath())
+@click.option(
+    "--rpe",
+    type=parse_delta,
+    metavar="DELTA",
+    multiple=True,
+    help="RPE over a distance (5m), a time (10s) or a number of frames (1f); repeatable.  "
+    "[default: several that fit the path length]",
+)
+@click.option(
+    "--alignment",
+    type=options.Choice(("none", "yaw", "se3", "sim3")),
+    help="Transform that is fitted before errors are computed.  [default: yaw for VIO, EKF2 and "
+    "KF; se3 for SLAM; sim3 for monocular SLAM]",
+)
+@click.option(
+    "--association",
+    type=options.Choice(("interpolate", "nearest")),
+    default="interpolate",
+    help="Interpolate the reference, or use its nearest pose (as evo does).",
+)
+@click.option(
+    "--max-gap",
+    "max_gap_s",
+    type=options.TypedQuantity("s"),
+    help="Longest gap in the reference to interpolate over; with --association nearest, "
+    "the largest time difference.  [default: from the rate of the reference; 0.01 for nearest]",
+)
+@click.option(
+    "--time-offset",
+    "time_offset_s",
+    type=options.TypedQuantity("s", auto=True),
+    help="Seconds to add to the timestamps of the estimate; auto estimates them from the motion.  "
+    "[default: auto if the two trajectories do not overlap in time]",
+)
+@click.option(
+    "--consecutive",
+    is_flag=True,
+    help="RPE over consecutive, non-overlapping pairs instead of all pairs.",
+)
+@options.system_option
+@options.max_size_option
+@options.report_options("Output report.  [default: reports/A_against_B.pdf]")
+@options.open_option
 def evaluate(
     estimate: Path,
     reference: Path,
@@ -59,7 +97,7 @@ def evaluate(
     from px4fuse.report.evaluation import write_evaluation
     from px4fuse.report.page import Page
     from px4fuse.results.build import evaluation_results
-    from px4fuse.trajectory.evaluation import evaluate as score
+    from px4fuse.trajectory.evaluation import evaluate as evaluate_trajectory
 
     deltas = option_values.pop("rpe")
     request = EvaluationRequest(
@@ -71,23 +109,23 @@ def evaluate(
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
         raise SettingsError(f"--max-gap {request.max_gap_s:g}: the value must be above 0 s.")
     outputs.report_paths(output, json_path)
-    with outputs.progress(json_path) as step:
-        step("reading")
-        first = read_source(request.estimate, system=request.system)
-        second = read_source(request.reference, default="truth", system=request.system)
-        step("computing errors")
-        score_result = score(
-            first.trajectory,
-            second.trajectory,
+    with outputs.progress(json_path) as show_progress:
+        show_progress("reading")
+        estimate_source = read_source(request.estimate, system=request.system)
+        reference_source = read_source(request.reference, default="truth", system=request.system)
+        show_progress("computing errors")
+        evaluation = evaluate_trajectory(
+            estimate_source.trajectory,
+            reference_source.trajectory,
             rpe_deltas=deltas or None,
             all_pairs=not request.consecutive,
             **{name: option_values[name] for name in SCORE_OPTIONS},
         )
-        results = evaluation_results(request, score_result)
+        results = evaluation_results(request, evaluation)
         if output is None and json_path is None:
             name = f"{file_name(estimate)}_against_{file_name(reference)}"
             output = outputs.default_report(name, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, score_result, step)
+        contents = outputs.result_files(results, json_path, output, evaluation, show_progress)
     page = Page()
-    write_evaluation(page, score_result)
+    write_evaluation(page, evaluation)
     outputs.write_and_print(contents, page)

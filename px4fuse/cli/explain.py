@@ -1,4 +1,4 @@
-"""``px4fuse explain``: the page of a finding in the terminal."""
+"""``px4fuse explain``: prints the meaning, an example and the error rates of a finding."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ def _list_page() -> Page:
     return page
 
 
-def _finding_page(typed: str) -> Page:
+def _finding_page(finding_id: str) -> Page:
     from px4fuse.findings.cause_grouping import CONSEQUENCES
     from px4fuse.findings.model import CATALOGUE, RENAMED_IDS, load_examples
     from px4fuse.report.page import Page
 
-    name = typed.lower().replace("-", "_")
+    name = finding_id.lower().replace("-", "_")
     name = RENAMED_IDS.get(name, name)
     if name not in CATALOGUE:
         raise SettingsError(
-            f"{typed!r} is not a finding",
+            f"{finding_id!r} is not a finding",
             f"{suggest_name(name, CATALOGUE)}For a list, run px4fuse explain.",
         )
     entry, example = CATALOGUE[name], load_examples()[name]
@@ -53,13 +53,15 @@ def _finding_page(typed: str) -> Page:
     effects = dict.fromkeys(effect.partition(":")[0] for effect in CONSEQUENCES.get(name, ()))
     page = Page()
     page.write(f"{entry.title}  [{name}]", bold=True)
-    page.labelled("Meaning", entry.meaning)
-    page.labelled("Example", example.message)
-    page.labelled("Action", example.remedy)
+    page.write_labelled("Meaning", entry.meaning)
+    page.write_labelled("Example", example.message)
+    page.write_labelled("Action", example.remedy)
     for label, names in {"Causes": causes, "Effects": effects}.items():
         if names:
-            page.labelled(label, ", ".join(names))
-    page.labelled("Rates", *_rates(example.clean_flights, example.false_alarms, example.detection))
+            page.write_labelled(label, ", ".join(names))
+    page.write_labelled(
+        "Rates", *_rates(example.clean_flights, example.false_alarms, example.detection)
+    )
     return page
 
 
@@ -72,7 +74,7 @@ def _rates(clean_flights: int, false_alarms: int, detection: Mapping[str, float]
     if not clean_flights:
         return ["Not measured: this finding states a fact of the log or of a setting."]
     detected = "; ".join(
-        f"{mistake}: {100.0 * share:.0f} %" for mistake, share in detection.items()
+        f"{mistake}: {100.0 * fraction:.0f} %" for mistake, fraction in detection.items()
     )
     return [
         f"False alarms on {false_alarms} of {clean_flights} simulated flights without a mistake.",

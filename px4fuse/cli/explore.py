@@ -5,16 +5,16 @@ from typing import Any
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.cli.sample import sample_log
 from px4fuse.request import settings_name
 
 
 @click.command()
-@click.argument("log", required=False, type=inputs.InputPath())
-@inputs.analysis_options
-@inputs.options("explore")
-@inputs.open_option
+@click.argument("log", required=False, type=options.InputPath())
+@options.analysis_options
+@options.output_option("FILE.html", "Output file.  [default: reports/LOG.html]")
+@options.open_option
 def explore(log: Path | None, output: Path | None, **option_values: Any) -> None:
     """Write an interactive page with sliders for the filter settings.
 
@@ -26,12 +26,12 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
     from px4fuse.analysis import run
 
     log = log or sample_log()
-    request = inputs.comparison_request(log, option_values)
+    request = options.comparison_request(log, option_values)
     target = outputs.web_page(output, Path("reports", f"{log.stem}{settings_name(request)}.html"))
-    with outputs.progress(target) as step:
-        analysis = run(request, step)
-        step("writing the page")
-        # imported late: Bokeh is slow to import, and an error above does not need it
+    with outputs.progress(target) as show_progress:
+        analysis = run(request, show_progress)
+        show_progress("writing the page")
+        # Bokeh is slow to import, so an error above is shown without waiting for the import
         from px4fuse.explore.page import html_text
 
         page = html_text(analysis)

@@ -6,31 +6,43 @@ import importlib.util
 import io
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import InputPath, comparison_request, options, recording_options
+from px4fuse.cli.options import (
+    Choice,
+    InputPath,
+    comparison_request,
+    flight_options,
+    output_option,
+)
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError, to_one_line
-from px4fuse.input_files import check_output_folder, own_files
+from px4fuse.input_files import check_output_folder, inputs_not_registered
 from px4fuse.reading import read_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# bytes; limit for flight.json of an earlier run
+# Limit for flight.json of an earlier run
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 
 @click.command()
 @click.argument("log", type=InputPath())
-@options("extract")
-@recording_options
+@output_option("DIR", "Output folder for the tables.", required=True)
+@click.option(
+    "--format",
+    type=Choice(("csv", "parquet")),
+    default="csv",
+    help='Table format; parquet requires pip install "px4fuse[parquet]".',
+)
+@flight_options
 def extract(
     log: Path,
     output: Path,
-    format: Literal["csv", "parquet"] = "csv",  # noqa: A002 - the name of the option
+    format: str,  # noqa: A002 - the name of the option
     **option_values: Any,
 ) -> None:
     """Export a log as tables (CSV or Parquet).
@@ -69,14 +81,14 @@ def extract(
 def _require_same_flight(folder: Path, sha256: str) -> None:
     """Raise an OutputError if the folder contains the tables of another log."""
     try:
-        with own_files():
+        with inputs_not_registered():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
-        before = json.loads(text)["log"]
-        other = before["sha256"] != sha256
-        name = str(before["name"])
+        earlier_log = json.loads(text)["log"]
+        is_other_log = earlier_log["sha256"] != sha256
+        name = str(earlier_log["name"])
     except (OutputError, ValueError, KeyError, TypeError):  # flight.json is not from px4fuse
         return
-    if other:
+    if is_other_log:
         raise OutputError(
             f"{folder} contains the tables of another log, {name}. Choose another folder (-o)."
         )

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from px4fuse.cli.inputs import InputPath, max_size_option, open_option, options
+from px4fuse.cli.options import (
+    Choice,
+    InputPath,
+    NonEmptyPath,
+    max_size_option,
+    open_option,
+    output_option,
+)
 from px4fuse.cli.outputs import Interrupted, progress, write_and_print, write_new
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.input_files import add_input, check_output_folder
@@ -21,13 +28,83 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("submissions", nargs=-1, type=InputPath())
-@options("grade-reads", logs={"type": InputPath(), "multiple": True}, rubric={"type": InputPath()})
+@click.option(
+    "--logs",
+    type=InputPath(),
+    metavar="DIR",
+    multiple=True,
+    help="Folder with the flight logs (or one log); repeatable. A report cannot be verified "
+    "without its log.",
+)
+@click.option(
+    "--rubric",
+    type=InputPath(),
+    metavar="FILE.toml",
+    help="Rubric with the points of each item.  [default: the rubric of this lab]",
+)
 @max_size_option
-@options(
-    "grade",
-    key={"type": InputPath()},
-    roster={"type": InputPath()},
-    worksheet={"type": InputPath(), "multiple": True},
+@click.option(
+    "--key",
+    type=InputPath(),
+    metavar="FILE.json",
+    help="Answer key written by px4fuse simulate --assignment.",
+)
+@output_option("DIR", "Output folder for the class table and the feedback.")
+@click.option("--title", help="Title of the class page.  [default: the rubric's title]")
+@click.option(
+    "--roster",
+    type=InputPath(),
+    metavar="FILE.csv",
+    help="Class list with all students.  [default: the students in --key]",
+)
+@click.option(
+    "--attempt",
+    type=Choice(("latest", "best", "first")),
+    default="latest",
+    help="Attempt of each student that counts.",
+)
+@click.option(
+    "--due",
+    metavar="TIME",
+    help="Due time: '2026-11-20 23:59' in this computer's time zone, or followed by '+01:00' or "
+    "'Europe/Berlin'. Submission times without a zone are in the same zone.",
+)
+@click.option(
+    "--late",
+    metavar="RULE",
+    help="Deduction for late submissions: '10%/day' or '10%/day up to 50%' of all points, for each "
+    "day or part of a day.",
+)
+@click.option(
+    "--include-pending",
+    is_flag=True,
+    help="Also enter points that the instructor has not confirmed yet.",
+)
+@click.option(
+    "--worksheet",
+    type=InputPath(),
+    metavar="FILE.csv",
+    multiple=True,
+    help="Moodle grading worksheet, Canvas gradebook, or another table with ids or names; px4fuse "
+    "writes a copy with the grades. Repeatable.",
+)
+@click.option("--column", metavar="TITLE", help="Title of the grade column in the worksheets.")
+@click.option(
+    "--anonymous",
+    is_flag=True,
+    help="Show pseudonyms on the class page; names.csv maps them to students.",
+)
+@click.option(
+    "--jobs",
+    type=click.IntRange(1, 256),
+    metavar="N",
+    help="Number of reports processed in parallel.  [default: number of cores]",
+)
+@click.option(
+    "--write-rubric",
+    type=NonEmptyPath(),
+    metavar="FILE.toml",
+    help="Write the default rubric for editing, and exit.",
 )
 @open_option
 def grade(
@@ -39,7 +116,7 @@ def grade(
     output: Path | None,
     title: str | None,
     roster: Path | None,
-    attempt: Literal["latest", "best", "first"] = "latest",
+    attempt: Literal["latest", "best", "first"],
     due: str | None,
     late: str | None,
     include_pending: bool,
@@ -59,45 +136,49 @@ def grade(
     from px4fuse.assignment.key import read_key
     from px4fuse.assignment.roster import read_people
     from px4fuse.assignment.sheet import read_sheet
-    from px4fuse.grading.entries import Course, due_time, late_rule
-    from px4fuse.grading.grade import grade as grade_all
+    from px4fuse.grading.entries import Course, parse_due_time, parse_late_rule
+    from px4fuse.grading.grade import grade as grade_submissions
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
         return
-    costs = late_rule(late) if late else None
-    if costs is not None and due is None:
+    late_deduction = parse_late_rule(late) if late else None
+    if late_deduction is not None and due is None:
         raise SettingsError("--late requires --due TIME.")
     if not submissions:
         raise SettingsError("no submissions were given. Give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("grade requires an output folder: -o DIR.")
     _require_output_outside(output, (*submissions, *logs))
-    answers = None if key is None else read_key(key)
+    answer_key = None if key is None else read_key(key)
     course = Course(
         read_rubric(rubric),
-        answers,
+        answer_key,
         logs,
         title or "",
         roster=None if roster is None else read_people(read_sheet(roster)),
         worksheets=tuple(map(read_sheet, worksheet)),
         column=column or "",
         attempt=attempt,
-        due=due_time(due) if due else None,
-        late=costs,
+        due=parse_due_time(due) if due else None,
+        late_rule=late_deduction,
         include_pending=include_pending,
         anonymous=anonymous,
     )
     try:
-        with progress() as step:
-            outcome = grade_all(
-                submissions, course, output, processes=jobs, progress=partial(step, "grading")
+        with progress() as show_progress:
+            outcome = grade_submissions(
+                submissions,
+                course,
+                output,
+                processes=jobs,
+                progress=partial(show_progress, "grading"),
             )
-    except KeyboardInterrupt as stopped:
+    except KeyboardInterrupt as interrupt:
         message = f"finished results are in {output}. Run the same command to continue."
-        raise Interrupted(stopped, message) from None
-    write_and_print({}, _page(outcome), written=outcome.written)
+        raise Interrupted(interrupt, message) from None
+    write_and_print({}, _page(outcome), written=outcome.written_paths)
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
@@ -125,21 +206,22 @@ def _page(outcome: GradeOutcome) -> Page:
 
     page, rows = Page(), []
     for entry in outcome.entries:
-        attempt = entry.counting
+        attempt = entry.counted_report
         pending = ", pending" if attempt and entry.total is None else ""
         status = attempt.status + pending if attempt else "missing"
         status_colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
         total = "–" if entry.total is None else f"{entry.total:g}"
         name = one_line(entry.student or entry.student_id, 60)
         file, flags = attempt.submission if attempt else "", f"{len(entry.flags) or ''}"
-        rows.append((name, file, (status, status_colour), f"{total} / {entry.of:g}", flags))
+        rows.append((name, file, (status, status_colour), f"{total} / {entry.max_points:g}", flags))
     page.table(("student", "submission", "status", "points", "flags"), rows, right=(3, 4))
-    counts = Counter(attempt.status for attempt in outcome.graded)
+    counts = Counter(attempt.status for attempt in outcome.reports)
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    missing = sum(entry.counting is None for entry in outcome.entries)
+    missing = sum(entry.counted_report is None for entry in outcome.entries)
     page.write(
-        f"{len(outcome.graded)} submissions: {status_counts or 'none'}; no submission from "
-        f"{missing} of {len(outcome.entries)} students; {outcome.reused} reused from an earlier run"
+        f"{len(outcome.reports)} submissions: {status_counts or 'none'}; no submission from "
+        f"{missing} of {len(outcome.entries)} students; stored verifications of "
+        f"{outcome.reused_count} submissions were used"
     )
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)

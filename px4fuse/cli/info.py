@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import InputPath, comparison_request, json_option, recording_options
+from px4fuse.cli.options import InputPath, comparison_request, flight_options, json_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.record import Unavailable
 from px4fuse.text import join_first
@@ -46,7 +46,7 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
     help="Print the versions of px4fuse, system and libraries for a bug report, and exit.",
 )
 @json_option
-@recording_options
+@flight_options
 def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """List the contents of a log and which analyses are possible.
 
@@ -58,9 +58,9 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
     request = comparison_request(log, option_values)
     check_targets([json_path])
-    with progress(json_path) as step:
-        flight = read_flight(request, step)
-        step("reading the contents")
+    with progress(json_path) as show_progress:
+        flight = read_flight(request, show_progress)
+        show_progress("reading the contents")
         inventory = take_inventory(flight)
     contents = result_files(to_plain(inventory), json_path)
     write_and_print(contents, _page(inventory, request))
@@ -74,7 +74,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
     for label, text in _log_facts(inventory):
-        page.labelled(label, text)
+        page.write_labelled(label, text)
     if inventory.flight.log.senders:
         page.table(("sender", "type", "messages", "lost"), _sender_rows(inventory), right=(2, 3))
     page.table(SOURCES_HEAD, list(_source_rows(inventory)), right=(2, 3, 4, 5))
@@ -85,7 +85,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     ]
     page.table(("possible", "analysis", ""), rows)
     if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
-        command = command_line(request, "compare", typed=True)
+        command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
     lists = {
         "Action": [
@@ -100,7 +100,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     }
     for label, texts in lists.items():
         if texts:
-            page.labelled(label, *texts)
+            page.write_labelled(label, *texts)
     return page
 
 
@@ -166,13 +166,20 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
 
     previous = ""
     for source in inventory.sources:
-        part = source.part if source.part != previous else ""
+        data_type = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
-            yield part, ("none", MUTED_COLOUR), "", "", "", ""  # the next table gives the reason
+            yield (
+                data_type,
+                ("none", MUTED_COLOUR),
+                "",
+                "",
+                "",
+                "",
+            )  # the table of analyses gives the reason
             continue
         yield (
-            f"{part:8} (used)" if source.chosen else part,
+            f"{data_type:8} (used)" if source.chosen else data_type,
             source.name,
             "" if source.samples is None else f"{source.samples}",
             "" if source.rate_hz is None else _format_short(source.rate_hz),
@@ -198,7 +205,7 @@ def _span_text(source: Source) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0
-    # + 0.0 turns -0.0 into 0.0
+    # Adding 0.0 turns -0.0 into 0.0
     start, end = (round(time, digits) + 0.0 for time in (source.start_s, source.end_s))
     return f"{start:.{digits}f} to {end:.{digits}f}"
 

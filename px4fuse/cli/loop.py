@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.reading import display_name
 from px4fuse.request import (
-    LOOP_OPTIONS,
+    FrameName,
     GivenClosure,
     Landing,
     LoopRequest,
@@ -24,19 +24,19 @@ from px4fuse.writing import STANDARD_OUTPUT
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# m; limit for --landed-at, longer than any tape measure
+# Limit for --landed-at, longer than any tape measure
 MAX_LANDING_DISTANCE_M = 10_000.0
 # Parameters that are allowed with a pose graph
 GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
 
 
-def _parse_numbers(text: str, expected: str, most: float) -> list[float]:
+def _parse_numbers(text: str, expected: str, max_absolute: float) -> list[float]:
     """Parse two or three comma-separated finite numbers of at most ``most``."""
     try:
-        numbers = [float(text_part) for text_part in text.split(",")]
+        numbers = [float(word) for word in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (2, 3) or not all(abs(number) <= most for number in numbers):
+    if len(numbers) not in (2, 3) or not all(abs(number) <= max_absolute for number in numbers):
         raise click.BadParameter(f"{text!r} is not {expected}.")
     return numbers
 
@@ -54,20 +54,98 @@ def parse_closure(text: str) -> GivenClosure:
 
 
 @click.command()
-@click.argument("source", type=inputs.InputPath())
-@inputs.options(
-    "loop",
-    landed_at={"type": parse_landing},
-    opened={"is_flag": True},
-    closures={"type": parse_closure, "multiple": True},
-    robust={"is_flag": True},
+@click.argument("source", type=options.InputPath())
+@click.option(
+    "--landed-at",
+    type=parse_landing,
+    metavar="FORWARD,RIGHT[,DEG]",
+    help="Measured landing place relative to the take-off place: m forward (along the nose at "
+    "take-off), m right, and optionally the clockwise rotation in degrees.  [default: the log's "
+    "ground truth, else 0,0]",
 )
-@inputs.request_options(LoopRequest, LOOP_OPTIONS)
-@inputs.max_size_option
-@inputs.person_options
-@inputs.report_options("Output report.  [default: reports/SOURCE_loop.pdf]")
-@inputs.options("loop-writes")
-@inputs.show_option
+@click.option(
+    "--open",
+    "opened",
+    is_flag=True,
+    help="The vehicle did not return to the take-off place: do not use the landing as a closure.",
+)
+@click.option(
+    "--closure",
+    "closures",
+    type=parse_closure,
+    metavar="T1,T2[,SIGMA]",
+    multiple=True,
+    help="Loop closure: the vehicle was at the same place at times T1 and T2, within SIGMA m "
+    "(0.10); repeatable.",
+)
+@click.option(
+    "--robust",
+    is_flag=True,
+    help="Also run robust optimisation on a pose graph with more than 1000 closures (takes "
+    "minutes).",
+)
+@click.option(
+    "--from",
+    "start_s",
+    type=options.TypedQuantity("s", 20.0),
+    help="Start of the loop, in seconds after the first data, or a timestamp of the trajectory.  "
+    "[default: take-off]",
+)
+@click.option(
+    "--to",
+    "end_s",
+    type=options.TypedQuantity("s", 60.0),
+    help="End of the loop.  [default: landing]",
+)
+@click.option(
+    "--reference",
+    type=options.InputPath(str),
+    metavar="FILE|LOG:TRACK",
+    help="Reference trajectory (for example SLAM) for the ATE and RPE of each path, besides the "
+    "log's ground truth.",
+)
+@click.option(
+    "--drift",
+    "position_drift_m",
+    type=options.TypedQuantity("m", 1.0),
+    default=1.0,
+    help="Position drift of the odometry after 100 m (1 σ).",
+)
+@click.option(
+    "--heading-drift",
+    "heading_drift_deg",
+    type=options.TypedQuantity("°", 3.0),
+    default=3.0,
+    help="Heading drift of the odometry after 100 m (1 σ).",
+)
+@click.option(
+    "--key-frames",
+    "key_frames_m",
+    type=options.TypedQuantity("m", 0.2),
+    help="Distance between key frames.  [default: 2 % of the path's extent, 0.02 to 0.5 m]",
+)
+@click.option(
+    "--frame",
+    type=options.Choice(get_args(FrameName)),
+    help="Frame of a trajectory file.  [default: detected]",
+)
+@options.system_option
+@options.max_size_option
+@options.person_options
+@options.report_options("Output report.  [default: reports/SOURCE_loop.pdf]")
+@click.option(
+    "--tum",
+    type=options.NonEmptyPath(),
+    metavar="FILE",
+    help="Write the corrected path as a TUM file, in the frame of SOURCE.",
+)
+@click.option(
+    "--g2o",
+    type=options.NonEmptyPath(),
+    metavar="FILE",
+    help="Write the optimised pose graph as a g2o file.",
+)
+@options.show_option
 def loop(
     source: Path,
     output: Path | None,
@@ -87,7 +165,7 @@ def loop(
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
 
-    person = inputs.read_student(option_values)
+    student = options.read_student(option_values)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
             raise SettingsError(
@@ -98,20 +176,20 @@ def loop(
         return
     request = loop_request(source, option_values)
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
-    with outputs.progress(json_path) as step:
-        loop_result = run_loop(request, step)
-        loop_output = loop_results(request, loop_result, person)
+    with outputs.progress(json_path) as show_progress:
+        loop_result = run_loop(request, show_progress)
+        results = loop_results(request, loop_result, student)
         if output is None and json_path is None:
             output = outputs.default_report(
-                f"{file_name(source)}_loop", settings_name(request), loop_output
+                f"{file_name(source)}_loop", settings_name(request), results
             )
         contents = _output_files(loop_result, tum, g2o)
-        contents |= outputs.result_files(loop_output, json_path, output, loop_result, step)
-    outputs.write_and_print(contents, summary(loop_result, loop_output.findings), request)
+        contents |= outputs.result_files(results, json_path, output, loop_result, show_progress)
+    outputs.write_and_print(contents, summary(loop_result, results.findings), request)
 
 
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
-    """Make a request of the values of the command's options."""
+    """Make a request from the values of the options."""
     del option_values["robust"]
     return LoopRequest(
         source=str(source), closed_loop=not option_values.pop("opened"), **option_values
@@ -154,7 +232,7 @@ def _solve_graph(
         raise SettingsError(
             f"{display_name(source)}: a pose graph has no track {track!r}", f"Omit :{track}."
         )
-    for parameter in inputs.typed_parameters():
+    for parameter in options.typed_parameters():
         if parameter.name not in GRAPH_PARAMETERS:
             raise SettingsError(
                 (
@@ -164,9 +242,11 @@ def _solve_graph(
                 "Use only --g2o FILE, --json FILE and --robust.",
             )
     outputs.check_targets([json_path, g2o])
-    with outputs.progress(json_path) as step:
-        step(f"reading {display_name(source)}")
-        solved = analyse_graph(display_name(source), read_g2o(path), step, robust=robust)
+    with outputs.progress(json_path) as show_progress:
+        show_progress(f"reading {display_name(source)}")
+        solved = analyse_graph(
+            display_name(source), read_g2o(path), show_progress, run_robust=robust
+        )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
     contents |= outputs.result_files(graph_results(solved, command), json_path)

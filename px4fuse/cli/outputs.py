@@ -28,40 +28,40 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# bytes; limit for the name of a report (file systems allow 255), and the kept part of a longer one
-LONGEST_NAME, LONGEST_STEM = 200, 180
+# Limit for the name of a report (file systems allow 255), and the kept start of a longer name
+MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
 # Name and id on a report without a student
 NO_PERSON = ("", "")
-# characters; longer than any paragraph
+# In characters; longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
 # Key in click's context: files that this run has written, for the message if it ends early
 WRITTEN_KEY = "px4fuse.written"
 # Key in click's context: True if the output is to be opened
 OPEN_KEY = "px4fuse.opened"
-# Types of files that --open opens, in this order
+# --open opens the first file with one of these suffixes, in this order
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 # Command and SHA-256 of the log in the head of a web page
 GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
 
 
-class Interrupted(Exception):  # noqa: N818 - the user ended the run, no error
+class Interrupted(Exception):  # noqa: N818 - the user ends the run: no error
     """End of a run by Ctrl-C or a signal.
 
     Parameters
     ----------
-    stopped : KeyboardInterrupt
+    interrupt : KeyboardInterrupt
         Contains the number of the signal, except for Ctrl-C.
-    written : str
-        Sentence about the files that the run has written.
+    files_sentence : str
+        Sentence on the files that the run has written.
     """
 
-    def __init__(self, stopped: KeyboardInterrupt, written: str) -> None:
-        super().__init__(f"interrupted; {written}")
-        self.exit_code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+    def __init__(self, interrupt: KeyboardInterrupt, files_sentence: str) -> None:
+        super().__init__(f"interrupted; {files_sentence}")
+        self.exit_code = 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
-class ShowStep(Protocol):
-    """Function that shows the current activity, with counts if its parts can be counted."""
+class ShowProgress(Protocol):
+    """Function that shows the current activity, with counts if the work can be counted."""
 
     def __call__(self, activity: str, done_count: int = 0, total_count: int | None = None) -> None:
         """Show the activity."""
@@ -72,7 +72,7 @@ def show_nothing(activity: str, done_count: int = 0, total_count: int | None = N
 
 
 @contextmanager
-def progress(output: Path | None = None) -> Iterator[ShowStep]:
+def progress(output: Path | None = None) -> Iterator[ShowProgress]:
     """Show a progress bar on the terminal with the current activity and the remaining time.
 
     Nothing is shown in a pipe, or if the output is written to standard output.
@@ -80,21 +80,21 @@ def progress(output: Path | None = None) -> Iterator[ShowStep]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    # older versions of rich end a disabled bar with an empty line
+    # Older versions of rich print an empty line after a disabled bar
     if not console.is_terminal or output == STANDARD_OUTPUT:
         yield show_nothing
         return
-    from rich import progress as bars
+    from rich import progress as rich_progress
 
     columns = (
-        bars.SpinnerColumn(),
-        bars.TextColumn("{task.description}", markup=False),
-        bars.BarColumn(),
-        bars.TextColumn("{task.fields[count]}"),
-        bars.TimeElapsedColumn(),
-        bars.TimeRemainingColumn(),
+        rich_progress.SpinnerColumn(),
+        rich_progress.TextColumn("{task.description}", markup=False),
+        rich_progress.BarColumn(),
+        rich_progress.TextColumn("{task.fields[count]}"),
+        rich_progress.TimeElapsedColumn(),
+        rich_progress.TimeRemainingColumn(),
     )
-    with bars.Progress(*columns, console=console, transient=True) as bar:
+    with rich_progress.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 
         def show(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
@@ -118,8 +118,8 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
     from px4fuse.verification.pdf_input import attached_results
 
     name = f"{stem}{settings}"
-    if len(os.fsencode(name)) > LONGEST_NAME:
-        short_stem = os.fsencode(name)[:LONGEST_STEM].decode(errors="ignore")
+    if len(os.fsencode(name)) > MAX_NAME_BYTES:
+        short_stem = os.fsencode(name)[:KEPT_STEM_BYTES].decode(errors="ignore")
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
     kind = "a report of the same files and student by this version"
@@ -136,18 +136,18 @@ def check_default_page(path: Path, page: str) -> None:
     OutputError
         A file of that name exists and is not a page of the same command and log.
     """
-    made_by = GENERATOR.findall(page)
+    generator = GENERATOR.findall(page)
     kind = "a page of the same command and log by this version"
-    _check_default(path, kind, lambda content: GENERATOR.findall(content.decode()) == made_by)
+    _check_default(path, kind, lambda content: GENERATOR.findall(content.decode()) == generator)
 
 
 def _check_default(path: Path, kind: str, is_replaceable: Callable[[bytes], bool]) -> None:
     """Raise an error if the file of a default path exists and its content is of another kind."""
     try:
-        replaceable = not path.exists() or is_replaceable(path.read_bytes())
+        may_replace = not path.exists() or is_replaceable(path.read_bytes())
     except (OSError, UnicodeDecodeError, ResultsError):
-        replaceable = False
-    if not replaceable:
+        may_replace = False
+    if not may_replace:
         raise OutputError(
             f"{path} exists and is not {kind}; it was not overwritten",
             "Choose another name with -o.",
@@ -160,9 +160,9 @@ def _is_same_report(
     """Return True if the files are the same, and the old report has no other student."""
     from px4fuse.results.contract import file_hashes_in, to_json
 
-    old = read(content, "report")
-    same_files = file_hashes_in(to_json(old)) == file_hashes_in(to_json(results))
-    return same_files and _person(old) in (NO_PERSON, _person(results))
+    existing = read(content, "report")
+    same_files = file_hashes_in(to_json(existing)) == file_hashes_in(to_json(results))
+    return same_files and _person(existing) in (NO_PERSON, _person(results))
 
 
 def _person(results: Results) -> tuple[str, str]:
@@ -189,7 +189,7 @@ def web_page(output: Path | None, default: Path) -> Path:
 def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     """Return the paths of a report and its results, which are beside it unless --json names a file.
 
-    A report without -o is missing from the list: its name is determined later.
+    Without -o the list does not contain the report, because its name is determined later.
 
     Raises
     ------
@@ -210,8 +210,8 @@ def result_files(
     results: Struct | dict[str, Any],
     json_path: Path | None,
     output: Path | None = None,
-    subject: object = None,
-    step: ShowStep = show_nothing,
+    analysis: object = None,
+    show_progress: ShowProgress = show_nothing,
 ) -> dict[Path, bytes]:
     """Return the contents of the results (JSON) and of the report (PDF) by their paths.
 
@@ -220,20 +220,19 @@ def result_files(
     results : Struct or dict
     json_path, output : Path or None
         Values of --json and -o.
-    subject : object, optional
-        Analysis that the report shows.
-    step : callable
-        Shows the progress.
+    analysis : object, optional
+        Analysis that the report shows; without it no report is written.
+    show_progress : callable
     """
     from px4fuse.results.contract import to_json
 
     text, contents = to_json(results), dict[Path, bytes]()
-    if output is not None and subject is not None:
+    if output is not None and analysis is not None:
         from px4fuse.report.pdf import render
 
-        step("writing the report")
+        show_progress("writing the report")
         output, results_path = report_paths(output, json_path)
-        contents |= {output: render(subject, results, text), results_path: text.encode()}
+        contents |= {output: render(analysis, results, text), results_path: text.encode()}
     if json_path is not None:
         contents[json_path] = text.encode()
     return contents
@@ -282,14 +281,14 @@ def check_targets(targets: Iterable[Path | None]) -> None:
     """
     files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
     if len({file.resolve() for file in files}) < len(files):
-        raise OutputError("two outputs have the same file name. Give each another name.")
+        raise OutputError("two outputs have the same file name. Give them different names.")
     for target in files:
         try:
             if stat.S_ISDIR(target.stat().st_mode):
                 raise OutputError(f"{target} is a folder. Give a file name.")
         except FileNotFoundError:
             continue
-        except OSError as error:  # the name is too long, or a parent is a file
+        except OSError as error:  # The name is too long, or a parent is a file
             raise OutputError(
                 f"{target} cannot be written ({error.strerror}). Choose another place."
             ) from error
@@ -311,9 +310,9 @@ def write_and_print(
     page : Page, optional
         Results to print.
     request : Request, optional
-        Completes the commands on the page, so that they can be pasted.
+        Its files and options complete the commands on the page, so that they can be pasted.
     written : iterable of Path
-        Files that were written before.
+        Files that the command has written already.
     """
     from px4fuse.report.screen import print_line, show
 
@@ -326,7 +325,7 @@ def write_and_print(
         for path in files:
             print_line(console, "Wrote", to_one_line(str(path)), "bold")
     openable = [
-        path for ending in OPENABLE_SUFFIXES for path in files if path.suffix.lower() == ending
+        path for suffix in OPENABLE_SUFFIXES for path in files if path.suffix.lower() == suffix
     ]
     if click.get_current_context().meta.get(OPEN_KEY) and openable:
         click.launch(str(openable[0].resolve()))
@@ -345,9 +344,9 @@ def terminal() -> Console:
             raise BrokenPipeError
 
     console = PipeConsole(highlight=False)
-    columns = os.environ.get("COLUMNS", "")
-    if not console.is_terminal and not (columns.isdecimal() and int(columns)):
+    columns_text = os.environ.get("COLUMNS", "")
+    if not console.is_terminal and not (columns_text.isdecimal() and int(columns_text)):
         console.width = UNWRAPPED_WIDTH
-    elif console.width < 1:  # the environment variable COLUMNS is 0
+    elif console.width < 1:  # The environment variable COLUMNS is 0
         console.width = shutil.get_terminal_size().columns
     return console

@@ -6,12 +6,33 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import options
+from px4fuse.cli.options import output_option
 from px4fuse.cli.outputs import OPEN_KEY, check_default_page, progress, web_page, write_and_print
 
 
 @click.command()
-@options("practice")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    metavar="N",
+    help="Random seed; the same number gives the same flights.  [default: random]",
+)
+@click.option(
+    "--level",
+    type=click.IntRange(1, 3),
+    metavar="N",
+    default=1,
+    help="Difficulty. 1: one large mistake; 2: one smaller mistake; 3: small mistakes, sometimes "
+    "two.",
+)
+@click.option(
+    "--flights",
+    type=click.IntRange(1, 20),
+    metavar="N",
+    default=10,
+    help="Number of flights.",
+)
+@output_option("FILE.html", "Output file.  [default: reports/practice_SEED.html]")
 @click.option(
     "--open/--no-open", "opened", default=None, help="Open the page.  [default: on a terminal]"
 )
@@ -19,10 +40,10 @@ from px4fuse.cli.outputs import OPEN_KEY, check_default_page, progress, web_page
 def practice(
     ctx: click.Context,
     seed: int | None,
+    level: int,
+    flights: int,
     output: Path | None,
     opened: bool | None,
-    level: int = 1,
-    flights: int = 10,
 ) -> None:
     """Write a quiz page with simulated flights and hidden mistakes.
 
@@ -32,10 +53,10 @@ def practice(
     seed = secrets.randbelow(10**6) if seed is None else seed
     target = web_page(output, Path("reports", f"practice_{seed}.html"))
     ctx.meta[OPEN_KEY] = sys.stdout.isatty() if opened is None else opened
-    with progress(target) as step:
+    with progress(target) as show_progress:
         from px4fuse.practice import practice_text
 
-        page = practice_text(seed, level, flights, step)
+        page = practice_text(seed, level, flights, show_progress)
         if output is None:
             check_default_page(target, page)
     write_and_print({target: page.encode()})

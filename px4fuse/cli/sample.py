@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.inputs import options
+from px4fuse.cli.options import output_option
 from px4fuse.cli.outputs import write_and_print
 
 FOLDER = Path("sample_logs")
@@ -41,8 +41,8 @@ def sample_log() -> Path:
 
 
 @click.command()
-@options("sample")
-def sample(output: Path = FOLDER) -> None:
+@output_option("DIR", "Output folder.", default=FOLDER)
+def sample(output: Path) -> None:
     """Write the sample logs (aisle with UWB, loop with VIO) to a folder."""
     from importlib.resources import files
 
@@ -53,16 +53,16 @@ def sample(output: Path = FOLDER) -> None:
     try:
         logs = [file for file in files("px4fuse_samples").iterdir() if file.is_file()]
     except ModuleNotFoundError:
-        raise MissingDataError("the sample logs are not installed", f"Run {INSTALL}.") from None
+        raise MissingDataError("The sample logs are not installed", f"Run {INSTALL}.") from None
     contents = {output / file.name: file.read_bytes() for file in sorted(logs, key=str)}
     for path, content in contents.items():
         if path.is_file() and path.read_bytes() != content:
             raise OutputError(
-                f"{path} already exists and is another file. Nothing was written. Move it, "
-                "or choose another folder (-o)."
+                f"{path} already exists with different contents. Nothing was written. Move that "
+                "file, or choose another folder (-o)."
             )
-    first = next(path for path in contents if path.suffix == ".ulg")
-    command = command_line(ComparisonRequest(log=str(first)), "compare", typed=True)
+    first_log = next(path for path in contents if path.suffix == ".ulg")
+    command = command_line(ComparisonRequest(log=str(first_log)), "compare", for_shell=True)
     page = Page()
     page.add("command", text=command, label="Run")
     write_and_print(contents, page)

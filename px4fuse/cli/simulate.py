@@ -6,11 +6,18 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args
 
 import click
 
-from px4fuse.cli.inputs import InputPath, TypedQuantity, options, typed_parameters
+from px4fuse.cli.options import (
+    Choice,
+    InputPath,
+    NonEmptyPath,
+    TypedQuantity,
+    output_option,
+    typed_parameters,
+)
 from px4fuse.cli.outputs import check_targets, progress, write_and_print
 from px4fuse.errors import OutputError, SettingsError, to_one_line
 from px4fuse.input_files import check_output_folder
@@ -34,7 +41,7 @@ _DEFAULT = Scenario()
 MIXED = "mixed"
 OUTDOOR: Kind = "outdoor"
 SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
-# Options that require --assignment, and all options that are allowed with it
+# Parameters that require --assignment, and all parameters that are allowed with it
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes", "preview")
 ASSIGNMENT_OPTIONS = (
     "output",
@@ -57,7 +64,7 @@ def _scenario_options(command: Command) -> Command:
         default_text = f"{default:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
         help_text = f"{quantity.meaning}  [default: {default_text}]"
         kind = TypedQuantity(quantity.unit, default)
-        command = click.option(quantity.typed, field, type=kind, help=help_text)(command)
+        command = click.option(quantity.cli_name, field, type=kind, help=help_text)(command)
     return command
 
 
@@ -79,7 +86,75 @@ class WithMistakes(click.Command):
 
 
 @click.command(cls=WithMistakes)
-@options("simulate", assignment={"type": InputPath()}, secret_file={"type": InputPath()})
+@output_option(
+    "FLIGHT.ulg|DIR", "Output log, or with --assignment the folder for the class.", required=True
+)
+@click.option(
+    "--assignment",
+    type=InputPath(),
+    metavar="ROSTER.csv",
+    help="Class list (student id, name): write one flight per student, with individual noises and "
+    "mistakes, and the answer key beside the folder.",
+)
+@click.option(
+    "--secret-file",
+    type=InputPath(),
+    metavar="FILE",
+    help="File with the secret for --assignment; the same secret and id give the same flight.  "
+    "[default: generated, and stored in the answer key]",
+)
+@click.option(
+    "--mistakes",
+    type=int,
+    metavar="N",
+    help="Number of mistakes in each assigned flight.  [default: random, 0 to 2]",
+)
+@click.option(
+    "--preview",
+    is_flag=True,
+    help="Print the flights that --assignment would draw; write no files.",
+)
+@click.option(
+    "--kind",
+    type=Choice((*get_args(Kind), MIXED)),
+    default=_DEFAULT.kind,
+    help="aisle: passes along an aisle with UWB. loop: laps of a square with drifting VIO. "
+    "outdoor: laps with GNSS. mixed (--assignment only): one third loops, the rest aisles.",
+)
+@click.option(
+    "--seed",
+    type=int,
+    metavar="N",
+    default=_DEFAULT.seed,
+    help="Random seed; the same number gives the same flight.",
+)
+@click.option(
+    "--mistake",
+    metavar="NAME[=VALUE]",
+    multiple=True,
+    help="Mistake to simulate (listed below); repeatable.",
+)
+@click.option(
+    "--answer",
+    type=NonEmptyPath(),
+    metavar="FILE.json",
+    help="Write the solution: mistakes, biases, outliers, clock offset. Not for students.  "
+    "[default with --assignment: DIR_answers.json]",
+)
+@click.option("--no-truth", is_flag=True, help="Do not log ground truth.")
+@click.option("--no-ekf2", is_flag=True, help="Do not simulate EKF2 (faster).")
+@click.option(
+    "--passes",
+    type=int,
+    metavar="N",
+    help="Number of passes [6], or of laps of the square [1; outdoors 3].",
+)
+@click.option(
+    "--yaw",
+    type=Choice(get_args(Yaw)),
+    help="Heading of the vehicle: fixed, or along the flight direction.  [default: fixed; follow "
+    "on a square]",
+)
 @_scenario_options
 def simulate(
     output: Path,
@@ -92,11 +167,11 @@ def simulate(
     no_truth: bool,
     no_ekf2: bool,
     preview: bool,
-    kind: Literal[Kind, "mixed"] = _DEFAULT.kind,
-    seed: int = _DEFAULT.seed,
+    kind: Literal[Kind, "mixed"],
+    seed: int,
     passes: int | None,
     yaw: Yaw | None,
-    **chosen: Any,
+    **option_values: Any,
 ) -> None:
     """Simulate a flight with known ground truth and chosen mistakes.
 
@@ -111,9 +186,9 @@ def simulate(
     """
     _check_options(assignment)
     if assignment is not None:
-        drawn_from = _read_secret(secret_file), cast("Kinds", kind), mistakes
+        random_choices = _read_secret(secret_file), cast("Kinds", kind), mistakes
         _write_assignment(
-            assignment, output, answer, *drawn_from, truth=not no_truth, preview=preview
+            assignment, output, answer, *random_choices, truth=not no_truth, preview=preview
         )
         return
     if kind == MIXED:
@@ -121,21 +196,21 @@ def simulate(
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_targets([output, answer])
-    parsed = parse(mistake)
-    chosen |= {"seed": seed, "passes": passes, "yaw": yaw}
+    mistake_sizes = parse(mistake)
+    option_values |= {"seed": seed, "passes": passes, "yaw": yaw}
     scenario = make_scenario(
         cast(Kind, kind),
         truth=not no_truth,
         ekf2=not no_ekf2,
-        **{name: value for name, value in chosen.items() if value is not None},
+        **{name: value for name, value in option_values.items() if value is not None},
     )
     from px4fuse.results.contract import to_json
     from px4fuse.simulation import flights
 
-    with progress() as step:
-        step("simulating")
-        simulation = flights.simulate(scenario, parsed)
-        step("writing the log")
+    with progress() as show_progress:
+        show_progress("simulating")
+        simulation = flights.simulate(scenario, mistake_sizes)
+        show_progress("writing the log")
         contents = {output: flights.to_ulog(simulation)}
     if answer is not None:
         contents[answer] = to_json(flights.answer(simulation)).encode()
@@ -143,7 +218,7 @@ def simulate(
 
 
 def _check_options(assignment: Path | None) -> None:
-    """Reject options that cannot be combined."""
+    """Reject options that cannot be combined with or without --assignment."""
     if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR:
         raise SettingsError(
             f"--kind {OUTDOOR} is not available with --assignment.",
@@ -189,41 +264,45 @@ def _write_assignment(
     from px4fuse.assignment.roster import read_roster
     from px4fuse.report.page import Page
 
-    students, page, ends = read_roster(roster), Page(), dict[str, str]()
+    students, page, closing_texts = read_roster(roster), Page(), dict[str, str]()
     key_file = assignment.key_path(folder, answer_path)
     check_targets([key_file])
     check_output_folder(folder)
     drawn_flights: list[tuple[tuple[str, ...], float | None]]
     if preview:
         previews = assignment.preview(students, key_file, secret, kind, count)
-        drawn_flights = [(drawing.typed, drawing.difficulty) for drawing in previews]
+        drawn_flights = [(assigned.mistake_options, assigned.difficulty) for assigned in previews]
         rows = [
             (
                 student.student_id,
                 student.name,
-                drawing.scenario.kind,
-                " ".join(drawing.typed) or "none",
-                f"{drawing.difficulty:.2f}",
+                assigned.scenario.kind,
+                " ".join(assigned.mistake_options) or "none",
+                f"{assigned.difficulty:.2f}",
             )
-            for student, drawing in zip(students, previews, strict=True)
+            for student, assigned in zip(students, previews, strict=True)
         ]
         page.table(("student", "name", "flight", "mistakes", "difficulty"), rows, right=(4,))
-        ends["Preview"] = (
+        closing_texts["Preview"] = (
             "nothing was written. Not for students: the table lists the mistakes of each flight."
         )
     else:
-        with progress() as step:
-            show_progress = partial(step, "simulating")
+        with progress() as show_progress:
+            show_flight = partial(show_progress, "simulating")
             key, written = assignment.assign(
-                students, folder, key_file, secret, kind, count, truth, show_progress
+                students, folder, key_file, secret, kind, count, truth, show_flight
             )
         drawn_flights = [(answer.mistakes, answer.difficulty) for answer in key.answers]
-        at, key_at = (to_one_line(str(path)) for path in (folder, key_file))
+        folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
         existing_count = len(drawn_flights) - written
-        ends["Flights"] = f"{at} ({written} written, {existing_count} existed already)"
-        ends["Answers"] = f"{key_at} (not for students: it lists the mistakes of each flight)"
+        closing_texts["Flights"] = (
+            f"{folder_text} ({written} written, {existing_count} existed already)"
+        )
+        closing_texts["Answers"] = (
+            f"{key_text} (not for students: it lists the mistakes of each flight)"
+        )
         if key.secret:
-            ends["Secret"] = (
+            closing_texts["Secret"] = (
                 "generated, and stored in the answers. With that file the same flights can be "
                 "written again, and students can be added later."
             )
@@ -231,14 +310,14 @@ def _write_assignment(
         mistake.partition("=")[0] for typed, _ in drawn_flights for mistake in typed or ("none",)
     )
     difficulties = [difficulty for _, difficulty in drawn_flights if difficulty is not None]
-    page.advice(
+    page.write_labelled_texts(
         {
             "Class": f"{len(drawn_flights)} student{'s' * (len(drawn_flights) != 1)}, {kind}",
             "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
             "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
             f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g}: size that px4fuse detects in 19 "
             "of 20 flights, divided by the drawn size, for the most difficult mistake",
-            **ends,
+            **closing_texts,
         }
     )
     write_and_print({}, page)
@@ -250,11 +329,11 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
 
     scenario, page = simulation.scenario, Page()
     names = active_mistakes(simulation.mistakes)
-    loop, many = scenario.kind == "loop", scenario.passes > 1
-    path = f"{scenario.passes} lap{'s' * many} of a square of {scenario.length_m:g} m"
+    loop, plural = scenario.kind == "loop", scenario.passes > 1
+    path = f"{scenario.passes} lap{'s' * plural} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
-        path = f"{scenario.passes} pass{'es' * many} of {scenario.length_m:g} m"
-    page.advice(
+        path = f"{scenario.passes} pass{'es' * plural} of {scenario.length_m:g} m"
+    page.write_labelled_texts(
         {
             "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
             f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
@@ -267,10 +346,10 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     mistake_texts = [
         f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}" for name in names
     ]
-    page.labelled("Mistakes", *(mistake_texts or ["none"]))
-    page.labelled("Truth", "logged" if scenario.truth else "not logged")
+    page.write_labelled("Mistakes", *(mistake_texts or ["none"]))
+    page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
     none = "not simulated and not in the log"
-    page.labelled("EKF2", "px4fuse's model of EKF2" if scenario.ekf2 else none)
+    page.write_labelled("EKF2", "px4fuse's model of EKF2" if scenario.ekf2 else none)
     if answer is not None:
-        page.labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
+        page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
     return page

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.inputs import InputPath, analysis_options, comparison_request, json_option
+from px4fuse.cli.options import InputPath, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 
 
@@ -30,18 +30,18 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
     request = comparison_request(log, option_values)
     check_targets([json_path])
-    with progress(json_path) as step:
-        compared = prepare_comparison(request, step)
-        _, clock_result = estimate_noises_and_clock(compared, step)
-    advice = clock_advice(compared, clock_result)
+    with progress(json_path) as show_progress:
+        comparison = prepare_comparison(request, show_progress)
+        _, clock_result = estimate_noises_and_clock(comparison, show_progress)
+    advice = clock_advice(comparison, clock_result)
     if isinstance(clock_result, Unavailable) or not clock_result.is_determinable:
-        name = compared.flight.log.name
+        name = comparison.flight.log.name
         remedy = clock_result.remedy if isinstance(clock_result, Unavailable) else advice["Action"]
         raise MissingDataError(
             f"{name}: the time offset cannot be estimated from this flight: {clock_result.reason}",
             remedy,
         )
-    results = sync_results(request, compared, clock_result)
+    results = sync_results(request, comparison, clock_result)
     page = Page()
-    page.advice(advice)
+    page.write_labelled_texts(advice)
     write_and_print(result_files(results, json_path), page, request)

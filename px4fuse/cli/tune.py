@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli.inputs import InputPath, analysis_options, comparison_request, json_option
+from px4fuse.cli.options import InputPath, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.record import Unavailable
 
@@ -48,41 +48,41 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
     request = comparison_request(log, option_values)
     check_targets([json_path])
-    with progress(json_path) as step:
-        compared = prepare_comparison(request, step)
-        tuned = tuned_noises(compared, progress=step)
+    with progress(json_path) as show_progress:
+        comparison = prepare_comparison(request, show_progress)
+        tunings = tuned_noises(comparison, progress=show_progress)
     missing = [
-        noise_result for noise_result in tuned.values() if isinstance(noise_result, Unavailable)
+        noise_result for noise_result in tunings.values() if isinstance(noise_result, Unavailable)
     ]
-    if len(missing) == len(tuned):
-        name, reason = compared.flight.log.name, missing[0].reason
+    if len(missing) == len(tunings):
+        name, reason = comparison.flight.log.name, missing[0].reason
         raise MissingDataError(
             f"{name}: SIGMA_A and SIGMA_Z cannot be estimated: {reason}", missing[0].remedy
         )
-    results = tuning_results(request, compared, tuned)
-    write_and_print(result_files(results, json_path), _page(compared, tuned), request)
+    results = tuning_results(request, comparison, tunings)
+    write_and_print(result_files(results, json_path), _page(comparison, tunings), request)
 
 
-def noise_text(noise: Noise) -> str:
+def format_noise_estimate(noise: Noise) -> str:
     """Format a noise estimate and its 95 % interval, without the unit."""
     if noise.value is None:
-        ends = (("at most", noise.high), ("at least", noise.low))
-        bounds = (f"{word} {end:.2g}" for word, end in ends if end is not None)
-        return next(bounds, "not identifiable")
+        bounds = (("at most", noise.high), ("at least", noise.low))
+        texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)
+        return next(texts, "not identifiable")
     low = "0" if noise.low is None else f"{noise.low:.2g}"
     high = "?" if noise.high is None else f"{noise.high:.2g}"
     return f"{noise.value:.3g} ({low}-{high})"
 
 
-def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> Page:
+def _page(comparison: Comparison, tunings: dict[str, AxisTuning | Unavailable]) -> Page:
     from px4fuse.report.page import Page
     from px4fuse.report.phrases import format_settings, tuning_advice
     from px4fuse.report.style import MUTED_COLOUR
 
-    page, rows, notes = Page(), [], list[str]()
-    for name, tuning in tuned.items():
+    page, rows, sentences = Page(), [], list[str]()
+    for name, tuning in tunings.items():
         if isinstance(tuning, Unavailable):
-            notes.append(f"{name}: {tuning.reason}. {tuning.remedy}")
+            sentences.append(f"{name}: {tuning.reason}. {tuning.remedy}")
             continue
         validation, consistencies = tuning.held_out, (tuning.before, tuning.after)
         lags = [
@@ -91,20 +91,28 @@ def _page(compared: Comparison, tuned: dict[str, AxisTuning | Unavailable]) -> P
             if not isinstance(consistency, Unavailable)
         ]
         lag_text = " ".join(lags) if len(lags) == len(consistencies) else ""
-        gain = (
+        held_out_gain = (
             ""
             if isinstance(validation, Unavailable)
             else f"{validation.log_likelihood_gain_per_measurement:+.3f}"
         )
-        noises = [noise_text(noise) for noise in (tuning.sigma_a_two_state, tuning.sigma_z)]
+        noises = [
+            format_noise_estimate(noise) for noise in (tuning.sigma_a_two_state, tuning.sigma_z)
+        ]
         rows.append(
-            [name, *noises, f"{tuning.log_likelihood_gain_per_measurement:.3f}", gain, lag_text]
+            [
+                name,
+                *noises,
+                f"{tuning.log_likelihood_gain_per_measurement:.3f}",
+                held_out_gain,
+                lag_text,
+            ]
         )
-    page.labelled("Chosen", format_settings(compared.settings))
+    page.write_labelled("Chosen", format_settings(comparison.settings))
     if rows:
         page.table(TUNING_HEAD, rows, right=(1, 2, 3, 4, 5))
-        notes.append(TUNING_NOTE)
-    for text in notes:
+        sentences.append(TUNING_NOTE)
+    for text in sentences:
         page.write(text, colour=MUTED_COLOUR)
-    page.advice(tuning_advice(compared, tuned))
+    page.write_labelled_texts(tuning_advice(comparison, tunings))
     return page

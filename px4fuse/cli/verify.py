@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from px4fuse.cli.inputs import InputPath, json_option, max_size_option, open_option, option
+from px4fuse.cli.options import InputPath, json_option, max_size_option, open_option, output_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
 from px4fuse.errors import LogError
 from px4fuse.reading import display_name, files_by_sha256, read_bytes_limited
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from px4fuse.verification.model import Verdict
 
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
-# s; the analysis of a flight of 10 minutes takes about 60 s
+# The analysis of a flight of 10 minutes takes about 60 s
 TIMEOUT_S = 1800.0
 
 
@@ -29,7 +29,7 @@ TIMEOUT_S = 1800.0
 @click.argument("report", type=InputPath(), metavar="REPORT.pdf")
 @click.argument("logs", type=InputPath(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@option("-o, --output FILE.pdf", "Write the report again, from the log.")
+@output_option("FILE.pdf", "Write the report again, from the log.")
 @json_option
 @open_option
 def verify(
@@ -49,35 +49,37 @@ def verify(
     from px4fuse.workers import JobFailure, run_one_bounded
 
     content = read_bytes_limited(report, LogError, MAX_BYTES, size_remedy="Reports are below 2 MB")
-    read = read_report(content, display_name(report))
-    with progress(json_path) as step:
-        step("hashing the logs")
+    recorded = read_report(content, display_name(report))
+    with progress(json_path) as show_progress:
+        show_progress("hashing the logs")
         files = files_by_sha256(logs)
         check_targets([json_path, output])
         if logs and not files:
             raise LogError("LOG contains no files. Give the flight log or its folder.")
-        step("repeating the analysis")
-        verdict = run_one_bounded(partial(verify_report, pdf=content, logs=files), read, TIMEOUT_S)
+        show_progress("repeating the analysis")
+        verdict = run_one_bounded(
+            partial(verify_report, pdf=content, logs=files), recorded, TIMEOUT_S
+        )
     if isinstance(verdict, JobFailure):
         raise LogError(f"{display_name(report)}: cannot be verified: {verdict.reason}")
-    redrawn = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
-    contents = redrawn | result_files(_verdict_data(content, verdict), json_path)
+    report_files = {} if output is None or not verdict.redrawn else {output: verdict.redrawn}
+    contents = report_files | result_files(_verdict_data(content, verdict), json_path)
     write_and_print(contents, _page(display_name(report), verdict, output))
     sys.exit(0 if verdict.outcome == "verified" else 1)
 
 
 def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
-    from px4fuse.verification.verification import LIMIT
+    from px4fuse.verification.verification import LIMIT_NOTE
 
     values = asdict(verdict)
-    for name in ("redrawn", "remedy", "missing"):  # fields for px4fuse grade only
+    for name in ("redrawn", "remedy", "missing"):  # only px4fuse grade uses these fields
         del values[name]
     return {
         "schema": SCHEMA,
         "report_sha256": hashlib.sha256(pdf).hexdigest(),
         "outcome": verdict.outcome,
         **values,
-        "limit": LIMIT,
+        "limit": LIMIT_NOTE,
     }
 
 
@@ -85,23 +87,24 @@ def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
     from px4fuse.results.reading import one_line
-    from px4fuse.verification.verification import LIMIT
+    from px4fuse.verification.verification import LIMIT_NOTE
 
     page = Page()
     colours = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
     colour = colours.get(verdict.outcome, SEVERITY_COLOURS["error"])
     page.write(f"{one_line(name, 200)}: {verdict.outcome}", bold=True, colour=colour)
-    sentences = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT]
+    sentences = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT_NOTE]
     sentences += [
-        f"{d.path}: report {d.recorded}, re-computed {d.recomputed}" for d in verdict.differences
+        f"{difference.path}: report {difference.recorded}, re-computed {difference.recomputed}"
+        for difference in verdict.differences
     ]
-    for text in sentences:
-        page.write(text, indent=12.0)
+    for sentence in sentences:
+        page.write(sentence, indent=12.0)
     if output is not None and not verdict.redrawn:
-        page.write("The report was not re-created: the analysis was not repeated.")
+        page.write("No report was written (-o), because the analysis was not repeated.")
     elif output is None and verdict.pages:
         page.write(
-            "Action: write the report again from the log with -o FILE.pdf, and read that one."
+            "Action: write the report again from the log with -o FILE.pdf, and read that report."
         )
-    page.write(LIMIT, colour=MUTED_COLOUR)
+    page.write(LIMIT_NOTE, colour=MUTED_COLOUR)
     return page

@@ -7,25 +7,52 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli import inputs, outputs
+from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.units import NAMES, in_unit
+from px4fuse.units import NAMES, convert_to_unit
 
 if TYPE_CHECKING:
     from px4fuse.request import Sweep
 
 
 @click.command()
-@click.argument("log", type=inputs.InputPath())
-@inputs.options("whatif", since={"type": inputs.TypedQuantity("s", 60.0)})
-@inputs.flight_options
-@inputs.json_option
+@click.argument("log", type=options.InputPath())
+@click.option(
+    "--set",
+    "changes",
+    metavar="NAME=VALUE",
+    multiple=True,
+    help="Parameter to change, in PX4's unit; repeatable.  [default: the maximum-likelihood noise "
+    "and delay]",
+)
+@click.option(
+    "--sweep",
+    metavar="NAME=LOW:HIGH[:COUNT]",
+    help="Replay with COUNT values of one parameter, from LOW to HIGH.  [default COUNT: 9]",
+)
+@click.option(
+    "--without",
+    metavar="AID",
+    multiple=True,
+    help="Aid that EKF2 no longer fuses, for example gnss_pos, gnss_vel, baro_hgt, mag or ev_pos; "
+    "repeatable.",
+)
+@click.option(
+    "--from",
+    "start_s",
+    type=options.TypedQuantity("s", 60.0),
+    metavar="SECONDS",
+    help="Time from which EKF2 does not fuse the aids of --without.  [default: from the start]",
+)
+@options.recording_options
+@options.max_size_option
+@options.json_option
 def whatif(
     log: Path,
     changes: tuple[str, ...],
     sweep: str | None,
     without: tuple[str, ...],
-    since: float | None,
+    start_s: float | None,
     json_path: Path | None,
     **option_values: Any,
 ) -> None:
@@ -43,17 +70,17 @@ def whatif(
     from px4fuse.results.build import whatif_results
 
     outputs.check_targets([json_path])
-    if since is not None and not without:
+    if start_s is not None and not without:
         raise SettingsError("--from requires --without AID.")
     request = WhatIfRequest(
         log=str(log),
         changes=_parse_changes(changes),
         sweep=None if sweep is None else _parse_sweep(sweep),
-        without=dict.fromkeys(without, since or 0.0),
+        without=dict.fromkeys(without, start_s or 0.0),
         **option_values,
     )
-    with outputs.progress(json_path) as step:
-        counterfactual = run_what_if(request, step)
+    with outputs.progress(json_path) as show_progress:
+        counterfactual = run_what_if(request, show_progress)
     results = whatif_results(request, counterfactual)
     outputs.write_and_print(outputs.result_files(results, json_path), summary(counterfactual))
 
@@ -75,8 +102,8 @@ def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:
 def _parse_sweep(text: str) -> Sweep:
     from px4fuse.request import Sweep
 
-    name, _, ends = text.partition("=")
-    limits = ends.split(":")
+    name, _, range_text = text.partition("=")
+    limits = range_text.split(":")
     if len(limits) not in (2, 3) or (len(limits) == 3 and not limits[2].isdecimal()):
         raise SettingsError(
             f"--sweep {text} is not valid. Use NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for "
@@ -93,7 +120,7 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
         return float(value)
     except ValueError as error:
         unit = PARAMETERS[name].unit.replace("^2", "²") if name in PARAMETERS else ""
-        parsed = in_unit(value, unit)
-        of_unit = f" in {NAMES[unit]}" if unit else ""
-        problem = "" if parsed is None else f"{of_unit}. Give {parsed:g}"
+        converted = convert_to_unit(value, unit)
+        unit_text = f" in {NAMES[unit]}" if unit else ""
+        problem = "" if converted is None else f"{unit_text}. Give {converted:g}"
         raise SettingsError(f"{option_text}: {value!r} is not a number{problem}.") from error

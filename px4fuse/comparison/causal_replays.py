@@ -1,11 +1,11 @@
 """Causes of inconsistency, found by re-running a filter with one change at a time.
 
 A discrepancy is a mean NIS outside its band, or errors larger than the reported σ (mean NEES). Each
-candidate change is re-run alone; if none suffices, the best one is combined with each other one. A
-cause is the smallest change that brings the statistic into its band, or else explains at least half
-of its logarithm. A smaller noise is not a cause if the reported σ would then be smaller than the
-errors against ground truth. A fault of a sensor that explains as much as a setting comes first: the
-setting would only hide it.
+candidate change is re-run alone; if none suffices, the best change is combined with each other one.
+The cause is the smallest change that brings the statistic into its band, or else explains at least
+half of the logarithm of the statistic. A smaller noise is not a cause if the reported σ would then
+be smaller than the errors against ground truth. A sensor fault that explains as much as a setting
+is preferred: the setting would only hide the fault.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import difference, error_statistics, kf_error_statistics
 from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import (
-    AgainstTruth,
     AxisComparison,
     Comparison,
+    ErrorsAgainstTruth,
     FilterName,
     FilterSummary,
-    UnjudgedFilter,
+    UntestedFilter,
 )
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source, ml_delay_change, noise_change
 from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
-from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
+from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, nis_band
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, nis_band
 from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.hypotheses import BiasScaleJumpFit
@@ -48,10 +48,10 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
-    along,
+    cut_to_segment,
     ned_acceleration,
     project_acceleration,
-    within,
+    weighted_sum,
 )
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -60,30 +60,33 @@ from px4fuse.record import Positive, Record
 
 Statistic = Literal["nis", "nees", "difference"]
 Change = Mapping[str, float]
-# Mean NEES from which errors exceed the reported σ (by 2 in σ); below 3 without a fault
+# Mean NEES from which errors count as larger than the reported σ (2 σ); flights without a fault
+# have less than 3
 MIN_NEES_FINDING = 4.0
-# Largest mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
+# Limit of the mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
 MAX_NEES_AFTER_CHANGE = 2.0
 # Mean NIS above which the innovations already show that the σ is too small
-MAX_UNSUSPICIOUS_NIS = 1.5
-# Share of ln(statistic) that a cause explains: at least this, at most 2 minus this
+MAX_UNREMARKABLE_NIS = 1.5
+# Share of ln(statistic) that a cause explains: at least 0.5, at most 1.5 (overshoot)
 MIN_EXPLAINED_SHARE = 0.5
-# Distance from the whole logarithm within which a sensor fault suffices: noises are approximate
-SUFFICIENT_TOLERANCE = 0.25
+# Maximum distance of the explained share from 1 at which a sensor fault alone is the cause; the
+# noises of the re-run are approximate
+SENSOR_CAUSE_TOLERANCE = 0.25
 # Share of ln(statistic) that a change must explain to be combined with the best one
 MIN_HELPFUL_SHARE = 0.1
-CLOCK, TURN, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
-FORWARD, RIGHT = "bias_forward_m_s2", "bias_right_m_s2"
+CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
+FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 # Changes that correct a sensor; they precede changes of settings
-SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK, TURN, FORWARD))
-# m; smallest SIGMA_Z of a re-run: accuracy of motion capture in flight
+SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
+# m; minimum SIGMA_Z of a re-run: accuracy of motion capture in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# Parts of a change that do not count as separate changes
-ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT))
+# Parameters that another change requires; they do not count as separate changes
+ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# SIGMA_A also covers tilt error and bias, so EKF2_ACC_NOISE is raised only above this factor
+# Minimum ratio of SIGMA_A to EKF2_ACC_NOISE for a larger EKF2_ACC_NOISE: SIGMA_A also covers tilt
+# error and bias
 VIBRATION_FACTOR = 3.0
 # Parameters of EKF2 that are re-run with PX4's default if another value was flown
 PARAMETERS_OF_EKF2 = (
@@ -96,19 +99,18 @@ PARAMETERS_OF_EKF2 = (
 )
 # Columns of north and east
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
-POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in LEVEL]
-# Misalignments within this many σ are not significant
+POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
+# σ; smaller misalignments are not significant
 HEADING_SIGMAS = 3.0
 
 
 class Intervention(Record, frozen=True, kw_only=True):
-    """One change, and the statistic before and after it.
+    """Re-run of a filter with a change: a statistic before and after.
 
     Attributes
     ----------
     statistic : {"nis", "nees", "difference"}
-        Statistic: mean NIS, mean NEES of position, or RMS difference KF - EKF2 (m). The last one is
-        computed for causes only.
+        Mean NIS, mean NEES of position, or RMS difference KF - EKF2 (m, for causes only).
     filter : {"kf", "ekf2"}
     axis : str
     change : mapping from name to value
@@ -118,13 +120,13 @@ class Intervention(Record, frozen=True, kw_only=True):
     before, after : float
         Statistic without the change (EKF2: from the log) and with it (from a re-run).
     explained_fraction : float
-        Share of ln(statistic) that the change removes; above 1 it overshoots. For the RMS
+        Share of ln(statistic) that the change removes; above 1 the change overshoots. For the RMS
         difference, the share of the mean square.
     is_sufficient : bool
         True if the mean NIS is in its 95 % band, or the mean NEES below
         :data:`MIN_NEES_FINDING`.
     contradicts_truth : bool
-        True if the reported σ would then be smaller than the errors.
+        True if the reported σ with the change is smaller than the errors against ground truth.
     """
 
     statistic: Statistic
@@ -139,59 +141,59 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     @property
     def is_cause(self) -> bool:
-        """True if it explains at least half of ln(statistic) and does not overshoot by more."""
+        """True if the explained share of ln(statistic) is 0.5 to 1.5."""
         return (
             MIN_EXPLAINED_SHARE <= self.explained_fraction <= 2.0 - MIN_EXPLAINED_SHARE
             and not self.contradicts_truth
         )
 
     @property
-    def of_sensors(self) -> bool:
-        """True if it corrects a sensor, which precedes changes of settings."""
+    def corrects_sensor(self) -> bool:
+        """True if the change corrects a sensor, which precedes changes of settings."""
         return not SENSOR_CHANGES.isdisjoint(self.change)
 
     @property
-    def needs_no_other(self) -> bool:
-        """True if no other cause is needed: in the band, or nearly all by a sensor."""
+    def is_complete_cause(self) -> bool:
+        """True if the statistic is in its band, or a sensor fault explains nearly all of it."""
         return self.is_sufficient or (
-            self.of_sensors and abs(self.explained_fraction - 1.0) <= SUFFICIENT_TOLERANCE
+            self.corrects_sensor and abs(self.explained_fraction - 1.0) <= SENSOR_CAUSE_TOLERANCE
         )
 
 
-def interventions_on(
-    causes: Iterable[Intervention], owner: FilterName, axis: str, statistic: Statistic = "nis"
+def interventions_for(
+    causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Intervention]:
-    """Return the re-runs for one discrepancy."""
+    """Return the re-runs that test causes of one discrepancy."""
     return [
         intervention
         for intervention in causes
         if (intervention.statistic, intervention.filter, intervention.axis)
-        == (statistic, owner, axis)
+        == (statistic, filter_name, axis)
     ]
 
 
-def cause_of(
-    causes: Iterable[Intervention], owner: FilterName, axis: str, statistic: Statistic = "nis"
+def find_cause(
+    causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Intervention | None:
     """Return the cause of one discrepancy, or None if no re-run explains it."""
     return min(
         (
             intervention
-            for intervention in interventions_on(causes, owner, axis, statistic)
+            for intervention in interventions_for(causes, filter_name, axis, statistic)
             if intervention.is_cause
         ),
         key=lambda intervention: (
-            not intervention.needs_no_other,
+            not intervention.is_complete_cause,
             len(intervention.change.keys() - ACCOMPANYING_CHANGES),
-            not intervention.of_sensors,
+            not intervention.corrects_sensor,
             abs(intervention.explained_fraction - 1.0),
         ),
         default=None,
     )
 
 
-class ErrorBeyondSigma(NamedTuple):
-    """Position RMSE and NEES against ground truth, larger than the reported σ."""
+class ErrorAboveSigma(NamedTuple):
+    """Position error against ground truth larger than the reported σ: mean NEES, RMSE, σ, NIS."""
 
     nees: float
     rmse_m: float
@@ -199,21 +201,21 @@ class ErrorBeyondSigma(NamedTuple):
     nis_mean: float
 
 
-def error_beyond_reported_sigma(
-    statement: FilterSummary | UnjudgedFilter,
-) -> ErrorBeyondSigma | None:
-    """Return the errors if they exceed the reported σ without effect on the innovations."""
-    truth = statement.truth
-    if isinstance(statement, Unavailable) or isinstance(truth, Unavailable):
+def error_above_reported_sigma(
+    summary: FilterSummary | UntestedFilter,
+) -> ErrorAboveSigma | None:
+    """Return the position error if it exceeds the reported σ, but innovations do not show this."""
+    truth = summary.truth
+    if isinstance(summary, Unavailable) or isinstance(truth, Unavailable):
         return None
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    if nees < MIN_NEES_FINDING or statement.nis_mean >= MAX_UNSUSPICIOUS_NIS:
+    if nees < MIN_NEES_FINDING or summary.nis_mean >= MAX_UNREMARKABLE_NIS:
         return None
-    reported_sigma_m = statement.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
-    return ErrorBeyondSigma(nees, rmse_m, reported_sigma_m, statement.nis_mean)
+    reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
+    return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, summary.nis_mean)
 
 
-def interventions(
+def run_interventions(
     comparison: Comparison,
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
@@ -235,20 +237,22 @@ def interventions(
         EKF2 of the same flight.
     """
     estimates = comparison, tuning, clock, heading
-    filters: list[_FilterChanges] = [_KfChanges(*estimates, bias_scale_jump_fit)]
+    filters: list[_FilterRerun] = [_KfRerun(*estimates, bias_scale_jump_fit)]
     if (
         isinstance(model, Model)
         and model.agreement.good
         and is_fused_source(comparison, model.inputs)
     ):
-        filters.append(_Ekf2Changes(*estimates, model.inputs, model))
+        filters.append(_Ekf2Rerun(*estimates, model.inputs, model))
     rows: list[Intervention] = []
-    for changed in filters:
-        for result, statistic in changed.discrepancies():
-            tried_changes = _try_candidates(changed, result, statistic)
+    for filter_changes in filters:
+        for result, statistic in filter_changes.discrepancies():
+            tried_changes = _try_candidates(filter_changes, result, statistic)
             rows += tried_changes
-            if cause := cause_of(tried_changes, changed.owner, result.axis.name, statistic):
-                rows += _difference_reduction(cause, result, changed)
+            if cause := find_cause(
+                tried_changes, filter_changes.filter_name, result.axis.name, statistic
+            ):
+                rows += _difference_reduction(cause, result, filter_changes)
     return tuple(rows)
 
 
@@ -259,13 +263,10 @@ def planned_variants(
     heading: HeadingError | Unavailable,
     inputs: Inputs,
 ) -> list[Variant]:
-    """Return the EKF2 variants that :func:`interventions` will need, as far as known.
-
-    Variants that are missing here are replayed on demand.
-    """
+    """Return EKF2 variants that :func:`run_interventions` needs; others are replayed on demand."""
     if not is_fused_source(comparison, inputs):
         return []
-    ekf2_changes, flown = _Ekf2Changes(comparison, tuning, clock, heading, inputs), inputs.settings
+    ekf2_changes, flown = _Ekf2Rerun(comparison, tuning, clock, heading, inputs), inputs.settings
     changes = [
         change
         for discrepancy in ekf2_changes.discrepancies()
@@ -275,11 +276,12 @@ def planned_variants(
 
 
 def _difference_reduction(
-    cause: Intervention, result: AxisComparison, changed: _FilterChanges
+    cause: Intervention, result: AxisComparison, filter_changes: _FilterRerun
 ) -> list[Intervention]:
     """Compute the RMS difference KF - EKF2 (m) with and without a cause."""
     before, after = (
-        changed.statistic_after(result, "difference", change) for change in ({}, cause.change)
+        filter_changes.statistic_after(result, "difference", change)
+        for change in ({}, cause.change)
     )
     if before is None or after is None:
         return []
@@ -296,48 +298,51 @@ def _difference_reduction(
     ]
 
 
-def is_inconsistent(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[FilterSummary]:
+def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[FilterSummary]:
     """Return True if the mean NIS is outside its band and σ is wrong by at least 25 %."""
-    if isinstance(statement, Unavailable):
+    if isinstance(summary, Unavailable):
         return False
     return (
-        statement.verdict != "consistent" and statement.sigma_error_factor >= SIGMA_FACTOR_FINDING
+        summary.verdict != "consistent" and summary.sigma_error_factor >= MIN_FINDING_SIGMA_FACTOR
     )
 
 
-def _find_discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Statistic]:
+def _find_discrepancies(summary: FilterSummary | UntestedFilter) -> list[Statistic]:
     """Return the statistics of a filter that are outside their limits."""
-    found: list[Statistic] = ["nees"] if error_beyond_reported_sigma(statement) else []
-    return [*found, "nis"] if is_inconsistent(statement) else found
+    statistics: list[Statistic] = ["nees"] if error_above_reported_sigma(summary) else []
+    return [*statistics, "nis"] if is_inconsistent(summary) else statistics
 
 
 def _try_candidates(
-    changed: _FilterChanges, result: AxisComparison, statistic: Statistic
+    filter_changes: _FilterRerun, result: AxisComparison, statistic: Statistic
 ) -> list[Intervention]:
-    """Re-run all candidates alone; if none suffices, combine the best with each other one."""
-    statement, candidates = result.filters[changed.owner], changed.candidates(result, statistic)
-    assert isinstance(statement, FilterSummary)  # else it has no discrepancy
-    truth = statement.truth
+    """Re-run all candidate changes alone; if none suffices, the best with each other one."""
+    summary, candidates = (
+        result.filters[filter_changes.filter_name],
+        filter_changes.candidates(result, statistic),
+    )
+    assert isinstance(summary, FilterSummary)  # else it has no discrepancy
+    truth = summary.truth
     nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
-    before = statement.nis_mean if nees is None or statistic == "nis" else nees
+    before = summary.nis_mean if nees is None or statistic == "nis" else nees
     is_checked_by_truth = (
         statistic == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
     )
 
     def rerun(change: Change) -> list[Intervention]:
-        after_change = changed.statistic_after(result, statistic, change)
+        after_change = filter_changes.statistic_after(result, statistic, change)
         if after_change is None or after_change[0] <= 0.0:
             return []
         after, count = after_change
         low, high = nis_band(count) if statistic == "nis" else (0.0, MIN_NEES_FINDING)
         nees_after = (
-            changed.statistic_after(result, "nees", change) if is_checked_by_truth else None
+            filter_changes.statistic_after(result, "nees", change) if is_checked_by_truth else None
         )
         max_nees = MAX_NEES_AFTER_CHANGE if nees is not None and nees > 1.0 else MIN_NEES_FINDING
         return [
             Intervention(
                 statistic=statistic,
-                filter=changed.owner,
+                filter=filter_changes.filter_name,
                 axis=result.axis.name,
                 change=change,
                 before=before,
@@ -348,7 +353,7 @@ def _try_candidates(
             )
         ]
 
-    single_changes = [each for change in candidates for each in rerun(change)]
+    single_changes = [intervention for change in candidates for intervention in rerun(change)]
     helpful_changes = sorted(
         (
             intervention
@@ -357,7 +362,7 @@ def _try_candidates(
         ),
         key=lambda intervention: abs(intervention.explained_fraction - 1.0),
     )
-    if not helpful_changes or any(each.is_sufficient for each in helpful_changes):
+    if not helpful_changes or any(intervention.is_sufficient for intervention in helpful_changes):
         return single_changes
     best_change, *other_changes = helpful_changes
     return single_changes + [
@@ -367,15 +372,15 @@ def _try_candidates(
     ]
 
 
-def _rms_difference(run: Replay, state: pd.DataFrame) -> tuple[float, int] | None:
-    """Return the RMS of KF - EKF2 in position (m) and the number of samples."""
-    kf_minus_ekf2 = difference(run, state)
+def _rms_difference(kf_run: Replay, state: pd.DataFrame) -> tuple[float, int] | None:
+    """Return the RMS position difference KF - EKF2 (m) and the number of samples."""
+    kf_minus_ekf2 = difference(kf_run, state)
     if isinstance(kf_minus_ekf2, Unavailable):
         return None
     return kf_minus_ekf2.position_rms_m, kf_minus_ekf2.count
 
 
-def _mean_nees(errors: AgainstTruth | Unavailable) -> tuple[float, int] | None:
+def _mean_nees(errors: ErrorsAgainstTruth | Unavailable) -> tuple[float, int] | None:
     """Return the mean NEES of position and the number of samples."""
     if isinstance(errors, Unavailable) or errors.nees_position_mean is None:
         return None
@@ -383,7 +388,7 @@ def _mean_nees(errors: AgainstTruth | Unavailable) -> tuple[float, int] | None:
 
 
 def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
-    """Return the tuning of an axis: for horizontal axes the common one if available."""
+    """Return the tuning of an axis; for a horizontal axis that of both axes if available."""
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
@@ -393,34 +398,34 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 
 
 @dataclass(frozen=True)
-class _FilterChanges:
-    """Candidate changes of one filter, and its statistics after a change."""
+class _FilterRerun:
+    """Candidate changes of one filter, and statistics of re-runs with a change."""
 
     comparison: Comparison
     tuning: Tuning
     clock: ClockOffset | Unavailable
     heading: HeadingError | Unavailable
 
-    owner: ClassVar[FilterName]
+    filter_name: ClassVar[FilterName]
 
     def discrepancies(self) -> list[tuple[AxisComparison, Statistic]]:
-        """Return the discrepancies with their axes; for EKF2 along horizontal axes only."""
+        """Return axis and statistic of each discrepancy; for EKF2 of horizontal axes only."""
         return [
             (result, statistic)
             for result in self.comparison.axes.values()
-            if self.owner == "kf" or result.axis.name != "down"
-            for statistic in _find_discrepancies(result.filters[self.owner])
+            if self.filter_name == "kf" or result.axis.name != "down"
+            for statistic in _find_discrepancies(result.filters[self.filter_name])
         ]
 
     @abstractmethod
     def noise_candidates(
-        self, statement: FilterSummary, tuned: AxisTuning, over: bool
+        self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
         """Return maximum-likelihood noises whose interval excludes the value in use."""
 
     @abstractmethod
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """Return further candidates; ``tuned`` is None if the reported σ is too large."""
+        """Return further candidates; pass ``tuned`` None if the reported σ is too large."""
 
     @abstractmethod
     def statistic_after(
@@ -430,58 +435,63 @@ class _FilterChanges:
 
     def candidates(self, result: AxisComparison, statistic: Statistic) -> list[Change]:
         """Return the candidate changes for a discrepancy along an axis."""
-        statement, origin = result.filters[self.owner], self.comparison.source.origin
-        assert isinstance(statement, FilterSummary)  # else it has no discrepancy
-        is_underconfident = statistic == "nis" and statement.nis_mean < 1.0
+        summary, origin = result.filters[self.filter_name], self.comparison.source.origin
+        assert isinstance(summary, FilterSummary)  # else it has no discrepancy
+        is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
         tuned = tuning_of_axis(self.tuning, result.axis.name)
         changes = list[Change]()
-        # innovations against GNSS or a drifting source do not show its slow errors
-        hides_noise = origin.may_drift or origin.is_gnss
-        if tuned is not None and not (is_underconfident and hides_noise):
-            changes += self.noise_candidates(statement, tuned, is_underconfident)
+        # innovations do not show the slow errors of GNSS or of a drifting source, so they do not
+        # justify a smaller noise
+        hides_slow_errors = origin.may_drift or origin.is_gnss
+        if tuned is not None and not (is_underconfident and hides_slow_errors):
+            changes += self.noise_candidates(summary, tuned, is_underconfident)
         if tuned is not None and not is_underconfident and len(tuned.outlier_time_s):
             changes.append({OUTLIERS: float(len(tuned.outlier_time_s))})
         changes += self.time_offset_candidates()
         if result.axis.name == "down":
             return changes
-        if isinstance(turn := self.heading, HeadingError):
-            is_significant = abs(turn.misalignment_deg) > HEADING_SIGMAS * turn.sigma_deg
-            changes += [{TURN: -round(turn.misalignment_deg, 1)}] if is_significant else []
+        if isinstance(heading := self.heading, HeadingError):
+            is_significant = abs(heading.misalignment_deg) > HEADING_SIGMAS * heading.sigma_deg
+            changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
         return changes + self.other_candidates(None if is_underconfident else tuned)
 
     def time_offset_candidates(self) -> list[Change]:
-        """Return the time offset if the part that the filter does not apply is significant."""
+        """Return the time offset if the part that the filter does not yet apply is significant."""
         if isinstance(self.clock, Unavailable) or not self.clock.is_determinable:
             return []
         applied_s = self.comparison.settings.clock_offset_s
         offset_s = applied_s + self.clock.remaining_s
-        missing_s = offset_s - (applied_s if self.owner == "kf" else 0.0)
-        return [{CLOCK: round(offset_s, 3)}] if abs(missing_s) > self.clock.three_sigma_s else []
+        unapplied_s = offset_s - (applied_s if self.filter_name == "kf" else 0.0)
+        return (
+            [{CLOCK_OFFSET: round(offset_s, 3)}]
+            if abs(unapplied_s) > self.clock.three_sigma_s
+            else []
+        )
 
 
 @dataclass(frozen=True)
-class _KfChanges(_FilterChanges):
-    """KF with changes."""
+class _KfRerun(_FilterRerun):
+    """Re-runs of KF."""
 
     bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
 
-    owner = "kf"
+    filter_name = "kf"
 
     def noise_candidates(
-        self, statement: FilterSummary, tuned: AxisTuning, over: bool
+        self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
         """Return SIGMA_A and SIGMA_Z whose interval excludes the value in use."""
         changes = list[Change]()
         for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
             chosen_sigma = getattr(self.comparison.settings, name)
-            ml_sigma = noise.value or (noise.high if over else None) or 0.0
-            bound = noise.high if over else noise.low
+            ml_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
+            bound = noise.high if is_underconfident else noise.low
             if noise.value is None and name == SIGMA_Z:
                 ml_sigma = max(ml_sigma, SMALLEST_SIGMA_Z_M)
             if (
                 ml_sigma
                 and bound is not None
-                and (chosen_sigma > bound if over else chosen_sigma < bound)
+                and (chosen_sigma > bound if is_underconfident else chosen_sigma < bound)
             ):
                 changes.append({name: float(f"{ml_sigma:.3g}")})
         return changes
@@ -494,7 +504,7 @@ class _KfChanges(_FilterChanges):
         ):
             return []
         forward, right = self.bias_scale_jump_fit.forward_bias, self.bias_scale_jump_fit.right_bias
-        return [{FORWARD: round(forward.value, 3), RIGHT: round(right.value, 3)}]
+        return [{FORWARD_BIAS: round(forward.value, 3), RIGHT_BIAS: round(right.value, 3)}]
 
     def _acceleration_without_bias(
         self, change: Change, direction: Array
@@ -503,7 +513,7 @@ class _KfChanges(_FilterChanges):
         flight, imu = self.comparison.flight, self.comparison.flight.imu
         if isinstance(imu, Unavailable):
             return imu
-        bias = pd.Series([change[FORWARD], change[RIGHT], 0.0], Columns.SPECIFIC_FORCE)
+        bias = pd.Series([change[FORWARD_BIAS], change[RIGHT_BIAS], 0.0], Columns.SPECIFIC_FORCE)
         flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - bias)))
         corrected_ned = ned_acceleration(flight)
         if isinstance(corrected_ned, Unavailable):
@@ -519,17 +529,19 @@ class _KfChanges(_FilterChanges):
             name: change[name] for name in change if name in vars(Settings())
         }
         settings = replace(self.comparison.settings, **kf_settings)
-        truth, is_gnss_rotation = result.truth, TURN in change and source.origin.is_gnss
-        if TURN in change:
-            rotated_direction = _rotate_direction(axis.direction, change[TURN])
-            measured_m = along(within(source.samples, segment), Columns.POSITION, rotated_direction)
+        truth, is_gnss_rotation = result.truth, ROTATION in change and source.origin.is_gnss
+        if ROTATION in change:
+            rotated_direction = _rotate_direction(axis.direction, change[ROTATION])
+            measured_m = weighted_sum(
+                cut_to_segment(source.samples, segment), Columns.POSITION, rotated_direction
+            )
             axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
             if (
                 is_gnss_rotation
             ):  # GNSS and ground truth refer to true north; the attitude is misaligned
                 rotated_axis = replace(axis, direction=rotated_direction)
                 truth = project_truth(self.comparison.flight.truth, rotated_axis, segment)
-        if FORWARD in change:
+        if FORWARD_BIAS in change:
             axis = replace(
                 axis, acceleration=self._acceleration_without_bias(change, axis.direction)
             )
@@ -544,43 +556,40 @@ class _KfChanges(_FilterChanges):
             measurement_m=axis.measurement_m[is_used],
         )
         if statistic == "nis":
-            legs = preintegrate(axis, settings)
-            nu, s = innovations(legs, settings.sigma_a_m_s2, settings.sigma_z_m)
+            increments = preintegrate(axis, settings)
+            nu, s = innovations(increments, settings.sigma_a_m_s2, settings.sigma_z_m)
             return float(np.mean(nu**2 / s)), len(nu)
-        run = quick_replay(axis, settings)
+        kf_run = quick_replay(axis, settings)
         if statistic == "difference":
             state = result.ekf2_state
             return (
                 None
                 if is_gnss_rotation or isinstance(state, Unavailable)
-                else _rms_difference(run, state)
+                else _rms_difference(kf_run, state)
             )
-        return _mean_nees(kf_error_statistics(run, truth, run.steps))
+        return _mean_nees(kf_error_statistics(kf_run, truth, kf_run.steps))
 
 
 @dataclass(frozen=True)
-class _Ekf2Changes(_FilterChanges):
-    """EKF2 with changes, if it fused the analysed source.
-
-    Without ``model`` only the candidates are available.
-    """
+class _Ekf2Rerun(_FilterRerun):
+    """Re-runs of EKF2, if EKF2 fused the analysed source; without ``model`` candidates only."""
 
     inputs: Inputs
     model: Model | None = None
     replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
-    owner = "ekf2"
+    filter_name = "ekf2"
 
     @property
-    def used_m(self) -> float:
-        """Median √R (m) as flown."""
+    def flown_noise_m(self) -> float:
+        """Median √R (m) of EKF2 as flown."""
         aid, flown = self.inputs.aid, self.inputs.settings
-        takes_stated = not aid.noise_mode or flown[aid.noise_mode] != 1.0
-        stated = self.inputs.received.variance_m2[:, :2] * takes_stated
-        return float(np.sqrt(np.median(np.maximum(stated, flown[aid.noise] ** 2))))
+        uses_reported = not aid.noise_mode or flown[aid.noise_mode] != 1.0
+        reported_m2 = self.inputs.received.variance_m2[:, :2] * uses_reported
+        return float(np.sqrt(np.median(np.maximum(reported_m2, flown[aid.noise] ** 2))))
 
     def time_offset_candidates(self) -> list[Change]:
-        """Return a change of EKF2's delay, or else a shift of the timestamps."""
+        """Return a change of EKF2's delay parameter, else a shift of the timestamps."""
         delay = ml_delay_change(self.comparison, self.inputs, self.clock)
         return [delay] if delay else super().time_offset_candidates()
 
@@ -614,32 +623,32 @@ class _Ekf2Changes(_FilterChanges):
         return {ACC_NOISE: float(f"{ml_noise:.2g}")} if ml_noise > flown else {}
 
     def noise_candidates(
-        self, statement: FilterSummary, tuned: AxisTuning, over: bool
+        self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
         """Return the source's measurement noise if its interval excludes EKF2's value."""
         noise = tuned.sigma_z
-        if (noise.low or 0.0) <= self.used_m <= (noise.high or np.inf):
+        if (noise.low or 0.0) <= self.flown_noise_m <= (noise.high or np.inf):
             return []
         ml_noise_m = noise.value
-        if ml_noise_m is None:  # EKF2's innovations give an upper bound
-            ml_noise_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-        return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, ml_noise_m)]
+        if ml_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
+            ml_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
+        return [noise_change(self.inputs.aid, self.inputs.settings, self.flown_noise_m, ml_noise_m)]
 
     def statistic_after(
         self, result: AxisComparison, statistic: Statistic, change: Change
     ) -> tuple[float, int] | None:
-        """Replay EKF2 with the change; the difference without a change is from the log."""
+        """Replay EKF2 with the change; without a change the difference is that of the log."""
         assert self.model is not None
         compared_s, axis = self.model.flown.evaluated_s, result.axis
         ekf2_replay = self._replay_with(self.model, change)
-        if TURN in change and self.comparison.source.origin.is_gnss:
-            # the change corrects the attitude: only its frame rotates, north stays
-            axis = replace(axis, direction=_rotate_direction(axis.direction, -change[TURN]))
+        if ROTATION in change and self.comparison.source.origin.is_gnss:
+            # the change corrects the attitude, so the axis keeps its direction relative to north
+            axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
         weights = axis.direction[:2]
         updates = ekf2_replay.updates[inside_spans(ekf2_replay.updates.index, compared_s)]
         if statistic == "nis":
-            nu = along(updates, INNOVATION_COLUMNS, weights)
-            s = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
+            nu = weighted_sum(updates, INNOVATION_COLUMNS, weights)
+            s = weighted_sum(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
             return (float(np.mean(nu**2 / s)), len(nu)) if len(nu) else None
         state = project(ekf2_replay.published, axis, self.comparison.segment)
         if statistic == "difference":
@@ -648,11 +657,11 @@ class _Ekf2Changes(_FilterChanges):
             return _rms_difference(result.replay, state[inside_spans(state.index, compared_s)])
         at_s, track = (
             updates["fused_at_s"],
-            along(ekf2_replay.delayed, Columns.POSITION, axis.direction),
+            weighted_sum(ekf2_replay.delayed, Columns.POSITION, axis.direction),
         )
         horizon_columns = {
             "position_m": np.interp(at_s, ekf2_replay.delayed.index, track),
-            "position_variance_m2": along(updates, POSITION_VARIANCES, weights**2),
+            "position_variance_m2": weighted_sum(updates, POSITION_VARIANCES, weights**2),
         }
         horizon = pd.DataFrame(horizon_columns, index=pd.Index(at_s))
         return _mean_nees(error_statistics(state, result.ekf2_variance, result.truth, horizon))
@@ -664,14 +673,18 @@ class _Ekf2Changes(_FilterChanges):
         key = tuple(sorted(change.items()))
         if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
-            model = with_misaligned_positions(model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
+            model = with_misaligned_positions(
+                model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
+            )
             excluded_s, tuned = None, tuning_of_axis(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
                 delay_s = 1e-3 * self.inputs.settings[self.inputs.aid.delay]
                 is_gnss_source = self.comparison.source.origin.fused_as_gnss
                 excluded_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
                 excluded_s = (
-                    excluded_s + (delay_s if is_gnss_source else 0.0) + change.get(CLOCK, 0.0)
+                    excluded_s
+                    + (delay_s if is_gnss_source else 0.0)
+                    + change.get(CLOCK_OFFSET, 0.0)
                 )
             (self.replays[key],) = replay_settings(model, [settings], excluded_s)
         return self.replays[key]

@@ -11,23 +11,23 @@ from msgspec import structs
 from px4fuse.arrays import Array
 from px4fuse.comparison import projection
 from px4fuse.comparison.model import (
-    AgainstTruth,
     AxisComparison,
     Comparison,
     Difference,
+    ErrorsAgainstTruth,
     FilterName,
     FilterSummary,
-    UnjudgedFilter,
+    UntestedFilter,
     Updates,
 )
 from px4fuse.comparison.preparation import Choices, prepare
-from px4fuse.filter.consistency import GATE_SIGMA, HorizontalNis, assess, assess_horizontal
+from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
 
-STATE = ("position_m", "velocity_m_s")
-VARIANCES = ("position_variance_m2", "velocity_variance_m2_s2")
+STATE_COLUMNS = ("position_m", "velocity_m_s")
+VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 Frame = pd.DataFrame | Unavailable
 
 
@@ -59,10 +59,11 @@ def compare_prepared(
     """Run KF on a prepared comparison; fill in its axes and its horizontal NIS."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
-        state, statement = projection.continuous_state(ekf2, prepared.source, prepared.segment)
-        notes += [f"EKF2 {statement}"] if statement else []
+        state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
+        notes += [f"EKF2 {note}"] if note else []
         notes += ekf2.notes
-        # after a removed reset, logged positions at the fusion horizon are in another frame
+        # after the removal of a reset, positions at the fusion horizon are in another frame than
+        # the published state
         is_unchanged = state.equals(ekf2.state)
         ekf2 = (
             ekf2 if is_unchanged else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
@@ -72,11 +73,11 @@ def compare_prepared(
         line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
         for line in prepared.lines
     }
-    by_filter: dict[FilterName, HorizontalNis | None] = {
+    nis_by_filter: dict[FilterName, HorizontalNis | None] = {
         "kf": _horizontal_nis({name: axis.replay.updates for name, axis in axes.items()}),
         "ekf2": _horizontal_nis({name: axis.ekf2_innovations for name, axis in axes.items()}),
     }
-    horizontal = {name: nis for name, nis in by_filter.items() if nis is not None}
+    horizontal = {name: nis for name, nis in nis_by_filter.items() if nis is not None}
     return replace(prepared, notes=tuple(notes), axes=axes, horizontal=horizontal)
 
 
@@ -88,7 +89,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
     variance: Frame
     innovations: Frame
     axis_difference: Difference | Unavailable
-    horizon, gate = None, GATE_SIGMA if isinstance(ekf2, Unavailable) else ekf2.gate
+    horizon, gate = None, DEFAULT_GATE if isinstance(ekf2, Unavailable) else ekf2.gate
     if isinstance(ekf2, Unavailable):
         state = variance = innovations = axis_difference = ekf2
     else:
@@ -115,7 +116,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
         ),
         filters={
             "kf": _summarise_filter(
-                updates, kf_run.steps, kf_error_statistics(kf_run, truth, state), GATE_SIGMA
+                updates, kf_run.steps, kf_error_statistics(kf_run, truth, state), DEFAULT_GATE
             ),
             "ekf2": _summarise_filter(
                 innovations, variance, error_statistics(state, variance, truth, horizon), gate
@@ -133,8 +134,8 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
 
 
 def _summarise_filter(
-    innovations: Frame, variance: Frame, truth: AgainstTruth | Unavailable, gate: float
-) -> FilterSummary | UnjudgedFilter:
+    innovations: Frame, variance: Frame, truth: ErrorsAgainstTruth | Unavailable, gate: float
+) -> FilterSummary | UntestedFilter:
     """Summarise a filter from its innovations, its variances and its errors."""
     sigmas: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
@@ -151,7 +152,7 @@ def _summarise_filter(
         if not isinstance(consistency, Unavailable):
             return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
         innovations = consistency
-    return UnjudgedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
+    return UntestedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
 def _known_values(frame: Frame, column: str) -> pd.Series:
@@ -159,10 +160,11 @@ def _known_values(frame: Frame, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
-def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
+def difference(kf_run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
     """Compute KF - EKF2 along one axis at EKF2's sample times."""
     kf_minus_ekf2 = (
-        np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
+        np.array(state_at(kf_run, ekf2_state.index.to_numpy()))
+        - ekf2_state[[*STATE_COLUMNS]].to_numpy().T
     )
     position, velocity = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
     if len(position) < projection.MIN_COMMON_SAMPLES:
@@ -186,23 +188,25 @@ def _rmse(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def kf_error_statistics(run: Replay, truth: Frame, ekf2_state: Frame) -> AgainstTruth | Unavailable:
+def kf_error_statistics(
+    kf_run: Replay, truth: Frame, ekf2_state: Frame
+) -> ErrorsAgainstTruth | Unavailable:
     """Compute KF's errors against ground truth at EKF2's sample times, else at KF's steps."""
-    times = (run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index.to_numpy()
+    times = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index.to_numpy()
     state, variance = (
-        pd.DataFrame(dict(zip(columns, state_function(run, times), strict=True)), index=times)
-        for columns, state_function in ((STATE, state_at), (VARIANCES, variance_at))
+        pd.DataFrame(dict(zip(columns, state_function(kf_run, times), strict=True)), index=times)
+        for columns, state_function in ((STATE_COLUMNS, state_at), (VARIANCE_COLUMNS, variance_at))
     )
     return error_statistics(state, variance, truth)
 
 
 def error_statistics(
     state: Frame, variance: Frame, truth: Frame, horizon: pd.DataFrame | None = None
-) -> AgainstTruth | Unavailable:
+) -> ErrorsAgainstTruth | Unavailable:
     """Compute errors of a filter against ground truth along one axis, and its NEES.
 
-    NEES is computed at the timestamps of ``variance``. If the variances do not belong to ``state``,
-    ``horizon`` contains the positions with their variances.
+    NEES is computed at the timestamps of ``variance``. If the variances do not belong to ``state``
+    (EKF2's published position), ``horizon`` contains positions with their variances.
     """
     if isinstance(state, Unavailable):
         return state
@@ -211,7 +215,7 @@ def error_statistics(
     time_s = state.index.to_numpy()
     errors = [
         state[column].to_numpy() - np.interp(time_s, truth.index, truth[column], np.nan, np.nan)
-        for column in STATE
+        for column in STATE_COLUMNS
     ]
     position, velocity = (error[np.isfinite(error)] for error in errors)
     if len(position) < projection.MIN_COMMON_SAMPLES:
@@ -221,20 +225,20 @@ def error_statistics(
     # EKF2's variances are logged at a tenth of the state's rate: NEES uses their timestamps
     nees = {
         variance_column: _mean_nees(time_s, error, variance[variance_column])
-        for variance_column, error in zip(VARIANCES, errors, strict=True)
+        for variance_column, error in zip(VARIANCE_COLUMNS, errors, strict=True)
         if not isinstance(variance, Unavailable)
     }
     if horizon is not None:
         true_m = np.interp(horizon.index, truth.index, truth["position_m"], np.nan, np.nan)
         error = horizon["position_m"].to_numpy() - true_m
         variance_column = horizon["position_variance_m2"]
-        nees[VARIANCES[0]] = _mean_nees(horizon.index.to_numpy(), error, variance_column)
-    return AgainstTruth(
+        nees[VARIANCE_COLUMNS[0]] = _mean_nees(horizon.index.to_numpy(), error, variance_column)
+    return ErrorsAgainstTruth(
         count=len(position),
         position_rmse_m=_rmse(position),
         velocity_rmse_m_s=_rmse(velocity) if len(velocity) else None,
-        nees_position_mean=nees.get(VARIANCES[0]),
-        nees_velocity_mean=nees.get(VARIANCES[1]),
+        nees_position_mean=nees.get(VARIANCE_COLUMNS[0]),
+        nees_velocity_mean=nees.get(VARIANCE_COLUMNS[1]),
     )
 
 
@@ -256,6 +260,6 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     ]
     if len(frames_of_axes) < 2:
         return None
-    # only updates with the same timestamp on both axes
+    # horizontal NIS needs both components of an update, which have the same timestamp
     joint = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
     return assess_horizontal((joint[0], joint[1]), (joint[2], joint[3]))

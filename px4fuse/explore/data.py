@@ -1,6 +1,6 @@
 """Data of one flight for the page: input signals of KF, EKF2, ground truth, events and findings.
 
-Python projects and integrates the signals and evaluates EKF2; the page only runs KF.
+Python projects and integrates the signals and evaluates EKF2. The page runs only KF.
 """
 
 from typing import Any
@@ -12,31 +12,36 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    MAX_UNSUSPICIOUS_NIS,
+    MAX_UNREMARKABLE_NIS,
     MIN_NEES_FINDING,
-    error_beyond_reported_sigma,
+    error_above_reported_sigma,
 )
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
+from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.packing import COARSE_SCALE, Packer
-from px4fuse.filter import settings as allowed
-from px4fuse.filter.consistency import CONFIDENCE, Consistency, nis_band
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency, nis_band
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
+from px4fuse.filter.settings import (
+    CLOCK_OFFSET_RANGE_S,
+    DT_RANGE_S,
+    SIGMA_A_RANGE_M_S2,
+    SIGMA_Z_RANGE_M,
+    Settings,
+)
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings import Finding, by_root, find, finding_title
+from px4fuse.findings import Finding, find, finding_title, group_by_root
 from px4fuse.findings.cause_grouping import NOISES
 from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.text import capitalise_first
 
-# s; range of the clock offset slider on each side (the option --clock-offset has a larger range)
-OFFSET_REACH_S = 0.6
+# Range of the clock offset slider on each side of the analysed value
+OFFSET_HALF_RANGE_S = 0.6
 RUNNING_MEAN_COUNT = 30  # innovations in the running mean NIS
-MAX_PLAN_POINTS = 2000  # drawn points of the map
+MAX_TRACK_POINTS = 2000  # drawn points of the map
 # Ids of findings that depend on the settings of the page
 SETTING_FINDINGS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
@@ -57,18 +62,18 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
     return {
         "log": analysis.flight.log.name,
         "source": analysis.source.name,
-        # estimates from the innovations of a drifting source are not its noise
+        # The innovations of a drifting source do not show its error: the page suggests no noises
         "drifts": analysis.source.origin.may_drift,
         "summary": list(summarise(analysis, findings)),
         "settings": _settings_data(analysis.settings),
         "main": analysis.main.axis.name,
         **signals,
         "axes": [
-            own | _axis_data(analysis, result, packer)
-            for own, result in zip(signals["axes"], analysis.axes.values(), strict=True)
+            axis_signals | _axis_data(analysis, result, packer)
+            for axis_signals, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
         "maps": _map_data(analysis),
-        "plan": _plan_data(analysis, packer),
+        "plan": _track_data(analysis, packer),
         "events": {
             "gap": list(events.gaps),
             "dropout": list(events.dropouts),
@@ -77,8 +82,11 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
             "reset": list(events.resets_s),
         },
         "findings": [
-            {**_finding_data(first), "more": [_finding_data(one) for one in followers]}
-            for first, *followers in by_root(findings)
+            {
+                **_finding_data(finding),
+                "more": [_finding_data(consequence) for consequence in followers],
+            }
+            for finding, *followers in group_by_root(findings)
         ],
         "command": _command_data(request, analysis),
         "offset": _offset_data(request, analysis),
@@ -97,15 +105,15 @@ def replay_signals(comparison: Comparison, packer: Packer) -> dict[str, Any]:
 
 
 def ranges() -> dict[str, Any]:
-    """Return the limits of the settings (as on the command line) and the lesson's values."""
+    """Return limits and lesson values of the settings, and thresholds for verdicts."""
     return {
-        "sigma-a": list(allowed.SIGMA_A_RANGE_M_S2),
-        "sigma-z": list(allowed.SIGMA_Z_RANGE_M),
-        "dt": list(allowed.DT_RANGE_S),
-        "clock-offset": list(allowed.CLOCK_OFFSET_RANGE_S),
+        "sigma-a": list(SIGMA_A_RANGE_M_S2),
+        "sigma-z": list(SIGMA_Z_RANGE_M),
+        "dt": list(DT_RANGE_S),
+        "clock-offset": list(CLOCK_OFFSET_RANGE_S),
         "lesson": _settings_data(Settings()),
         "running": [RUNNING_MEAN_COUNT, *nis_band(RUNNING_MEAN_COUNT)],
-        "hidden": [MIN_NEES_FINDING, MAX_UNSUSPICIOUS_NIS],
+        "hidden": [MIN_NEES_FINDING, MAX_UNREMARKABLE_NIS],
     }
 
 
@@ -129,10 +137,14 @@ def _offset_data(request: ComparisonRequest, analysis: Analysis) -> dict[str, An
     if request.position is not None:
         return {"why": "the clock offset of a position file is used to align the file"}
     centre, clock = analysis.settings.clock_offset_s, analysis.clock
-    likely = None
+    estimate_s = None
     if isinstance(clock, ClockOffset) and clock.is_determinable:
-        likely = centre + clock.remaining_s
-    return {"from": centre - OFFSET_REACH_S, "to": centre + OFFSET_REACH_S, "likely": likely}
+        estimate_s = centre + clock.remaining_s
+    return {
+        "from": centre - OFFSET_HALF_RANGE_S,
+        "to": centre + OFFSET_HALF_RANGE_S,
+        "likely": estimate_s,
+    }
 
 
 def _imu_data(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
@@ -141,19 +153,21 @@ def _imu_data(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
     time = acceleration.time_s
-    gap = np.flatnonzero(imu_gaps(time))
-    edges = np.stack([time[gap], time[gap + 1]], 1)
-    total = np.cumsum(edges[:, 1] - edges[:, 0])
+    gap_starts = np.flatnonzero(imu_gaps(time))
+    gap_edges = np.stack([time[gap_starts], time[gap_starts + 1]], 1)
+    cumulative_gap_s = np.cumsum(gap_edges[:, 1] - gap_edges[:, 0])
     return {
         "time": packer.add_times(time[_used_samples(comparison, acceleration)]),
         "span": [time[0], time[-1]],
-        "gapEdges": edges.ravel().tolist(),
-        "gapSum": np.stack([np.concatenate([[0.0], total])[:-1], total], 1).ravel().tolist(),
+        "gapEdges": gap_edges.ravel().tolist(),
+        "gapSum": np.stack([np.concatenate([[0.0], cumulative_gap_s])[:-1], cumulative_gap_s], 1)
+        .ravel()
+        .tolist(),
     }
 
 
 def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
-    """Return the slice of IMU samples for the segment, with one more at each end."""
+    """Return the slice of IMU samples in the segment, with one more sample at each end."""
     segment, time = comparison.segment, acceleration.time_s
     low = int(np.searchsorted(time, segment.start_s, side="right")) - 1
     high = int(np.searchsorted(time, segment.end_s)) + 1
@@ -163,12 +177,12 @@ def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
 def _axis_signals(
     comparison: Comparison, axis: Axis, raw: PositionTrack, packer: Packer
 ) -> dict[str, Any]:
-    """Return measurements (also near the segment) and integrated acceleration of one axis."""
+    """Return measurements (in and near the segment) and integrated acceleration of an axis."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
-    value = along(raw.samples, Columns.POSITION, axis.direction)
-    reach = OFFSET_REACH_S + abs(comparison.settings.clock_offset_s)
-    is_in_reach = (time >= segment.start_s - reach) & (time <= segment.end_s + reach)
+    value = weighted_sum(raw.samples, Columns.POSITION, axis.direction)
+    half_range_s = OFFSET_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
+    is_in_reach = (time >= segment.start_s - half_range_s) & (time <= segment.end_s + half_range_s)
     is_in_reach &= np.isfinite(value)
     signals: dict[str, Any] = {
         "name": axis.name,
@@ -190,7 +204,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
     """Return the axis description, NIS bands, EKF2 and ground truth of one axis."""
     name = result.axis.name
     return {
-        "called": result.axis.called,
+        "called": result.axis.label,
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
@@ -205,12 +219,13 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
 def _nis_bands(count: int, packer: Packer) -> list[int]:
     """Pack both ends of the 95 % band of the mean NIS for each number of innovations.
 
-    The number changes with the clock offset, which moves measurements across the segment's ends.
+    The number depends on the clock offset, which moves measurements into or out of the segment.
     """
-    freedom = np.arange(1, 2 * count + 1)
-    ends = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
+    counts = np.arange(1, 2 * count + 1)
+    probabilities = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)
     return [
-        packer.add(np.asarray(stats.chi2.ppf(end, freedom)) / freedom, COARSE_SCALE) for end in ends
+        packer.add(np.asarray(stats.chi2.ppf(probability, counts)) / counts, COARSE_SCALE)
+        for probability in probabilities
     ]
 
 
@@ -227,13 +242,13 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
         "summary": _summary(consistency),
         "r": None,
     }
-    if isinstance(consistency.truth, AgainstTruth):
+    if isinstance(consistency.truth, ErrorsAgainstTruth):
         ekf2["summary"] |= {
             "truthP": consistency.truth.position_rmse_m,
             "truthV": consistency.truth.velocity_rmse_m_s,
         }
-    if hidden := error_beyond_reported_sigma(consistency):
-        ekf2["summary"]["reportedSigma"] = hidden.reported_sigma_m
+    if excess := error_above_reported_sigma(consistency):
+        ekf2["summary"]["reportedSigma"] = excess.reported_sigma_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         ekf2["variance"] = _pack_frame(
@@ -251,24 +266,24 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
         ekf2["innovations"] = _pack_frame(
             packed_rows, ["innovation_m", "sigma", "rejected"], packer
         )
-        r = frame["observation_variance_m2"].dropna()
-        ekf2["r"] = float(np.sqrt(r.median())) if len(r) else None
+        variance_m2 = frame["observation_variance_m2"].dropna()
+        ekf2["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
     else:
         ekf2["why"] = result.ekf2_innovations.reason
     return ekf2
 
 
-def _summary(statement: Consistency | Unavailable) -> dict[str, Any]:
-    """Return EKF2's column of the table of numbers, or the reason why it is missing."""
-    if isinstance(statement, Unavailable):
-        return {"why": statement.reason}
+def _summary(consistency: Consistency | Unavailable) -> dict[str, Any]:
+    """Return the statistics of EKF2, or the reason why they are missing."""
+    if isinstance(consistency, Unavailable):
+        return {"why": consistency.reason}
     return {
         "why": "",
-        "count": statement.count,
-        "nis": statement.nis_mean,
-        "band": list(statement.nis_band),
-        "outside": statement.fraction_outside_two_sigma,
-        "lag1": statement.lag1_autocorrelation,
+        "count": consistency.count,
+        "nis": consistency.nis_mean,
+        "band": list(consistency.nis_band),
+        "outside": consistency.fraction_outside_two_sigma,
+        "lag1": consistency.lag1_autocorrelation,
     }
 
 
@@ -304,13 +319,13 @@ def _map_data(analysis: Analysis) -> dict[str, Any]:
     }
 
 
-def _plan_data(comparison: Comparison, packer: Packer) -> list[int] | str:
-    """Pack time, north and east of the source's track, or return why it is missing."""
-    samples = within(comparison.source.samples, comparison.segment)
+def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
+    """Pack time, north and east of the source's track, or return the reason why it is missing."""
+    samples = cut_to_segment(comparison.source.samples, comparison.segment)
     track = samples[Columns.POSITION[:2]].dropna()
     if not len(track):
         return "the source has no horizontal position"
-    sampled = track.iloc[:: max(1, -(-len(track) // MAX_PLAN_POINTS))]
+    sampled = track.iloc[:: max(1, -(-len(track) // MAX_TRACK_POINTS))]
     return _pack_frame(sampled, Columns.POSITION[:2], packer)
 
 
@@ -328,10 +343,10 @@ def _finding_data(finding: Finding) -> dict[str, Any]:
 
 
 def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[str, Any]:
-    """Return the command without the page's settings, and one with a fixed segment and aisle.
+    """Return the command without the page's settings, and one that also fixes segment and aisle.
 
-    Segment and aisle are derived from the timestamps, so another clock offset would change them;
-    then the command states them.
+    The automatic segment and aisle depend on the timestamps. With another clock offset the command
+    must state them, so that the analysis uses the same ones.
     """
     offset_s = None if request.position is None else request.clock_offset_s
     base_request = msgspec.structs.replace(
@@ -345,8 +360,10 @@ def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[st
         heading_deg=heading if base_request.heading_deg is None else base_request.heading_deg,
     )
     return {
-        "bare": command_line(base_request),
-        "held": command_line(fixed_request),
+        "base": command_line(base_request),
+        "fixed": command_line(fixed_request),
         "input": request.input,
-        "found": "zero" if isinstance(comparison.lines[0].acceleration, Unavailable) else "imu",
+        "default_input": "zero"
+        if isinstance(comparison.lines[0].acceleration, Unavailable)
+        else "imu",
     }

@@ -25,16 +25,16 @@ const Engine = (() => {
   function stepMeans(imu, axis, edges) {
     const velocity = interp(edges, imu.time, axis.integral);
     const gap = interp(edges, imu.gapEdges, imu.gapSum);
-    const n = edges.length - 1, mean = new Float64Array(n), share = new Float64Array(n);
+    const n = edges.length - 1, mean = new Float64Array(n), gapFraction = new Float64Array(n);
     const low = imu.span[0], high = imu.span[1];
     const clip = (t) => Math.min(Math.max(t, low), high);
     for (let i = 0; i < n; i++) {
       const length = edges[i + 1] - edges[i];
       mean[i] = (velocity[i + 1] - velocity[i]) / length;
       const outside = 1 - (clip(edges[i + 1]) - clip(edges[i])) / length;
-      share[i] = Math.min(Math.max((gap[i + 1] - gap[i]) / length + outside, 0), 1);
+      gapFraction[i] = Math.min(Math.max((gap[i + 1] - gap[i]) / length + outside, 0), 1);
     }
-    return { mean, share };
+    return { mean, gapFraction };
   }
 
   /* Measurements within the segment after the time offset correction */
@@ -80,13 +80,13 @@ const Engine = (() => {
     if (settings.input === "zero") {
       return { mean: new Float64Array(n), extra: new Float64Array(n) };
     }
-    const { mean, share } = stepMeans(flight.imu, axis, line.time);
+    const { mean, gapFraction } = stepMeans(flight.imu, axis, line.time);
     const extra = new Float64Array(n);
-    for (let from = 0; from < n;) { // between measurements: unknown acceleration persists through a gap
+    for (let from = 0; from < n;) { // from measurement to measurement: the unknown acceleration persists in a gap
       let to = from, gap = 0;
-      do gap += share[to] * (line.time[to + 1] - line.time[to]); while (line.at[++to] < 0 && to < n);
+      do gap += gapFraction[to] * (line.time[to + 1] - line.time[to]); while (line.at[++to] < 0 && to < n);
       const persistence = Math.max(gap / settings.dt, 1);
-      for (let i = from; i < to; i++) extra[i] = share[i] * persistence * axis.rms * axis.rms;
+      for (let i = from; i < to; i++) extra[i] = gapFraction[i] * persistence * axis.rms * axis.rms;
       from = to;
     }
     return { mean, extra };

@@ -50,8 +50,7 @@ STYLES = {
     "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
 }
-# Range of the colours of the likelihood map: √(2 · drop of the log-likelihood), in standard
-# deviations
+# Range of the colours of the likelihood map, in standard deviations: √(2 · (ln L_max − ln L))
 MAP_SIGMAS = 6.0
 
 
@@ -61,12 +60,12 @@ class Plot(Record, frozen=True):
     Attributes
     ----------
     lines : tuple of (source, column, style, name)
-        Style of :data:`STYLES`; the name appears in the tooltip, "" for none.
+        Key of :data:`STYLES`, and name in the tooltip ("": no tooltip).
     """
 
     label: str
     lines: tuple[tuple[str, str, str, str], ...]
-    tall: bool = False
+    is_tall: bool = False
     scale: Literal["linear", "log"] = "linear"
     unit: str = ""
 
@@ -74,7 +73,7 @@ class Plot(Record, frozen=True):
 class Figures(Record, frozen=True):
     """Tables of ``figures.toml``."""
 
-    strip: list[str]
+    event_rows: list[str]
     map_colours: list[str]
     panels: dict[str, str]
     sources: dict[str, str]
@@ -123,7 +122,7 @@ def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
         sources = _Sources(name)
         fig = plots[name] = figure(
             name=name,
-            height=TALL_HEIGHT if plot.tall else PLOT_HEIGHT,
+            height=TALL_HEIGHT if plot.is_tall else PLOT_HEIGHT,
             sizing_mode="stretch_width",
             x_range=time_range,
             y_range=_page_range(),
@@ -209,7 +208,7 @@ def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ek
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     tips = [("time", "@t{0.00} s"), *rows]
-    # different sides, so that tooltips do not overlap
+    # The tooltips are on different sides, so that they do not overlap
     side: Any = {"EKF2": "right", "ground truth": "above"}.get(rows[0][0], "left")
     fig.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
 
@@ -248,7 +247,7 @@ def _event_strip(data: dict[str, Any], time_range: Range1d) -> Any:
     """Make the event plot, with a row per kind of event."""
     source = _empty_source("strip", "row left right text")
     has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
-    rows = FIGURES.strip if has_ekf2 else FIGURES.strip[2:]
+    rows = FIGURES.event_rows if has_ekf2 else FIGURES.event_rows[2:]
     fig = figure(
         name="strip",
         height=28 * len(rows) + 24,
@@ -323,16 +322,17 @@ def _likelihood_map(tuning: Tuning) -> Any:
 def _draw_dots(
     fig: Any, source: ColumnDataSource, colour: str | None, size: int, **style: Any
 ) -> Any:
-    """Draw dots at the last two columns of a source, without edge unless the style has one."""
+    """Draw dots at the last two columns of a source, without an edge line by default."""
     x, y = source.column_names[-2:]
     marker_style = {"size": size, "fill_color": colour, "line_color": None} | style
     return fig.scatter(x, y, source=source, **marker_style)
 
 
 def _pixel_extent(values: Array) -> tuple[float, float]:
-    """Return start and length of an image on a logarithmic axis, from its pixel centres."""
-    half = float(np.sqrt(values[1] / values[0]))
-    return float(values[0]) / half, float(values[-1]) * half - float(values[0]) / half
+    """Return start and length of an image on a logarithmic axis from the centres of its pixels."""
+    half_pixel = float(np.sqrt(values[1] / values[0]))
+    start, end = float(values[0]) / half_pixel, float(values[-1]) * half_pixel
+    return start, end - start
 
 
 def _plan_plot() -> Any:

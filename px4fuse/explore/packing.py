@@ -1,7 +1,7 @@
 """Compact encoding of arrays for the page, with a negligible rounding error.
 
-Values become integers of a fixed step, then differences, then byte planes (the upper ones are
-nearly constant), then deflate and base64.
+Values are rounded to integer multiples of a step. Their differences are divided into byte planes
+(the upper planes are nearly constant), compressed by deflate and encoded as base64.
 """
 
 import base64
@@ -20,7 +20,10 @@ MAX_EXACT = 2.0**52  # integers up to this are exact in JavaScript (doubles)
 
 @dataclass
 class Packer:
-    """Collects arrays; the page's data contains their indices instead."""
+    """Collection of arrays; the page's data contain indices of arrays.
+
+    ``specs`` has length, number of byte planes and steps per unit of each array.
+    """
 
     specs: list[tuple[int, int, float]] = field(default_factory=list)
     _bytes: list[bytes] = field(default_factory=list)
@@ -39,11 +42,12 @@ class Packer:
         while largest * scale > MAX_EXACT:
             scale /= 2.0
         integers = np.rint(values * scale).astype(np.int64)
-        steps = np.diff(integers, prepend=0)
-        code = ((steps << 1) ^ (steps >> 63)).astype("<u8")
-        planes = max(1, (int(code.max(initial=0)).bit_length() + 7) // 8)
-        self._bytes.append(code.view(np.uint8).reshape(-1, 8)[:, :planes].T.tobytes())
-        self.specs.append((len(values), planes, scale))
+        differences = np.diff(integers, prepend=0)
+        # the lowest bit is the sign, so small negative numbers have few bits too
+        zigzag = ((differences << 1) ^ (differences >> 63)).astype("<u8")
+        plane_count = max(1, (int(zigzag.max(initial=0)).bit_length() + 7) // 8)
+        self._bytes.append(zigzag.view(np.uint8).reshape(-1, 8)[:, :plane_count].T.tobytes())
+        self.specs.append((len(values), plane_count, scale))
         return len(self.specs) - 1
 
     def add_times(self, time_s: Array) -> int:

@@ -1,10 +1,10 @@
-/* Main script of the page: settings to KF run, KF run to plots and numbers. */
+/* Main script of the page: runs KF with the settings and draws plots and numbers. */
 const Explore = (async () => {
-  const MOST_POINTS = 3000, FEW_POINTS = 600; // drawn points per line; fewer while a slider is dragged
-  const DRAG_ENDS_MS = 150;
+  const MAX_POINTS = 3000, MAX_DRAG_POINTS = 600; // most drawn points of a line, and while a slider is dragged
+  const DRAG_PAUSE_MS = 150;
   const NARROW = matchMedia("(max-width: 60rem)");
-  const read = (id) => JSON.parse($(id).textContent);
-  const content = read(`content${Practice.suffix}`), ranges = content.ranges;
+  const readJson = (id) => JSON.parse($(id).textContent);
+  const content = readJson(`content${Practice.suffix}`), ranges = content.ranges;
   if (typeof DecompressionStream === "undefined") {
     $("problem").textContent = "This browser is too old for this page. Use a browser from 2023 or later.";
     $("problem").hidden = false;
@@ -13,25 +13,25 @@ const Explore = (async () => {
 
   // ------------------------------------------------------------------ the flight's data
   const arrays = await Engine.unpack($(`arrays${Practice.suffix}`).textContent, content.packed);
-  const take = (places) => places.map((place) => arrays[place]);
+  const arraysAt = (indices) => indices.map((index) => arrays[index]);
   const { imu, plan, axes } = content.flight;
   const flight = {
     ...content.flight,
     imu: typeof imu === "string" ? imu : { ...imu, time: arrays[imu.time] },
-    plan: typeof plan === "string" ? plan : take(plan),
+    plan: typeof plan === "string" ? plan : arraysAt(plan),
     axes: axes.map((axis) => ({
-      ...axis, time: arrays[axis.time], z: arrays[axis.z], bands: take(axis.bands),
+      ...axis, time: arrays[axis.time], z: arrays[axis.z], bands: arraysAt(axis.bands),
       integral: axis.integral === undefined ? null : arrays[axis.integral],
       ekf2: typeof axis.ekf2 === "string" ? axis.ekf2 : {
-        ...axis.ekf2, state: take(axis.ekf2.state), variance: take(axis.ekf2.variance || []),
-        innovations: take(axis.ekf2.innovations || []),
+        ...axis.ekf2, state: arraysAt(axis.ekf2.state), variance: arraysAt(axis.ekf2.variance || []),
+        innovations: arraysAt(axis.ekf2.innovations || []),
       },
       truth: typeof axis.truth === "string" ? axis.truth : {
-        p: take(axis.truth.p), v: axis.truth.v === null ? null : take(axis.truth.v),
+        p: arraysAt(axis.truth.p), v: axis.truth.v === null ? null : arraysAt(axis.truth.v),
       },
     })),
   };
-  // ground truth is hidden until the answer
+  // the page hides ground truth until the student has answered
   if (Practice.hidden) {
     for (const axis of flight.axes) {
       axis.truth = "shown after your answer";
@@ -80,7 +80,7 @@ const Explore = (async () => {
       const value = setting.number.value === "" ? NaN : Number(setting.number.value);
       const [low, high] = limits(setting);
       if (value >= low && value <= high) return set({ [setting.key]: value });
-      say(`${setting.title}: enter ${low} to ${high} ${setting.unit}.`);
+      showMessage(`${setting.title}: enter ${low} to ${high} ${setting.unit}.`);
       show();
     });
     box.append(label, setting.number, setting.slider);
@@ -106,38 +106,38 @@ const Explore = (async () => {
     }
   }
   const axisNow = () => flight.axes.find((axis) => axis.name === settings.axis);
-  const say = (text) => { $("message").textContent = text; };
+  const showMessage = (text) => { $("message").textContent = text; };
   const mapNow = () => flight.maps[axisNow().map] ?? "not computed";
 
   $("lesson").addEventListener("click", () => {
     const { sigmaA, sigmaZ, dt } = ranges.lesson;
     set({ sigmaA, sigmaZ, dt });
-    say("Values of the lesson.");
+    showMessage("Values of the lesson.");
   });
   $("likely").addEventListener("click", () => {
     const [sigmaA, sigmaZ] = mapNow().likely;
     set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: flight.settings.dt });
-    say("Maximum-likelihood estimates from the innovations of this flight.");
+    showMessage("Maximum-likelihood estimates from the innovations of this flight.");
   });
   $("ekf2-r").addEventListener("click", () => {
     set({ sigmaZ: round(axisNow().ekf2.r, 3) });
-    say("SIGMA_Z is the median measurement standard deviation of EKF2 (√R).");
+    showMessage("SIGMA_Z is the median measurement standard deviation of EKF2 (√R).");
   });
 
-  /* Change settings, re-run KF and draw. During a drag: at most once per frame, with fewer points */
-  let waiting = false, again = false, rest = null;
+  /* Change settings, re-run KF and draw; during a drag at most once per frame, with fewer points */
+  let isDrawing = false, isChangedSince = false, finalDraw = null;
   function set(changes, dragged = false) {
     Object.assign(settings, changes);
-    if ($("message").textContent) say("");
-    clearTimeout(rest);
+    if ($("message").textContent) showMessage("");
+    clearTimeout(finalDraw);
     if (!dragged) return show();
-    rest = setTimeout(show, DRAG_ENDS_MS);
-    if (waiting) { again = true; return; }
-    waiting = true;
+    finalDraw = setTimeout(show, DRAG_PAUSE_MS);
+    if (isDrawing) { isChangedSince = true; return; }
+    isDrawing = true;
     show(true);
     requestAnimationFrame(() => {
-      waiting = false;
-      if (again) { again = false; show(true); }
+      isDrawing = false;
+      if (isChangedSince) { isChangedSince = false; show(true); }
     });
   }
 
@@ -169,7 +169,7 @@ const Explore = (async () => {
     else open(parts.get("view") ?? view, false);
     const step = Number(parts.get("measurement"));
     if (Number.isInteger(step) && step > 0) chosen.step = step - 1;
-    if (ignored.length) say(`Invalid values in the address are ignored: ${ignored.join(", ")}.`);
+    if (ignored.length) showMessage(`Invalid values in the address are ignored: ${ignored.join(", ")}.`);
   }
 
   // ------------------------------------------------------------------ views
@@ -179,9 +179,9 @@ const Explore = (async () => {
     track: ["Position and ground truth", ["position", "velocity", "error"]],
     more: ["NIS, gain, events", ["nis", "gain", "strip"]] };
   const CARDS = { step: "Step by step", map: "Likelihood", numbers: "Numbers", recorded: "Findings" };
-  const there = (name) => document.querySelector(`[data-plot=${name}]`) !== null;
+  const hasPlot = (name) => document.querySelector(`[data-plot=${name}]`) !== null;
   const isView = (name) => Object.hasOwn(GROUPS, name) || Object.hasOwn(CARDS, name)
-    || (Object.hasOwn(PLOTS, name) && there(name));
+    || (Object.hasOwn(PLOTS, name) && hasPlot(name));
   let view = "filter";
   /* Tab of a view; on a narrow screen each plot has a separate tab */
   function tabOf(name) {
@@ -191,8 +191,8 @@ const Explore = (async () => {
   }
   const seenPlots = () => Object.hasOwn(CARDS, view) ? [] : Object.hasOwn(GROUPS, view) ? GROUPS[view][1] : [view];
   const isSeen = (name) => name === "plan" || name === "step" ? view === "step" : name === view || seenPlots().includes(name);
-  function tabs() {
-    const names = NARROW.matches ? Object.entries(PLOTS).filter(([name]) => there(name))
+  function drawTabs() {
+    const names = NARROW.matches ? Object.entries(PLOTS).filter(([name]) => hasPlot(name))
       : Object.entries(GROUPS).map(([name, [title]]) => [name, title]);
     $("tabs").replaceChildren(...[...names, ...Object.entries(CARDS)].map(([name, title]) => {
       const tab = make("button", title, { type: "button", id: `tab-${name}` });
@@ -231,26 +231,26 @@ const Explore = (async () => {
   });
   $("others").open = !NARROW.matches;
   NARROW.addEventListener("change", () => {
-    tabs();
+    drawTabs();
     $("others").open = !NARROW.matches;
     open(view);
   });
-  // on a small screen sticky elements stay below the settings
+  // on a small screen the plots stick below the settings
   new ResizeObserver(() => document.body.style.setProperty("--bar", `${$("bar").offsetHeight}px`)).observe($("bar"));
 
   // ------------------------------------------------------------------ Bokeh
   Bokeh.logger.set_level("off");
-  await Bokeh.embed.embed_items({ page: read(`document${Practice.suffix}`) }, [
+  await Bokeh.embed.embed_items({ page: readJson(`document${Practice.suffix}`) }, [
     { docid: "page", roots: content.places, root_ids: Object.keys(content.places) }]);
   const page = Bokeh.documents[0];
-  const known = new Map();
+  const models = new Map();
   const model = (name) => {
-    if (!known.has(name)) known.set(name, page.get_model_by_name(name));
-    return known.get(name);
+    if (!models.has(name)) models.set(name, page.get_model_by_name(name));
+    return models.get(name);
   };
-  const put = (name, columns) => { model(`${name}-source`).data = columns; };
+  const setSource = (name, columns) => { model(`${name}-source`).data = columns; };
   /* Set a source in each visible plot that has it */
-  const give = (name, columns) => {
+  const setVisibleSources = (name, columns) => {
     for (const plot of seenPlots()) {
       const source = model(`${plot}:${name}-source`);
       if (source !== null) source.data = columns;
@@ -261,18 +261,18 @@ const Explore = (async () => {
     "nis", "gain", "strip"].map(model).filter(Boolean);
 
   /* Rows within the visible time range; long series are reduced to the extremes of each bin */
-  let most = MOST_POINTS;
-  function thin(columns, keys) {
+  let pointLimit = MAX_POINTS;
+  function decimate(columns, keys) {
     const t = columns.t, n = t.length;
     const below = (x) => { let a = 0, b = n; while (a < b) { const c = (a + b) >> 1;
       if (t[c] < x) a = c + 1; else b = c; } return a; };
     const from = Math.max(below(timeRange.start) - 1, 0), to = Math.min(below(timeRange.end) + 2, n);
     const names = Object.keys(columns), out = {};
-    if (to - from <= most) {
+    if (to - from <= pointLimit) {
       for (const name of names) out[name] = columns[name].subarray(from, to);
       return out;
     }
-    const bins = Math.floor(most / 2 / keys.length), kept = [];
+    const bins = Math.floor(pointLimit / 2 / keys.length), kept = [];
     for (let b = 0; b < bins; b++) {
       const low = from + Math.floor((to - from) * b / bins);
       const high = from + Math.floor((to - from) * (b + 1) / bins), own = new Set();
@@ -293,7 +293,7 @@ const Explore = (async () => {
   const shifted = (t, by) => by ? t.map((x) => x + by) : t;
 
   /* Set the vertical range of a visible plot */
-  function frame(name, ends, log = false) {
+  function setRange(name, ends, log = false) {
     const range = isSeen(name) ? model(name)?.y_range : undefined;
     if (!range) return;
     let [low, high] = ends();
@@ -302,7 +302,7 @@ const Explore = (async () => {
     [range.start, range.end] = log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
   }
   /* Draw arrow heads at the edge for values outside the plot */
-  function marks(drawn) {
+  function drawOutsideArrows(drawn) {
     const rows = (...parts) => parts.flatMap(([part, column]) => part === undefined ? []
       : Array.from(part.t, (t, i) => [t, part[column][i]]));
     for (const [plot, name, points] of [["position", "beyond", rows([drawn.measured, "z"])],
@@ -330,7 +330,7 @@ const Explore = (async () => {
   };
 
   // ------------------------------------------------------------------ KF run and its numbers
-  // current run; run and numbers are null with too few measurements
+  // run and numbers are null if the segment has too few measurements
   const result = { run: null, axis: null, numbers: null };
   function replay(quick) {
     const axis = axisNow(), run = Engine.replay(flight, axis, settings);
@@ -352,13 +352,13 @@ const Explore = (async () => {
       const at = Engine.stateAt(run, times), { p, v } = axis.truth;
       kf.truthP = Engine.rmse(at.p, Engine.interp(times, p[0], p[1], NaN));
       kf.truthV = v === null ? null : Engine.rmse(at.v, Engine.interp(times, v[0], v[1], NaN));
-      kf.reportedSigma = hidden(run, p, kf.nis);
+      kf.reportedSigma = hiddenErrorSigma(run, p, kf.nis);
     }
     return kf;
   }
   /* Median reported σ of position, if ground truth shows an error that the innovations do not
      show (findings/hidden_errors.py) */
-  function hidden({ steps }, truth, nis) {
+  function hiddenErrorSigma({ steps }, truth, nis) {
     const known = Engine.interp(steps.time, truth[0], truth[1], NaN);
     let sum = 0, count = 0;
     steps.p.forEach((p, i) => { if (Number.isFinite(known[i])) { sum += (p - known[i]) ** 2 / steps.p00[i]; count++; } });
@@ -396,8 +396,8 @@ const Explore = (async () => {
     return run && numbers(axis, run, true);
   };
   function drawSentences({ axis, numbers: kf }) {
-    const found = mapNow(), { likely } = flight.offset;
-    const [sigmaA, sigmaZ] = typeof found === "string" ? [null, null] : found.likely;
+    const map = mapNow(), { likely } = flight.offset;
+    const [sigmaA, sigmaZ] = typeof map === "string" ? [null, null] : map.likely;
     const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["clock offset", "offset", likely]]
       .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
       .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
@@ -447,29 +447,29 @@ const Explore = (async () => {
   function drawKf({ run, axis }) {
     const { steps, updates } = run;
     const n = steps.time.length, m = updates.nu.length, size = n + m;
-    const saw = table(["t", "p", "v", "sp", "sv"], Array.from({ length: 5 }, () => new Float64Array(size)));
+    const sawtooth = table(["t", "p", "v", "sp", "sv"], Array.from({ length: 5 }, () => new Float64Array(size)));
     for (let i = 0, k = 0, u = 0; i < n; i++) {
       if (u < m && updates.step[u] === i) { // before the update, then after it
-        saw.t[k] = steps.time[i]; saw.p[k] = updates.p[u]; saw.v[k] = updates.v[u];
-        saw.sp[k] = Math.sqrt(updates.p00[u]); saw.sv[k++] = Math.sqrt(updates.p11[u++]);
+        sawtooth.t[k] = steps.time[i]; sawtooth.p[k] = updates.p[u]; sawtooth.v[k] = updates.v[u];
+        sawtooth.sp[k] = Math.sqrt(updates.p00[u]); sawtooth.sv[k++] = Math.sqrt(updates.p11[u++]);
       }
-      saw.t[k] = steps.time[i]; saw.p[k] = steps.p[i]; saw.v[k] = steps.v[i];
-      saw.sp[k] = Math.sqrt(steps.p00[i]); saw.sv[k++] = Math.sqrt(steps.p11[i]);
+      sawtooth.t[k] = steps.time[i]; sawtooth.p[k] = steps.p[i]; sawtooth.v[k] = steps.v[i];
+      sawtooth.sp[k] = Math.sqrt(steps.p00[i]); sawtooth.sv[k++] = Math.sqrt(steps.p11[i]);
     }
     const rows = { t: updates.time, nu: updates.nu,
       plus: updates.s.map((s) => 2 * Math.sqrt(s)), minus: updates.s.map((s) => -2 * Math.sqrt(s)),
       k0: updates.k0, k1: updates.k1, running: running(updates.nu, updates.s) };
-    const seen = { steps: thin(saw, ["p", "sp"]), updates: thin(rows, ["nu", "plus"]) };
-    give("steps", seen.steps);
-    give("updates", seen.updates);
+    const seen = { steps: decimate(sawtooth, ["p", "sp"]), updates: decimate(rows, ["nu", "plus"]) };
+    setVisibleSources("steps", seen.steps);
+    setVisibleSources("updates", seen.updates);
     if (isSeen("position")) {
-      seen.measured = thin({ t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
-      give("measured", seen.measured);
+      seen.measured = decimate({ t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
+      setVisibleSources("measured", seen.measured);
     }
     if (isSeen("error") && typeof axis.truth !== "string") {
       const known = Engine.interp(steps.time, ...axis.truth.p, NaN);
-      seen.error = thin({ t: steps.time, e: steps.p.map((p, i) => p - known[i]) }, ["e"]);
-      give("error", seen.error);
+      seen.error = decimate({ t: steps.time, e: steps.p.map((p, i) => p - known[i]) }, ["e"]);
+      setVisibleSources("error", seen.error);
     }
     return seen;
   }
@@ -482,10 +482,10 @@ const Explore = (async () => {
     }
     return out;
   }
-  /* Draw EKF2 and ground truth, which change with axis and zoom only */
+  /* Draw EKF2 and ground truth, which depend only on axis and zoom */
   function drawReferences(axis) {
     const seen = {};
-    const take = (name, columns, keys) => { seen[name] = thin(columns, keys); give(name, seen[name]); };
+    const take = (name, columns, keys) => { seen[name] = decimate(columns, keys); setVisibleSources(name, seen[name]); };
     if (typeof axis.ekf2 !== "string") {
       const { state, variance, innovations } = axis.ekf2;
       take("state", table(["t", "p", "v"], state), ["p", "v"]);
@@ -511,13 +511,13 @@ const Explore = (async () => {
     }
     return seen;
   }
-  function frames(kf, others) {
+  function setRanges(kf, others) {
     const of = (part, column) => part?.[column] ?? EMPTY;
     const { steps, updates } = kf;
-    frame("position", () => extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
-    frame("velocity", () => extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
-    frame("error", () => extent(of(kf.error, "e"), of(others.error_ekf2, "e")));
-    frame("innovation", () => { // limited, so that outliers and gaps do not hide the other innovations
+    setRange("position", () => extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
+    setRange("velocity", () => extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
+    setRange("error", () => extent(of(kf.error, "e"), of(others.error_ekf2, "e")));
+    setRange("innovation", () => { // limited, so that outliers and gaps do not hide the other innovations
       const reach = 1.3 * Math.max(...[[updates.nu, updates.plus],
         [of(others.fused, "nu"), of(others.limits, "plus")]].map(([nu, plus]) => {
           const typical = quantile(plus, 0.5);
@@ -525,19 +525,19 @@ const Explore = (async () => {
         }));
       return [-reach, reach];
     });
-    frame("sigma_p", () => extent(steps.sp, of(others.variance, "sp")), true);
-    frame("sigma_v", () => extent(steps.sv, of(others.variance, "sv")), true);
-    frame("nis", () => extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
-    frame("gain", () => extent(updates.k0, updates.k1, [0]));
-    marks({ ...others, ...kf });
+    setRange("sigma_p", () => extent(steps.sp, of(others.variance, "sp")), true);
+    setRange("sigma_v", () => extent(steps.sv, of(others.variance, "sv")), true);
+    setRange("nis", () => extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
+    setRange("gain", () => extent(updates.k0, updates.k1, [0]));
+    drawOutsideArrows({ ...others, ...kf });
   }
 
   // ------------------------------------------------------------------ likelihood map
   const trail = { x: [], y: [] };
   let mapShown = null;
   function drawMap() {
-    const found = mapNow(), plot = model("map");
-    const known = typeof found !== "string";
+    const map = mapNow(), plot = model("map");
+    const known = typeof map !== "string";
     $("map").hidden = !known;
     if (!known) return;
     const last = trail.x.length - 1;
@@ -546,47 +546,47 @@ const Explore = (async () => {
       trail.y.push(settings.sigmaZ);
       if (trail.x.length > 200) { trail.x.shift(); trail.y.shift(); }
     }
-    const [[a0, a1], [z0, z1]] = [found.sigmaA, found.sigmaZ], name = axisNow().map;
+    const [[a0, a1], [z0, z1]] = [map.sigmaA, map.sigmaZ], name = axisNow().map;
     if (mapShown !== name) {
       mapShown = name;
       for (const one of plot.renderers) {
         if (one.name?.startsWith("map:")) one.visible = one.name === `map:${name}`;
       }
-      const likely = found.likely.every((x) => x !== null);
-      put("best", likely ? { x: [found.likely[0]], y: [found.likely[1]] } : { x: [], y: [] });
+      const likely = map.likely.every((x) => x !== null);
+      setSource("best", likely ? { x: [map.likely[0]], y: [map.likely[1]] } : { x: [], y: [] });
     }
-    put("trail", { x: [...trail.x], y: [...trail.y] });
-    put("point", { x: [settings.sigmaA], y: [settings.sigmaZ] });
+    setSource("trail", { x: [...trail.x], y: [...trail.y] });
+    setSource("point", { x: [settings.sigmaA], y: [settings.sigmaZ] });
     [plot.x_range.start, plot.x_range.end] = [Math.min(a0, settings.sigmaA / 1.3), Math.max(a1, settings.sigmaA * 1.3)];
     [plot.y_range.start, plot.y_range.end] = [Math.min(z0, settings.sigmaZ / 1.3), Math.max(z1, settings.sigmaZ * 1.3)];
   }
   function mapNote() {
-    const found = mapNow(), initial = flight.settings;
-    if (typeof found === "string") return `No map: ${found}.`;
+    const map = mapNow(), initial = flight.settings;
+    if (typeof map === "string") return `No map: ${map}.`;
     const axis = axisNow().map === "horizontal" ? "North and east together" : `Axis ${axisNow().map}`;
     const differs = initial.dt !== settings.dt || initial.offset !== settings.offset || initial.input !== settings.input;
-    return `${axis}, ${found.count} measurements, DT ${initial.dt} s, input ${initial.input}, clock offset `
+    return `${axis}, ${map.count} measurements, DT ${initial.dt} s, input ${initial.input}, clock offset `
       + `${round(initial.offset, 4)} s. Darker: higher likelihood. Cross: maximum. One shade: half a standard `
       + `deviation.${differs ? " The map is not valid for the current DT, input or clock offset." : ""}`;
   }
 
   // ------------------------------------------------------------------ command
-  const quoted = (x) => String(round(x, 12));
+  const optionText = (x) => String(round(x, 12));
   function command() {
-    const { bare, held, input, found } = flight.command, lesson = ranges.lesson;
-    const parts = [settings.offset !== flight.settings.offset ? held : bare];
+    const { base, fixed, input, default_input: defaultInput } = flight.command, lesson = ranges.lesson;
+    const parts = [settings.offset !== flight.settings.offset ? fixed : base];
     for (const setting of SETTINGS) {
       const standard = setting.key === "offset" ? 0 : lesson[setting.key];
       if (setting.key === "offset" && why) continue;
-      if (settings[setting.key] !== standard) parts.push(`--${setting.id} ${quoted(settings[setting.key])}`);
+      if (settings[setting.key] !== standard) parts.push(`--${setting.id} ${optionText(settings[setting.key])}`);
     }
-    if (settings.input !== found || input !== null) parts.push(`--input ${settings.input}`);
+    if (settings.input !== defaultInput || input !== null) parts.push(`--input ${settings.input}`);
     return parts.join(" ");
   }
   $("copy").addEventListener("click", async () => {
-    $("copy-note").textContent = await copied($("command")) ? " copied" : " selected, press Ctrl+C";
+    $("copy-note").textContent = await copyText($("command")) ? " copied" : " selected, press Ctrl+C";
   });
-  async function copied(node) {
+  async function copyText(node) {
     try {
       await navigator.clipboard.writeText(node.textContent);
       return true;
@@ -599,53 +599,53 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ whole page
   let axisShown = null;
   let others = null;
-  /* Run KF and draw the visible parts; quick (during a drag) leaves out texts and tables */
+  /* Run KF and draw the visible views; quick (during a drag): without texts and tables */
   function show(quick = false) {
-    most = quick ? FEW_POINTS : MOST_POINTS;
+    pointLimit = quick ? MAX_DRAG_POINTS : MAX_POINTS;
     for (const setting of SETTINGS) {
       if (document.activeElement !== setting.number || !quick) setting.number.value = settings[setting.key];
       if (!quick) setting.slider.value = toSlider(setting, settings[setting.key]);
       setting.slider.ariaValueText = `${settings[setting.key]} ${setting.unit}`;
     }
-    const another = axisShown !== settings.axis;
+    const isNewAxis = axisShown !== settings.axis;
     axisShown = settings.axis;
     replay(quick);
-    if (another) others = drawReferences(result.axis);
-    if (result.run) frames(drawKf(result), others);
+    if (isNewAxis) others = drawReferences(result.axis);
+    if (result.run) setRanges(drawKf(result), others);
     drawNeedle(result);
     if (isSeen("map")) drawMap();
     if (quick) return;
-    clearTimeout(rest);
+    clearTimeout(finalDraw);
     for (const name of ["axis", "input"]) {
       for (const radio of document.querySelectorAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
     }
-    const { axis } = result, found = mapNow();
+    const { axis } = result, map = mapNow();
     $("axis-note").textContent = [axis.heading === null ? "" : `heading ${axis.heading.toFixed(1)}°`, axis.note]
       .filter(Boolean).join(", ");
-    $("likely").disabled = typeof found === "string" || found.likely.includes(null);
+    $("likely").disabled = typeof map === "string" || map.likely.includes(null);
     $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
     $("map-note").textContent = mapNote();
     drawTable(result);
     $("command").textContent = command();
-    if (another) times.strip(axis);
+    if (isNewAxis) times.strip(axis);
     times.plan();
     stepper.draw();
     drawSentences(result);
     toAddress();
   }
-  /* Draw the same run after a zoom */
-  function look() {
+  /* Draw the same KF run again after a zoom */
+  function redraw() {
     others = drawReferences(result.axis);
-    if (result.run) frames(drawKf(result), others);
+    if (result.run) setRanges(drawKf(result), others);
     times.plan();
   }
 
-  const stepper = Step.start({ settings, chosen, result, model, put, figures, isSeen,
+  const stepper = Step.start({ settings, chosen, result, model, setSource, figures, isSeen,
     moved: (time) => { times.show(time); toAddress(); } });
   const keys = { n: () => stepper.go((chosen.step ?? -1) + 1), p: () => stepper.go((chosen.step ?? 1) - 1),
     " ": () => { open("step"); stepper.play(); }, s: () => stepper.faster(-1), f: () => stepper.faster(1) };
-  const times = Times.start({ flight, settings, model, put, timeRange, figures, look, shifted, isSeen, keys, open });
-  tabs();
+  const times = Times.start({ flight, settings, model, setSource, timeRange, figures, redraw, shifted, isSeen, keys, open });
+  drawTabs();
   addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
   open(view, false);
   fromAddress();

@@ -10,7 +10,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.explore.data import flight_data, ranges
 from px4fuse.explore.figures import FIGURES, document_json
 from px4fuse.explore.packing import Packer
-from px4fuse.webpage.safe import clean_values, inert_json, part, policy_hash, template
+from px4fuse.webpage.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 
 MAX_CHARACTERS = 2000  # longer texts from a log are shortened
 SCRIPTS = ("dom", "summary", "step", "times", "tour")
@@ -68,51 +68,53 @@ def data_scripts(data: dict[str, Any], analysis: Analysis, packer: Packer, suffi
 
 
 def page_text(
-    scripts: str,
+    data_elements: str,
     data: dict[str, Any],
     *,
     command: str,
     heading: str,
     title: str,
     sha256: str = "",
-    rounds: int = 0,
+    flight_count: int = 0,
     choices: Mapping[str, str] = {},
 ) -> str:
-    """Make the page around the data elements.
+    """Make the HTML page with the data elements.
 
     Parameters
     ----------
-    scripts : str
-        Elements of :func:`data_scripts`.
+    data_elements : str
+        Script elements from :func:`data_scripts`.
     data : dict
-        One flight of the page; either all flights have ground truth or none.
+        Data of any flight of the page: either all have ground truth or none has.
     command, heading, title : str
     sha256 : str
         SHA-256 of the log, in the head of the page.
-    rounds : int
-        Number of flights in a practice set.
+    flight_count : int
+        Number of flights in a practice set; 0 on other pages.
     choices : mapping of str to str
         Possible answers with their texts; empty for a page without questions.
     """
     practice = "practice" if choices else "no_practice"
-    code = {
-        # BokehJS core without widgets, tables and formulas; the second script of Bokeh only sets
-        # the log level and writes to the console
+    scripts_by_name = {
+        # the core of BokehJS, without widgets, tables and formulas; the second script only sets
+        # the log level
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
-        "engine": part("engine.js", PACKAGE),
-        "script": "".join(part(f"{name}.js", PACKAGE) for name in (*SCRIPTS, practice, "page")),
+        "engine": read_asset("engine.js", PACKAGE),
+        "script": "".join(
+            read_asset(f"{name}.js", PACKAGE) for name in (*SCRIPTS, practice, "page")
+        ),
     }
-    return template("explore/page.html").render(
-        {f"{name}_hash": policy_hash(text) for name, text in code.items()},
-        **code,
-        style=part("base.css") + part("page.css", PACKAGE),
+    return load_template("explore/page.html").render(
+        {f"{name}_hash": policy_hash(text) for name, text in scripts_by_name.items()},
+        **scripts_by_name,
+        style=read_asset("base.css") + read_asset("page.css", PACKAGE),
         command=command,
         heading=heading,
         title=title,
         made_from=f"px4fuse {command} {sha256}".rstrip(),
         made_with=f"px4fuse {version('px4fuse')}",
-        data=scripts,
-        rounds=rounds,
+        data=data_elements,
+        flight_count=flight_count,
         choices=choices,
         panels=FIGURES.panels.items(),
         has_truth=any(isinstance(axis["truth"], dict) for axis in data["axes"]),

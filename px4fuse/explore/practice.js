@@ -1,14 +1,14 @@
-/* Practice: current flight, given answers and score. The address contains the state, so a reload keeps
-   it. The correct answers are decoded only after an answer. */
+/* Practice: current flight, given answers and score. The address contains them, so a reload keeps them.
+   The solution of a flight is decoded only after the student's answer. */
 const Practice = (() => {
-  const count = Number($("quiz").dataset.rounds), parts = new URLSearchParams(location.hash.slice(1));
-  const saved = (parts.get("answers") ?? "").split("~").slice(0, count);
-  const answers = Array.from({ length: count }, (_, i) => saved[i] ?? "");
-  const wanted = Math.trunc(Number(parts.get("flight") ?? 1)) - 1;
-  const at = wanted >= 0 && wanted < count ? wanted : 0;
-  const hidden = answers[at] === "";
+  const count = Number($("quiz").dataset.flights), address = new URLSearchParams(location.hash.slice(1));
+  const savedAnswers = (address.get("answers") ?? "").split("~").slice(0, count);
+  const answers = Array.from({ length: count }, (_, i) => savedAnswers[i] ?? "");
+  const requested = Math.trunc(Number(address.get("flight") ?? 1)) - 1;
+  const current = requested >= 0 && requested < count ? requested : 0;
+  const hidden = answers[current] === "";
 
-  async function keyOf(number) {
+  async function readSolution(number) {
     const bytes = Uint8Array.from(atob($(`key-${number}`).textContent), (c) => c.charCodeAt(0));
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
     return JSON.parse(await new Response(stream).text());
@@ -19,20 +19,20 @@ const Practice = (() => {
     if (chosen.some((one) => !right.includes(one))) return 0;
     return chosen.length === right.length ? 1 : 0.5;
   }
-  const toAddress = () => ({ flight: at + 1, answers: answers.join("~") });
-  function to(number) {
+  const toAddress = () => ({ flight: current + 1, answers: answers.join("~") });
+  function goTo(number) {
     history.replaceState(null, "", `#${new URLSearchParams({ ...toAddress(), flight: number + 1 })}`);
     location.reload();
   }
 
   async function start(page) {
-    $("quiz-title").textContent = `Flight ${at + 1} of ${count}`;
+    $("quiz-title").textContent = `Flight ${current + 1} of ${count}`;
     $("tour-start").hidden = true;
     $("as-report").hidden = true; // the flight is not a log file
     const boxes = [...document.querySelectorAll("[name=choice]")];
     for (const box of boxes) {
       box.disabled = !hidden;
-      box.checked = answers[at].split(" ").includes(box.value);
+      box.checked = answers[current].split(" ").includes(box.value);
       box.addEventListener("change", () => {
         if (!box.checked) return;
         for (const other of boxes) {
@@ -44,14 +44,14 @@ const Practice = (() => {
     $("quiz-check").addEventListener("click", () => {
       const chosen = boxes.filter((box) => box.checked).map((box) => box.value);
       if (!chosen.length) { $("quiz-result").textContent = "Select at least one."; return; }
-      answers[at] = chosen.sort().join(" ");
-      to(at);
+      answers[current] = chosen.sort().join(" ");
+      goTo(current);
     });
-    const open = answers.findIndex((answer, i) => answer === "" && i !== at);
-    $("quiz-next").hidden = hidden || open < 0;
-    $("quiz-next").addEventListener("click", () => to(open));
+    const nextOpen = answers.findIndex((answer, i) => answer === "" && i !== current);
+    $("quiz-next").hidden = hidden || nextOpen < 0;
+    $("quiz-next").addEventListener("click", () => goTo(nextOpen));
     $("quiz-again").hidden = answers.every((answer) => answer === "");
-    $("quiz-again").addEventListener("click", () => { answers.fill(""); to(0); });
+    $("quiz-again").addEventListener("click", () => { answers.fill(""); goTo(0); });
     await score();
     if (!hidden) await showSolution(page);
   }
@@ -59,21 +59,21 @@ const Practice = (() => {
     let sum = 0, done = 0;
     for (const [number, answer] of answers.entries()) {
       if (answer === "") continue;
-      sum += points(answer, await keyOf(number));
+      sum += points(answer, await readSolution(number));
       done++;
     }
     $("quiz-score").textContent = done === 0 ? "" : `${sum} of ${done} correct${done === count
       ? ", set finished" : " so far"}`;
   }
   async function showSolution(page) {
-    const key = await keyOf(at), score = points(answers[at], key);
+    const solution = await readSolution(current), score = points(answers[current], solution);
     const grade = { 1: "Correct.", 0.5: "Half correct.", 0: "Wrong." }[score];
-    $("quiz-result").textContent = score === 1 ? grade : `${grade} Correct answer: ${key.right.join(" and ")}.`;
+    $("quiz-result").textContent = score === 1 ? grade : `${grade} Correct answer: ${solution.right.join(" and ")}.`;
     const box = $("quiz-solution");
-    if (!key.mistakes.length) {
+    if (!solution.mistakes.length) {
       box.append(make("p", "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."));
     }
-    for (const { description, symptom, view, span } of key.mistakes) {
+    for (const { description, symptom, view, span } of solution.mistakes) {
       const line = make("p", `${description} Symptom: ${symptom} `);
       const when = span === null ? "whole flight" : `at ${span[0].toFixed(1)} s`;
       const button = make("button", `show (${when})`, { type: "button", className: "jump" });
@@ -84,9 +84,9 @@ const Practice = (() => {
       line.append(button);
       box.append(line);
     }
-    page.recorded(key);
-    page.open(key.mistakes[0]?.view ?? "error");
+    page.recorded(solution);
+    page.open(solution.mistakes[0]?.view ?? "error");
   }
 
-  return { suffix: `-${at}`, hidden, toAddress, start, points };
+  return { suffix: `-${current}`, hidden, toAddress, start, points };
 })();

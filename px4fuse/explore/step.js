@@ -3,7 +3,7 @@
 const Step = (() => {
   const CORNERS = 120;
   const TRAIL = 60; // steps in the trail of means
-  const PACES_MS = [1600, 800, 400, 200, 100, 50];
+  const STEP_TIMES_MS = [1600, 800, 400, 200, 100, 50];
 
   /* Points of the 2σ ellipse, from the Cholesky factor of P */
   function ellipse([p, v, p00, p01, p11]) {
@@ -17,20 +17,20 @@ const Step = (() => {
     return out;
   }
 
-  /* All predictions and updates of a run in order: i step, u measurement or -1 */
+  /* All predictions and updates of a run in order: i is the step, u the measurement or -1 */
   function moments({ steps, updates }) {
     const list = [{ i: 0, u: -1, updated: false }];
     for (let i = 1, u = 0; i < steps.time.length; i++) {
-      const own = u < updates.step.length && updates.step[u] === i ? u++ : -1;
-      list.push({ i, u: own, updated: false });
-      if (own >= 0) list.push({ i, u: own, updated: true });
+      const updateIndex = u < updates.step.length && updates.step[u] === i ? u++ : -1;
+      list.push({ i, u: updateIndex, updated: false });
+      if (updateIndex >= 0) list.push({ i, u: updateIndex, updated: true });
     }
     return list;
   }
-  const after = ({ steps: s }, i) => [s.p[i], s.v[i], s.p00[i], s.p01[i], s.p11[i]];
+  const stateAfter = ({ steps: s }, i) => [s.p[i], s.v[i], s.p00[i], s.p01[i], s.p11[i]];
   function state(run, { i, u, updated }) {
     const { updates: s } = run;
-    return u >= 0 && !updated ? [s.p[u], s.v[u], s.p00[u], s.p01[u], s.p11[u]] : after(run, i);
+    return u >= 0 && !updated ? [s.p[u], s.v[u], s.p00[u], s.p01[u], s.p11[u]] : stateAfter(run, i);
   }
 
   const format = (x, digits = 4) => Math.abs(x) >= 1e-4 || x === 0 ? x.toFixed(digits) : x.toExponential(2);
@@ -38,10 +38,10 @@ const Step = (() => {
   const grows = (before, now) => now > before ? "increases" : now < before ? "decreases" : "unchanged";
   const sigma = (before, now) => `σ_p ${grows(before, now)}: ${format(Math.sqrt(before))} to ${format(Math.sqrt(now))} m`;
 
-  /* Equations of the lesson with the numbers of this step: label, text, true if part of the update */
+  /* Equations of the lesson with the numbers of this step: [label, text, true for the update] */
   function equations(run, settings, moment) {
     const { steps: s, updates: m } = run, { i, u, updated } = moment;
-    const [, , b00, b01, b11] = after(run, i - 1), prior = state(run, { i, u, updated: false });
+    const [, , b00, b01, b11] = stateAfter(run, i - 1), prior = state(run, { i, u, updated: false });
     const [p, v, p00, p01, p11] = prior, dt = s.time[i] - s.time[i - 1], a = s.acceleration[i - 1];
     const q = (settings.sigmaA ** 2 + s.extra[i - 1]) * settings.dt;
     const rows = [
@@ -60,7 +60,7 @@ const Step = (() => {
       ["Compare", `ν = z − Hx⁻ = ${format(m.nu[u])} m`, true],
       ["", `S = HP⁻Hᵀ + R = ${format(m.s[u], 5)} m²; ν²/S = ${format(m.nu[u] ** 2 / m.s[u], 2)}`, true]);
     if (updated) {
-      const [x, w, c00, c01, c11] = after(run, i);
+      const [x, w, c00, c01, c11] = stateAfter(run, i);
       rows.push(
         ["Gain", `K = P⁻Hᵀ/S = [${format(m.k0[u])}, ${format(m.k1[u])} 1/s]`, true],
         ["Update", `x⁺ = x⁻ + Kν = [${format(x)} m, ${format(w)} m/s]`, true],
@@ -71,14 +71,14 @@ const Step = (() => {
   }
 
   function start(page) {
-    const { settings, chosen, result, model, put, figures, isSeen, moved } = page;
+    const { settings, chosen, result, model, setSource, figures, isSeen, moved } = page;
     let cached = { run: null, list: [] };
     const listNow = () => {
       const { run } = result;
       if (cached.run !== run) cached = { run, list: run === null ? [] : moments(run) };
       return cached.list;
     };
-    let moment = null, playing = null, pace = 2; // indices: moments of the run, PACES_MS
+    let moment = null, playing = null, speed = 2; // indices: of moments of the run, and of STEP_TIMES_MS
 
     /* Go to a measurement (index), after its update */
     function go(measurement) {
@@ -109,22 +109,22 @@ const Step = (() => {
       const list = listNow();
       if (!list.length) return;
       if (moment === null || moment >= list.length - 1) moment = 0;
-      playing = setInterval(advance, PACES_MS[pace]);
+      playing = setInterval(advance, STEP_TIMES_MS[speed]);
       $("play").textContent = "Pause";
       $("now").ariaLive = "off"; // too fast for a screen reader
     }
     function faster(by) {
-      pace = Math.min(Math.max(pace + by, 0), PACES_MS.length - 1);
-      if (playing !== null) { clearInterval(playing); playing = setInterval(advance, PACES_MS[pace]); }
-      $("slower").disabled = pace === 0;
-      $("faster").disabled = pace === PACES_MS.length - 1;
+      speed = Math.min(Math.max(speed + by, 0), STEP_TIMES_MS.length - 1);
+      if (playing !== null) { clearInterval(playing); playing = setInterval(advance, STEP_TIMES_MS[speed]); }
+      $("slower").disabled = speed === 0;
+      $("faster").disabled = speed === STEP_TIMES_MS.length - 1;
     }
 
     function draw() {
       const { run } = result;
       if (moment === null && chosen.step !== null) {
-        const wanted = Math.min(chosen.step, (run?.updates.nu.length ?? 1) - 1);
-        moment = listNow().findIndex((one) => one.u === wanted && one.updated);
+        const requested = Math.min(chosen.step, (run?.updates.nu.length ?? 1) - 1);
+        moment = listNow().findIndex((one) => one.u === requested && one.updated);
         if (moment < 0) moment = null;
       }
       const known = run !== null && moment !== null;
@@ -156,12 +156,12 @@ const Step = (() => {
     }
     function drawPlane(run, one) {
       const plot = model("step"), now = state(run, one);
-      const previous = one.updated ? state(run, { ...one, updated: false }) : after(run, Math.max(one.i - 1, 0));
-      put("now", ellipse(now));
-      put("before", ellipse(previous));
-      put("mean", { p: [now[0]], v: [now[1]] });
+      const previous = one.updated ? state(run, { ...one, updated: false }) : stateAfter(run, Math.max(one.i - 1, 0));
+      setSource("now", ellipse(now));
+      setSource("before", ellipse(previous));
+      setSource("mean", { p: [now[0]], v: [now[1]] });
       const from = Math.max(one.i - TRAIL, 0);
-      put("trail-means", { p: run.steps.p.subarray(from, one.i), v: run.steps.v.subarray(from, one.i) });
+      setSource("trail-means", { p: run.steps.p.subarray(from, one.i), v: run.steps.v.subarray(from, one.i) });
       const measured = one.u >= 0, z = measured ? run.updates.z[one.u] : 0;
       const band = plot.center.find((part) => part.name === "band");
       const line = plot.center.find((part) => part.name === "measurement");
@@ -175,25 +175,25 @@ const Step = (() => {
       [plot.x_range.start, plot.x_range.end] = [now[0] - reach[0], now[0] + reach[0]];
       [plot.y_range.start, plot.y_range.end] = [now[1] - reach[1], now[1] + reach[1]];
     }
-    let reached = { run: null, reach: [1, 1] };
+    let cachedReach = { run: null, reach: [1, 1] };
     function reachOf(run) {
-      if (reached.run === run) return reached.reach;
+      if (cachedReach.run === run) return cachedReach.reach;
       const typical = (values) => Float64Array.from(values, Math.sqrt).sort()[Math.floor(0.9 * values.length)];
       const wide = Math.max(2.5 * typical(run.updates.p00), 2.5 * Math.min(settings.sigmaZ, 20 * typical(run.updates.p00)));
-      reached = { run, reach: [wide, 2.8 * typical(run.updates.p11)] };
-      return reached.reach;
+      cachedReach = { run, reach: [wide, 2.8 * typical(run.updates.p11)] };
+      return cachedReach.reach;
     }
 
-    const clicks = { first: () => go(0), previous: () => go((chosen.step ?? 1) - 1),
+    const actions = { first: () => go(0), previous: () => go((chosen.step ?? 1) - 1),
       next: () => go((chosen.step ?? -1) + 1), last: () => go(Infinity), play,
       slower: () => faster(-1), faster: () => faster(1) };
-    for (const [id, act] of Object.entries(clicks)) $(id).addEventListener("click", act);
+    for (const [id, act] of Object.entries(actions)) $(id).addEventListener("click", act);
     $("cursor").addEventListener("input", (event) => go(Number(event.target.value)));
-    const another = () => { // a new run has different steps: stay at the measurement
+    const restart = () => { // a new run has other steps, so the selected measurement is kept
       moment = null;
       draw();
     };
-    return { go, draw: another, play, pause, faster, at: () => moment, listNow };
+    return { go, draw: restart, play, pause, faster, at: () => moment, listNow };
   }
 
   return { start, ellipse, moments, state };

@@ -1,6 +1,6 @@
 /* Time range of the plots, events, map and findings. */
 const Times = (() => {
-  // by name of the drawn element, for light and dark mode
+  // colours by name of the drawn element, in light and dark mode
   const COLOURS = {
     light: { kf: "#123f7a", ekf2: "#e0741a", truth: "#111111", measured: "#9a9a9a",
       paper: "#ffffff", ink: "#1b2027", muted: "#55606c", line: "#d9dee4", event: "#aab3bd" },
@@ -9,15 +9,15 @@ const Times = (() => {
   };
 
   function start(page) {
-    const { flight, settings, model, put, timeRange, figures, look, shifted, isSeen, keys: others } = page;
+    const { flight, settings, model, setSource, timeRange, figures, redraw, shifted, isSeen, keys: others } = page;
     const ends = flight.segment;
 
     // ------------------------------------------------------------------ visible time range
     let waiting = false;
-    const seen = () => {
+    const onRangeChange = () => {
       if (waiting) return;
       waiting = true;
-      requestAnimationFrame(() => { waiting = false; showRange(); look(); });
+      requestAnimationFrame(() => { waiting = false; showRange(); redraw(); });
     };
     const showRange = () => {
       $("span").textContent = `${timeRange.start.toFixed(1)} s to ${timeRange.end.toFixed(1)} s`;
@@ -29,8 +29,8 @@ const Times = (() => {
       timeRange.end = from + width;
     }
     [timeRange.start, timeRange.end] = ends;
-    timeRange.properties.start.change.connect(seen);
-    timeRange.properties.end.change.connect(seen);
+    timeRange.properties.start.change.connect(onRangeChange);
+    timeRange.properties.end.change.connect(onRangeChange);
     const move = (by) => {
       const width = timeRange.end - timeRange.start;
       view(timeRange.start + by * width, timeRange.end + by * width);
@@ -56,17 +56,17 @@ const Times = (() => {
       const add = (row, low, high, text) => {
         rows.row.push(row); rows.left.push(low); rows.right.push(high); rows.text.push(text);
       };
-      const { events } = flight, sliver = (ends[1] - ends[0]) / 800;
+      const { events } = flight, minWidth = (ends[1] - ends[0]) / 800;
       for (const [low, high, name] of events.modes) add("mode", low, high, name);
       for (const [low, high] of events.ground) add("on the ground", low, high, "");
       for (const [low, high] of events.gap) add("gap in source", low, high, "");
       for (const [low, high] of events.dropout) add("log dropout", low, high, "");
       if (typeof axis.ekf2 !== "string") {
-        for (const t of events.reset) add("EKF2 reset", t, t + sliver, "");
+        for (const t of events.reset) add("EKF2 reset", t, t + minWidth, "");
         const [time, , , rejected] = axis.ekf2.innovations;
-        (rejected ?? []).forEach((flag, i) => { if (flag) add("EKF2 rejected", time[i], time[i] + sliver, ""); });
+        (rejected ?? []).forEach((flag, i) => { if (flag) add("EKF2 rejected", time[i], time[i] + minWidth, ""); });
       }
-      put("strip", rows);
+      setSource("strip", rows);
     }
 
     // ------------------------------------------------------------------ map
@@ -76,7 +76,7 @@ const Times = (() => {
       const inside = [...t.keys()].filter((i) => t[i] >= timeRange.start && t[i] <= timeRange.end);
       const track = model("plan-source");
       if (!track.data.t.length) {
-        put("plan", { t: time, north, east });
+        setSource("plan", { t: time, north, east });
         track.selected.properties.indices.change.connect(() => {
           const { indices } = track.selected;
           if (!indices.length) return;
@@ -85,7 +85,7 @@ const Times = (() => {
           view(time[low], time[high]);
         });
       }
-      put("shown", { north: inside.map((i) => north[i]), east: inside.map((i) => east[i]) });
+      setSource("shown", { north: inside.map((i) => north[i]), east: inside.map((i) => east[i]) });
     }
 
     /* Mark the vehicle on the map at a time of KF, and make that time visible */
@@ -96,7 +96,7 @@ const Times = (() => {
       }
       if (typeof flight.plan === "string" || !isSeen("plan")) return;
       const [time, north, east] = flight.plan, at = [t - settings.offset + flight.settings.offset];
-      put("here", { north: Engine.interp(at, time, north), east: Engine.interp(at, time, east) });
+      setSource("here", { north: Engine.interp(at, time, north), east: Engine.interp(at, time, east) });
     }
 
     // ------------------------------------------------------------------ summary and findings
@@ -119,14 +119,14 @@ const Times = (() => {
         make("strong", `${finding.title} [${finding.id}]. `), finding.message);
       box.append(line);
       if (finding.remedy) box.append(make("p", `Action: ${finding.remedy}`, { className: "note", dir: "auto" }));
-      // filled in after a change of settings
+      // the page fills in this text after a change of settings
       if (finding.depends_on_settings) box.append(make("p", "", { className: "changed-note" }));
       finding.spans.forEach(([low, high]) => {
         const text = high - low > 0.05 ? `${low.toFixed(1)} s to ${high.toFixed(1)} s` : `${low.toFixed(1)} s`;
         const button = make("button", `show ${text}`, { type: "button", className: "jump" });
         button.addEventListener("click", () => {
-          const around = Math.max(2, 0.3 * (high - low));
-          view(low - around, high + around);
+          const margin = Math.max(2, 0.3 * (high - low));
+          view(low - margin, high + margin);
           page.open("innovation");
         });
         box.append(button);
@@ -159,9 +159,9 @@ const Times = (() => {
       if (name === "kf_band") { glyph.fill_color = colours.kf; return; }
       if (name === "ink") { glyph.text_color = colours.ink; return; }
       if (name === null || colours[name] === undefined) return;
-      const drawn = (one) => Boolean(one !== null && typeof one === "object" ? one.value : one);
-      if (drawn(glyph.line_color)) glyph.line_color = colours[name];
-      if (drawn(glyph.fill_color)) glyph.fill_color = colours[name]; // hollow marks stay hollow
+      const isVisible = (one) => Boolean(one !== null && typeof one === "object" ? one.value : one);
+      if (isVisible(glyph.line_color)) glyph.line_color = colours[name];
+      if (isVisible(glyph.fill_color)) glyph.fill_color = colours[name]; // hollow marks stay hollow
     }
     dark.addEventListener("change", paint);
     paint();

@@ -1,5 +1,5 @@
-/* Tour of seven stations on this flight. Each sets the settings, describes the effect with the flight's
-   numbers, and gives one task. The previous settings return at the end. */
+/* Tour of seven stations on this flight. Each station changes the settings, describes the effect with
+   the flight's numbers, and gives one task. The end of the tour restores the previous settings. */
 const Tour = (() => {
   const { formatNumber: number, formatMetres: length } = Summary;
 
@@ -14,25 +14,25 @@ const Tour = (() => {
         see: "σ grows again between two measurements, and the innovations return into ±2√S." };
     },
     ({ base, rerun }) => {
-      const by = [10, 30, 100].find((d) => rerun({ ...base, sigmaZ: tidy(base.sigmaZ / d) }).outside > 0.1) ?? 100;
-      const sigmaZ = tidy(base.sigmaZ / by), run = rerun({ ...base, sigmaZ });
+      const divisor = [10, 30, 100].find((d) => rerun({ ...base, sigmaZ: roundTo2Digits(base.sigmaZ / d) }).outside > 0.1) ?? 100;
+      const sigmaZ = roundTo2Digits(base.sigmaZ / divisor), run = rerun({ ...base, sigmaZ });
       return { title: "R too small", set: { ...base, sigmaZ }, view: "innovation",
-        sentence: `SIGMA_Z is now ${sigmaZ} m, ${by} times too small. ${number(100 * run.outside, 2)} % of the innovations `
+        sentence: `SIGMA_Z is now ${sigmaZ} m, ${divisor} times too small. ${number(100 * run.outside, 2)} % of the innovations `
           + "are outside ±2√S (expected 5 %).",
         task: "Increase SIGMA_Z until about 5 % of the innovations are outside.",
         see: "The band widens around the dots, and the track becomes smoother." };
     },
     ({ base, rerun }) => {
-      const both = { ...base, sigmaA: tidy(3 * base.sigmaA), sigmaZ: tidy(3 * base.sigmaZ) };
-      const alone = { ...base, sigmaA: tidy(3 * base.sigmaA) };
+      const both = { ...base, sigmaA: roundTo2Digits(3 * base.sigmaA), sigmaZ: roundTo2Digits(3 * base.sigmaZ) };
+      const alone = { ...base, sigmaA: roundTo2Digits(3 * base.sigmaA) };
       return { title: "The ratio determines the track", set: both, view: "position",
-        sentence: `SIGMA_A and SIGMA_Z are both three times larger. The position changes by ${length(rerun(both).from(rerun(base)))} `
-          + `RMS. With a larger SIGMA_A alone it would change by ${length(rerun(alone).from(rerun(base)))} RMS.`,
+        sentence: `SIGMA_A and SIGMA_Z are both three times larger. The position changes by ${length(rerun(both).rmsDifference(rerun(base)))} `
+          + `RMS. With a larger SIGMA_A alone it would change by ${length(rerun(alone).rmsDifference(rerun(base)))} RMS.`,
         task: "Set one of them back to its previous value.",
         see: "The track depends on the ratio SIGMA_A / SIGMA_Z, hardly on their common scale." };
     },
     ({ base, rerun }) => {
-      const both = { ...base, sigmaA: tidy(3 * base.sigmaA), sigmaZ: tidy(3 * base.sigmaZ) };
+      const both = { ...base, sigmaA: roundTo2Digits(3 * base.sigmaA), sigmaZ: roundTo2Digits(3 * base.sigmaZ) };
       const [before, now] = [rerun(base), rerun(both)];
       return { title: "The scale determines σ", set: both, view: "sigma_p",
         sentence: `The track is the same, but σ of position changed from ${length(before.sigma)} to ${length(now.sigma)}, and `
@@ -46,14 +46,14 @@ const Tour = (() => {
           sentence: `The clock offset of this flight is fixed: ${why}.`,
           task: "Continue.", see: "px4fuse sync estimates the time offset of a log." };
       }
-      const wrong = Math.min(base.offset + 0.2, offsets[1]), late = { ...base, offset: wrong };
+      const lateOffset = Math.min(base.offset + 0.2, offsets[1]), late = { ...base, offset: lateOffset };
       const [before, now] = [rerun(base), rerun(late)];
-      const shows = now.nis / before.nis > 1.1, truth = now.truthP && now.truthP > 1.1 * before.truthP;
+      const isVisible = now.nis / before.nis > 1.1, truth = now.truthP && now.truthP > 1.1 * before.truthP;
       return { title: "Time offset", set: late, view: truth ? "error" : "innovation",
-        sentence: `The timestamps are now ${number(wrong - base.offset, 2)} s later. Mean NIS changes ${shows ? "" : "only "}`
+        sentence: `The timestamps are now ${number(lateOffset - base.offset, 2)} s later. Mean NIS changes ${isVisible ? "" : "only "}`
           + `from ${number(before.nis, 2)} to ${number(now.nis, 2)}. `
           + (truth ? `The position RMSE changes from ${length(before.truthP)} to ${length(now.truthP)}.`
-            : `The position changes by ${length(now.from(before))} RMS.`),
+            : `The position changes by ${length(now.rmsDifference(before))} RMS.`),
         task: truth ? "Move the clock offset to the smallest error."
           : "Move the clock offset to the smallest innovations.",
         see: "The error is proportional to speed: zero at rest, largest at high speed. This is typical of a time offset." };
@@ -82,7 +82,7 @@ const Tour = (() => {
         see: "With the same R and a similar Q, EKF2 reports a similar σ." };
     },
   ];
-  const tidy = (x) => Number(x.toPrecision(2));
+  const roundTo2Digits = (x) => Number(x.toPrecision(2));
 
   function start(page) {
     const { settings, set, open, result, flight, numbers, chosen, stepper, axisNow, mapNow } = page;
@@ -92,13 +92,13 @@ const Tour = (() => {
     /* Initial settings of all stations: maximum-likelihood estimates if known, else those of the report */
     function facts() {
       const axis = axisNow(), found = mapNow(), likely = typeof found === "string" ? [null, null] : found.likely;
-      const own = flight.settings, base = { sigmaA: tidy(likely[0] ?? own.sigmaA), sigmaZ: tidy(likely[1] ?? own.sigmaZ),
+      const own = flight.settings, base = { sigmaA: roundTo2Digits(likely[0] ?? own.sigmaA), sigmaZ: roundTo2Digits(likely[1] ?? own.sigmaZ),
         dt: own.dt, input: own.input, offset: Number((flight.offset.likely ?? own.offset).toFixed(3)) };
       if (flight.offset.why) base.offset = own.offset;
       const rerun = (changes) => {
         const run = Engine.replay(flight, axis, { ...settings, ...changes }), p = run.updates.p00;
         return { ...numbers(axis, run), run, sigma: Math.sqrt(p.toSorted()[p.length >> 1]),
-          from: (other) => {
+          rmsDifference: (other) => {
             const { time } = run.steps, from = time.length >> 3; // without the initial transient
             return Engine.rmse(run.steps.p.subarray(from), Engine.stateAt(other.run, time).p.subarray(from)) ?? 0;
           } };

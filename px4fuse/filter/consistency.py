@@ -12,16 +12,17 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 from px4fuse.arrays import Array
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
 
-# underconfident: the reported σ is too large; overconfident: too small
+# "underconfident": the reported σ is too large; "overconfident": the reported σ is too small
 Verdict = Literal["consistent", "underconfident", "overconfident"]
 
 # With fewer innovations the 95 % band of the mean NIS is wider than 0.3 to 2.1
 MIN_INNOVATIONS = 10
-CONFIDENCE = 0.95
+CONFIDENCE_LEVEL = 0.95
 LJUNG_BOX_LAGS = 10
-# Factor of √S below which there is no finding: R is a rule of thumb, and tracks hardly change
-SIGMA_FACTOR_FINDING = 1.25
-GATE_SIGMA = 5.0  # √S; default of EKF2_EVP_GATE, for KF and for logs without a gate
+# Ratio of reported to actual σ (or its inverse) below which there is no finding: R is a rule of
+# thumb, and tracks hardly change
+MIN_FINDING_SIGMA_FACTOR = 1.25
+DEFAULT_GATE = 5.0  # √S; default of EKF2_EVP_GATE, for KF and for logs without a gate
 
 
 class NisVerdict(Record, frozen=True, kw_only=True):
@@ -48,7 +49,7 @@ class NisVerdict(Record, frozen=True, kw_only=True):
 
     @property
     def sigma_error_factor(self) -> float:
-        """Factor between reported and actual σ, at least 1; ``verdict`` gives the direction."""
+        """Factor between reported and actual σ, at least 1; ``verdict`` names the larger σ."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
@@ -101,14 +102,22 @@ def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
     >>> round(2 * low, 2), round(2 * high, 2)
     (1.67, 2.36)
     """
-    freedom = count * dimensions
-    low = 2.0 * float(gammaincinv(freedom / 2.0, (1 - CONFIDENCE) / 2)) / freedom
-    high = 2.0 * float(gammaincinv(freedom / 2.0, (1 + CONFIDENCE) / 2)) / freedom
+    degrees_of_freedom = count * dimensions
+    low = (
+        2.0
+        * float(gammaincinv(degrees_of_freedom / 2.0, (1 - CONFIDENCE_LEVEL) / 2))
+        / degrees_of_freedom
+    )
+    high = (
+        2.0
+        * float(gammaincinv(degrees_of_freedom / 2.0, (1 + CONFIDENCE_LEVEL) / 2))
+        / degrees_of_freedom
+    )
     return low, high
 
 
 def classify_mean_nis(nis_mean: float, band: tuple[float, float]) -> Verdict:
-    """Return the two-sided verdict on a mean NIS."""
+    """Return the verdict on a mean NIS with its 95 % band."""
     if nis_mean < band[0]:
         return "underconfident"
     if nis_mean > band[1]:
@@ -128,18 +137,20 @@ def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
 
 
 def autocorrelation(values: Array, lags: int) -> Array:
-    """Return the autocorrelation of a series at lags 1 to ``lags``, without mean removal.
+    """Return the autocorrelation of a series at lags 1 to ``lags``, without subtracting the mean.
 
-    r(l) = Σ ν(k) ν(k+l) / Σ ν(k)²; the bias has a separate test.
+    r(l) = Σ ν(k) ν(k+l) / Σ ν(k)². The mean has a separate test.
     """
-    power = float(np.dot(values, values))
-    return np.array([np.dot(values[:-lag], values[lag:]) / power for lag in range(1, lags + 1)])
+    square_sum = float(np.dot(values, values))
+    return np.array(
+        [np.dot(values[:-lag], values[lag:]) / square_sum for lag in range(1, lags + 1)]
+    )
 
 
 def assess(
-    innovation_m: Array, innovation_variance_m2: Array, gate: float = GATE_SIGMA
+    innovation_m: Array, innovation_variance_m2: Array, gate: float = DEFAULT_GATE
 ) -> Consistency | Unavailable:
-    """Test innovations against the variances that their filter reports.
+    """Test innovations against the innovation variances that the filter reports.
 
     Parameters
     ----------
@@ -155,37 +166,39 @@ def assess(
     Consistency, or Unavailable with fewer than ten finite innovations.
     """
     is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
-    nu, s = innovation_m[is_usable], innovation_variance_m2[is_usable]
-    count = len(nu)
+    nu_m, variance_m2 = innovation_m[is_usable], innovation_variance_m2[is_usable]
+    count = len(nu_m)
     if count < MIN_INNOVATIONS:
         return Unavailable(
             "consistency test",
             f"only {count} innovations (at least {MIN_INNOVATIONS} are needed)",
             "Analyse a longer segment, or log the source at a higher rate.",
         )
-    if np.ptp(nu) == 0.0:
+    if np.ptp(nu_m) == 0.0:
         return Unavailable(
             "consistency test",
             "all innovations have the same value",
             "Check the position source; then analyse a longer segment.",
         )
-    normalised = nu / np.sqrt(s)
-    std = float(np.std(nu, ddof=1))
-    bias_t = float(np.sqrt(count) * np.mean(nu) / std)
+    normalised = nu_m / np.sqrt(variance_m2)
+    std_m = float(np.std(nu_m, ddof=1))
+    bias_t = float(np.sqrt(count) * np.mean(nu_m) / std_m)
     lags = min(LJUNG_BOX_LAGS, count // 5)
-    r = autocorrelation(normalised, lags)
-    q = count * (count + 2) * float(np.sum(r**2 / (count - np.arange(1, lags + 1))))
+    correlations = autocorrelation(normalised, lags)
+    ljung_box_q = (
+        count * (count + 2) * float(np.sum(correlations**2 / (count - np.arange(1, lags + 1))))
+    )
     return Consistency(
         **_verdict_fields(normalised**2),
-        innovation_mean_m=float(np.mean(nu)),
-        innovation_std_m=std,
-        sqrt_s_median_m=float(np.median(np.sqrt(s))),
+        innovation_mean_m=float(np.mean(nu_m)),
+        innovation_std_m=std_m,
+        sqrt_s_median_m=float(np.median(np.sqrt(variance_m2))),
         fraction_outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
         fraction_outside_gate=float(np.mean(np.abs(normalised) > gate)),
         bias_t=bias_t,
         bias_p=float(2.0 * stdtr(count - 1, -abs(bias_t))),
-        lag1_autocorrelation=float(r[0]),
-        ljung_box_p=float(chdtrc(lags, q)),
+        lag1_autocorrelation=float(correlations[0]),
+        ljung_box_p=float(chdtrc(lags, ljung_box_q)),
         ljung_box_lags=lags,
     )
 
@@ -193,7 +206,7 @@ def assess(
 def assess_horizontal(
     north: tuple[Array, Array], east: tuple[Array, Array]
 ) -> HorizontalNis | None:
-    """Test north and east together; their innovations have the same timestamps.
+    """Test the innovations of north and east together, which have the same timestamps.
 
     Parameters
     ----------

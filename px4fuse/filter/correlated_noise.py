@@ -1,7 +1,7 @@
 """Time correlation of the source's errors: a low pass, or time-correlated noise.
 
-All models are compared by the likelihood of the same positions over the motion from the IMU, with
-biases, tilt and scale factor error marginalised (:mod:`px4fuse.filter.imu_motion`), and each with
+All models are compared by the likelihood of the same positions given the motion from the IMU, with
+biases, tilt and scale factor error marginalised (:mod:`px4fuse.filter.imu_motion`). Each model has
 its own maximum-likelihood noises. The SIGMA_A of KF is not used: it covers the biases and would
 hide slow errors.
 
@@ -11,13 +11,13 @@ gives positions with white noise and without lag. So the likelihood of z is that
 Jacobian Π 1/(1 - ρ) of the inversion.
 
 Time-correlated noise of first order, c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w, is a third state in the
-measurement: z = p + c + v. It is correlated, too, but does not lag. Both models use the timestamps
-as they are; time-correlated noise is also fitted with the estimated time offset, the other
-explanation of a lag.
+measurement: z = p + c + v. It correlates the noise, too, but without a lag. Both models use the
+logged timestamps. Time-correlated noise is also fitted with the estimated time offset, which is the
+other explanation of a lag.
 
 Noise with a time constant much above a second cannot be distinguished from an IMU error, so such a
-τ is a lower bound. If ground truth is available, the errors themselves are used: by their
-likelihood after removal of the effects of a rotated, shifted or scaled frame and of late timestamps
+τ is a lower bound. If ground truth is available, τ is fitted to the errors of the positions. Their
+likelihood excludes the effects of a rotated, shifted or scaled frame and of late timestamps
 (restricted likelihood, Patterson and Thompson 1971).
 """
 
@@ -40,48 +40,48 @@ from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
-# Longer flights: only the middle is used, to limit the time
+# Of longer flights only the middle is used, to limit the computing time
 MAX_MEASUREMENTS = 2000
-# Intervals beyond this many median ones: correlation across them is negligible
+# Number of median intervals; correlation across longer intervals is negligible
 MAX_INTERVAL_RATIO = 3.0
-# Coarse search for time-correlated noise: τ, its share of the variance SIGMA_Z², and factors on
-# SIGMA_A and on all noises
-COARSE_TAUS_S, COARSE_SHARES, COARSE_SIGMA_A_FACTORS = (
+# Coarse search for time-correlated noise: τ, share of the variance SIGMA_Z² that is correlated, and
+# factors on SIGMA_A and on all noises
+COARSE_TAUS_S, COARSE_VARIANCE_SHARES, COARSE_SIGMA_A_FACTORS = (
     (0.2, 0.6, 2.0, 6.0),
     (0.12, 0.35, 0.8),
     (0.4, 0.9),
 )
 COARSE_SCALES = np.geomspace(0.7, 1.6, 12)
 COARSE_MEASUREMENTS = 1000
-# Log-likelihood gain that the coarse search needs before the full fit, and that the fit needs
+# Minimum gain of log-likelihood over white noise in the coarse search, and in the full fit
 MIN_COARSE_GAIN_NATS, MIN_GAIN_NATS = 0.5, 2.0
-# Penalty for time-correlated noise with a time offset compared with a low pass: 1 for each of its
-# two further parameters (Akaike 1974)
+# Penalty of time-correlated noise with a time offset compared with a low pass: 1 for each of the
+# two additional parameters (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
 # Range of the low pass's time constant, and tolerance in ln τ
 LOW_PASS_TAU_S, LOG_TAU_TOLERANCE = (0.02, 3.0), 0.05
-# With ground truth: limit of the measurements, required gain (likelihood ratio 150 for two more
-# parameters), and s to the next sample (error of the interpolation at 2 m/s²: 1 cm)
+# With ground truth: limit of the measurements, minimum gain (likelihood ratio 150 for two more
+# parameters), and largest distance to a sample (s; interpolation error at 2 m/s²: 1 cm)
 MAX_TRUTH_MEASUREMENTS, MIN_TRUTH_GAIN_NATS, MAX_TRUTH_DISTANCE_S = 300, 5.0, 0.1
-# Parts of the flight with a separate time offset
-OFFSET_PART_COUNT = 12
+# Number of parts of the flight with a separate time offset
+OFFSET_PARTS = 12
 # Grid of time constants and variance shares with ground truth
 TRUTH_TAUS_S, TRUTH_SHARES = np.geomspace(0.3, 80.0, 17), np.linspace(0.05, 0.999, 20)
 
 
 @dataclass(frozen=True)
 class SourceLowPass:
-    """Low pass of the position source.
+    """Low-pass filter of the position source.
 
     Attributes
     ----------
     correlation : float
         Correlation of the noise of successive positions; 0 without a low pass.
     lag_s : float
-        Lag behind a steady motion, Δt ρ / (1 - ρ): the time constant minus about half an
-        interval.
+        Lag of the positions during steady motion, Δt ρ / (1 - ρ): the time constant minus about
+        half an interval.
     gain_nats : float
-        Log-likelihood gain over white noise (timestamps unchanged or shifted).
+        Gain of log-likelihood over white noise (timestamps unchanged or shifted).
     sigma_z_m : float
         White noise of a position before the low pass.
     """
@@ -101,15 +101,15 @@ class TimeCorrelatedNoise:
     tau_s : float
         Correlation time.
     low_s, high_s : float
-        95 % interval of the correlation time; from the IMU only a lower bound, then ``high_s`` is
-        infinite.
+        95 % interval of the correlation time. A fit to the IMU gives only a lower bound;
+        ``high_s`` is then infinite.
     slow_m, white_m : float
-        Standard deviations of both parts, per axis.
+        Standard deviations of time-correlated and white noise, per axis.
     gain_nats : float
-        Log-likelihood gain over white noise alone.
+        Gain of log-likelihood over white noise alone.
     lag_nats : float
-        Further gain of a low pass, which lags; plus :data:`OFFSET_PENALTY_NATS` if the
-        time-correlated noise is fitted with a time offset.
+        Further gain of a low-pass filter, which delays the positions; plus
+        :data:`OFFSET_PENALTY_NATS` if the time-correlated noise is fitted with a time offset.
     """
 
     tau_s: float
@@ -126,7 +126,7 @@ class TimeCorrelatedNoise:
         return self.slow_m**2 / (self.slow_m**2 + self.white_m**2)
 
 
-def time_correlation_fit(
+def fit_time_correlation(
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
@@ -146,64 +146,71 @@ def time_correlation_fit(
     settings : Settings
         Its ``dt_s`` defines the unit of SIGMA_A.
     noises : Noises
-        Initial values: estimates for white noise.
+        Initial values: estimates with white noise.
     outlier_time_s : ndarray
         Timestamps of measurements to exclude.
     clock_offset_s : float
-        Estimated time offset with white noise.
+        Time offset that was estimated with white noise.
     jumps : sequence of Jump
         Steps of the source along these axes, to be subtracted.
     """
-    time = axes[0].measurement_time_s
-    if len(time) < MIN_MEASUREMENTS:
-        return too_few_measurements("time-correlated errors", len(time), MIN_MEASUREMENTS)
-    first_row = max(0, (len(time) - MAX_MEASUREMENTS) // 2)
+    time_s = axes[0].measurement_time_s
+    if len(time_s) < MIN_MEASUREMENTS:
+        return too_few_measurements("time-correlated errors", len(time_s), MIN_MEASUREMENTS)
+    first_row = max(0, (len(time_s) - MAX_MEASUREMENTS) // 2)
     rows = slice(first_row, first_row + MAX_MEASUREMENTS)
-    time, measured_m = time[rows], np.column_stack([axis.measurement_m[rows] for axis in axes])
+    time_s, measured_m = time_s[rows], np.column_stack([axis.measurement_m[rows] for axis in axes])
     for jump in jumps:
         measured_m = measured_m - np.outer(
-            time >= jump.time_s, [step.value for step in jump.step_m]
+            time_s >= jump.time_s, [step.value for step in jump.step_m]
         )
-    interval, is_outlier = np.diff(time, prepend=time[0]), np.isin(time, outlier_time_s)
-    is_short_interval = (interval < MAX_INTERVAL_RATIO * np.median(interval[1:])) & (interval > 0.0)
+    interval_s, is_outlier = np.diff(time_s, prepend=time_s[0]), np.isin(time_s, outlier_time_s)
+    is_short_interval = (interval_s < MAX_INTERVAL_RATIO * np.median(interval_s[1:])) & (
+        interval_s > 0.0
+    )
     directions, signals = np.array([axis.direction for axis in axes]), SignalCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
         """Invert a low pass; return the positions and the Jacobian's contribution to -ln p."""
         rho = (
-            np.where(is_short_interval, np.exp(-interval / tau_s), 0.0)
+            np.where(is_short_interval, np.exp(-interval_s / tau_s), 0.0)
             if tau_s
-            else np.zeros(len(time))
+            else np.zeros(len(time_s))
         )
         previous_m = np.concatenate([measured_m[:1], measured_m[:-1]])
-        unfiltered = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
-        # the inversion spreads an outlier to the next position: exclude both from all models
-        is_good = ~(is_outlier | (is_short_interval & np.concatenate([[False], is_outlier[:-1]])))
+        unfiltered_m = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
+        # the inversion spreads an outlier to the next position, so all models exclude both
+        is_used_position = ~(
+            is_outlier | (is_short_interval & np.concatenate([[False], is_outlier[:-1]]))
+        )
         prepared_motion = prepare_motion(
             flight,
-            time[is_good],
-            unfiltered[is_good],
+            time_s[is_used_position],
+            unfiltered_m[is_used_position],
             directions=directions,
             dt_s=settings.dt_s,
             signals=signals,
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
-        # the first position of a stretch is not predicted, so it has no likelihood
-        is_used = np.isin(time, np.delete(prepared_motion.time_s, prepared_motion.edges[:-1]))
+        # the first position of a segment is not predicted, so it has no likelihood
+        is_used = np.isin(time_s, np.delete(prepared_motion.time_s, prepared_motion.edges[:-1]))
         return prepared_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
     prepared_motion, _ = undo_low_pass(0.0)
     if isinstance(prepared_motion, Unavailable):
         return prepared_motion
     offsets = sorted({0.0, clock_offset_s})
-    sigma, coarse_motion = noises.sigma_z_m, prepared_motion.downsample(COARSE_MEASUREMENTS)
-    low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma)
+    sigma_z_m, coarse_motion = noises.sigma_z_m, prepared_motion.downsample(COARSE_MEASUREMENTS)
+    low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
     correlated_noises = [
         replace(
-            noises, sigma_z_m=sigma * (1.0 - share) ** 0.5, slow_m=sigma * share**0.5, tau_s=tau
+            noises,
+            sigma_z_m=sigma_z_m * (1.0 - share) ** 0.5,
+            correlated_sigma_m=sigma_z_m * share**0.5,
+            tau_s=tau,
         )
-        for share, tau in product(COARSE_SHARES, COARSE_TAUS_S)
+        for share, tau in product(COARSE_VARIANCE_SHARES, COARSE_TAUS_S)
     ]
     (white_score, _), (correlated_score, correlated_start) = (
         _best_of_grid(coarse_motion, offsets, candidates)
@@ -225,28 +232,27 @@ def time_correlation_fit(
         white_fit.noises,
         _score_of_fit(correlated_fit),
     )
-    # time-correlated noise explains much of a low pass, too
+    # time-correlated noise explains much of the effect of a low pass, so it is tested first
     if white_full_score - correlated_score < MIN_GAIN_NATS:
         return low_pass, no_correlation
 
-    def unfiltered(log_tau: float) -> tuple[float, Noises]:
+    def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        assert not isinstance(
-            prepared_motion, Unavailable
-        )  # the same measurements were available above
-        correlated_score = _fit_noises_at(prepared_motion, 0.0, white_noises)
-        return _score_of_fit(correlated_score) + jacobian_term, correlated_score.noises
+        # the same measurements were available above
+        assert not isinstance(prepared_motion, Unavailable)
+        fit = _fit_noises_at(prepared_motion, 0.0, white_noises)
+        return _score_of_fit(fit) + jacobian_term, fit.noises
 
     low, high = np.log(LOW_PASS_TAU_S).tolist()
     log_tau = minimize_scalar(
-        lambda offset: unfiltered(offset)[0],
+        lambda log_tau: fit_low_pass(log_tau)[0],
         bounds=(low, high),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
-    (score, filtered_noises), tau_s = unfiltered(log_tau), float(np.exp(log_tau))
+    (score, filtered_noises), tau_s = fit_low_pass(log_tau), float(np.exp(log_tau))
     if score < white_full_score:
-        correlation = float(np.exp(-np.median(np.diff(time)) / tau_s))
-        lag_s = float(np.median(np.diff(time))) * correlation / (1.0 - correlation)
+        correlation = float(np.exp(-np.median(np.diff(time_s)) / tau_s))
+        lag_s = float(np.median(np.diff(time_s))) * correlation / (1.0 - correlation)
         low_pass = SourceLowPass(
             correlation, lag_s, white_full_score - score, filtered_noises.sigma_z_m
         )
@@ -254,13 +260,13 @@ def time_correlation_fit(
         correlated_fit.noises,
         correlated_score - score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
-    sizes = (
-        fitted_noises.slow_m,
+    values = (
+        fitted_noises.correlated_sigma_m,
         fitted_noises.sigma_z_m,
         white_full_score - correlated_score,
         lag_nats,
     )
-    return low_pass, TimeCorrelatedNoise(fitted_noises.tau_s, fitted_noises.tau_s, np.inf, *sizes)
+    return low_pass, TimeCorrelatedNoise(fitted_noises.tau_s, fitted_noises.tau_s, np.inf, *values)
 
 
 def fit_time_correlation_to_truth(
@@ -269,24 +275,27 @@ def fit_time_correlation_to_truth(
     outlier_time_s: Array,
     clock_offset_s: float,
     jumps: Sequence[Jump],
-    by_imu: TimeCorrelatedNoise | Unavailable,
+    imu_fit: TimeCorrelatedNoise | Unavailable,
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the errors against ground truth.
 
-    Return ``by_imu`` if that has the larger gain or ground truth is insufficient.
+    Return ``imu_fit`` if it has the larger gain or the ground truth is insufficient.
 
     Parameters
     ----------
     axes, outlier_time_s, clock_offset_s, jumps
-        See :func:`time_correlation_fit`.
+        See :func:`fit_time_correlation`.
     truths : sequence of DataFrame
         True ``position_m`` along each axis.
-    by_imu : TimeCorrelatedNoise or Unavailable
-        Result of :func:`time_correlation_fit`, which also gives the lag.
+    imu_fit : TimeCorrelatedNoise or Unavailable
+        Result of :func:`fit_time_correlation`; its ``lag_nats`` is kept.
     """
     min_gain, lag_nats = MIN_TRUTH_GAIN_NATS, 0.0
-    if isinstance(by_imu, TimeCorrelatedNoise):
-        min_gain, lag_nats = max(MIN_TRUTH_GAIN_NATS, by_imu.gain_nats), by_imu.lag_nats
+    if isinstance(imu_fit, TimeCorrelatedNoise):
+        min_gain, lag_nats = (
+            max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats),
+            imu_fit.lag_nats,
+        )
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     time = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     time = time[
@@ -294,38 +303,39 @@ def fit_time_correlation_to_truth(
     ]
     time = time[:: max(1, -(-len(time) // MAX_TRUTH_MEASUREMENTS))]
     if len(time) < MIN_MEASUREMENTS:
-        return by_imu
+        return imu_fit
     measured_m = np.transpose([a.measurement_m[np.isin(a.measurement_time_s, time)] for a in axes])
     track = CubicSpline(true_track.index, true_track)
-    true_m, speed = (track(time + clock_offset_s, order) for order in (0, 1))
-    part_index = np.eye(OFFSET_PART_COUNT)[OFFSET_PART_COUNT * np.arange(len(time)) // len(time)]
-    offset_columns = np.einsum("tp,ta->tpa", part_index, speed).reshape(len(time), -1)
+    true_m, velocity = (track(time + clock_offset_s, order) for order in (0, 1))
+    part_indicators = np.eye(OFFSET_PARTS)[OFFSET_PARTS * np.arange(len(time)) // len(time)]
+    offset_columns = np.einsum("tp,ta->tpa", part_indicators, velocity).reshape(len(time), -1)
     jump_columns = unit_steps(time, [jump.time_s for jump in jumps])
     nuisance_columns = np.column_stack([np.ones_like(time), true_m, offset_columns, jump_columns])
     residual_basis = np.linalg.qr(nuisance_columns, mode="complete")[0][
         :, nuisance_columns.shape[1] :
     ]
-    residuals, share, grid_scores = residual_basis.T @ (measured_m - true_m), TRUTH_SHARES, []
-    half = 0.5 * np.array([len(axes), len(residuals)])
+    residuals, shares, grid_scores = residual_basis.T @ (measured_m - true_m), TRUTH_SHARES, []
+    half_counts = 0.5 * np.array([len(axes), len(residuals)])
     for tau in TRUTH_TAUS_S:
         correlation = (
             residual_basis.T @ np.exp(-np.abs(time[:, None] - time) / tau) @ residual_basis
         )
         eigenvalues, eigenvectors = np.linalg.eigh(correlation)
-        variance = 1.0 - share + share * eigenvalues[:, None]
-        square = ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / variance) / len(residuals)
-        score = half @ [np.log(variance).sum(axis=0), np.log(square).sum(axis=0)]
-        grid_scores.append((score, square.mean(axis=0)))
-    score, square = np.transpose(grid_scores, (1, 0, 2))  # shape (time constants, shares)
-    tau_index, share_index = divmod(int(np.argmin(score)), len(share))
-    gain = half[1] * np.log(np.mean(residuals**2, axis=0)).sum() - score.min(axis=1)
+        variance = 1.0 - shares + shares * eigenvalues[:, None]
+        mean_square = ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / variance) / len(residuals)
+        score = half_counts @ [np.log(variance).sum(axis=0), np.log(mean_square).sum(axis=0)]
+        grid_scores.append((score, mean_square.mean(axis=0)))
+    score, mean_square = np.transpose(grid_scores, (1, 0, 2))  # shape (time constants, shares)
+    tau_index, share_index = divmod(int(np.argmin(score)), len(shares))
+    gain = half_counts[1] * np.log(np.mean(residuals**2, axis=0)).sum() - score.min(axis=1)
     if gain.max() < min_gain:
-        return by_imu
+        return imu_fit
     first_tau, last_tau = np.flatnonzero(gain > gain.max() - PROFILE_DROP)[[0, -1]]
     # the ends of the interval are between grid points
     tau_s = np.append(TRUTH_TAUS_S, np.inf)[[tau_index, max(first_tau - 1, 0), last_tau + 1]]
     sizes_m = np.sqrt(
-        square[tau_index, share_index] * np.array([share[share_index], 1.0 - share[share_index]])
+        mean_square[tau_index, share_index]
+        * np.array([shares[share_index], 1.0 - shares[share_index]])
     )
     return TimeCorrelatedNoise(*np.concatenate([tau_s, sizes_m, [gain.max(), lag_nats]]).tolist())
 
@@ -345,15 +355,18 @@ def _score_of_fit(fit: NoiseFit) -> float:
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidates: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p of some noises with scaled SIGMA_A and common scale, and them."""
+    """Return the lowest -ln p over candidates with scaled noises, and the noises with that score.
+
+    SIGMA_A and then all noises together are scaled.
+    """
     results = []
     for positions in map(prepared_motion.at, offsets_s):
         for candidate, factor in product(candidates, COARSE_SIGMA_A_FACTORS):
             noises = replace(candidate, sigma_a_m_s2=factor * candidate.sigma_a_m_s2)
-            totals = fit_noises([positions], noises, prepared_motion.weight).totals(COARSE_SCALES)[
+            totals = fit_noises([positions], noises, prepared_motion.weight).scores(COARSE_SCALES)[
                 :, 0
             ]
             results.append((float(totals.min()), float(COARSE_SCALES[np.argmin(totals)]), noises))
     lowest_score, scale, noises = min(results, key=lambda result: result[0])
-    sizes = {name: value * scale for name, value in vars(noises).items() if name != "tau_s"}
-    return lowest_score, replace(noises, **sizes)
+    scaled_values = {name: value * scale for name, value in vars(noises).items() if name != "tau_s"}
+    return lowest_score, replace(noises, **scaled_values)

@@ -1,10 +1,10 @@
 """Maximum-likelihood noises of positions, SIGMA_A and SIGMA_Z, and the outliers.
 
 The innovations of a filter with correct noises are white and have the expected variance; these
-noises maximise their likelihood (Schweppe 1965). A share of the measurements may be from a normal
-distribution that is many times wider (Tukey 1960). Its share, its width and the outliers are
-estimated by expectation maximisation, with one decision for all axes of a sample, from the error
-given *all* data.
+noises maximise their likelihood (Schweppe 1965). Outliers are measurements from a normal
+distribution that is many times wider (Tukey 1960). Expectation maximisation estimates the share of
+outliers, their width (σ of outliers over SIGMA_Z) and the probability that a measurement is an
+outlier. This probability uses the errors of all axes of a measurement given all data.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,26 +28,26 @@ from px4fuse.filter.marginal_likelihood import (
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
 SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
-# From 1 mm, better than any positioning system
+# The lower end is better than any positioning system
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
-WALK_SEARCH_M = (1e-4, 1.0)
-SLOW_SEARCH_M, SLOW_SEARCH_S = (1e-3, 10.0), (0.05, 60.0)
-MAX_PASSES = 12
-# Iterations of the maximisation: final, and while the outliers still change
-MAX_STEPS, ROUGH_MAX_STEPS = 50, 3
-# Minimum ratio of the outliers' σ to SIGMA_Z: a smaller one cannot be distinguished
-MIN_WIDTH = 3.0
-FIRST_SHARE, FIRST_WIDTH, MAX_SHARE = 0.005, 10.0, 0.4
+RANDOM_WALK_SEARCH_M = (1e-4, 1.0)
+CORRELATED_SIGMA_SEARCH_M, CORRELATION_TIME_SEARCH_S = (1e-3, 10.0), (0.05, 60.0)
+MAX_OUTLIER_ITERATIONS = 12
+# Iterations of the maximisation in the last run, and while the outliers still change
+MAX_STEPS, COARSE_MAX_STEPS = 50, 3
+# Ratio of the outliers' σ to SIGMA_Z; outliers with a smaller ratio cannot be distinguished
+MIN_OUTLIER_WIDTH = 3.0
+START_OUTLIER_SHARE, START_OUTLIER_WIDTH, MAX_OUTLIER_SHARE = 0.005, 10.0, 0.4
 # Upper limit of SIGMA_Z relative to its estimate from the median square
-MAX_SIGMA_RATIO = 1.2
+MAX_SIGMA_Z_RATIO = 1.2
 MAX_PROBABILITY_CHANGE = 0.01
 # -ln p per measurement if it cannot be computed; larger than any computed value
 UNCOMPUTABLE_SCORE = 1e6
 # Step in ln σ for derivatives
-SLOPE_STEP = 1e-4
+DERIVATIVE_LOG_STEP = 1e-4
 # Interpolation nodes and their distance in ln σ; fewer while the outliers still change
-NODES, ROUGH_NODES = (10, 0.25), (6, 0.2)
-# 1/m² and s²/m²; precision of a known initial state: 1 µm
+NODES, COARSE_NODES = (10, 0.25), (6, 0.2)
+# 1/m² and s²/m²; precision of a known initial state (1 µm, 1 µm/s)
 KNOWN_START_PRECISION = 1e12
 
 
@@ -59,36 +59,36 @@ class Noises:
     ----------
     sigma_a_m_s2, sigma_z_m : float
         Noise of the acceleration (as KF's SIGMA_A) and of each measurement.
-    walk_m : float
+    random_walk_m : float
         Random walk of the source (m/√s); 0 for a source that does not drift.
-    slow_m, tau_s : float
+    correlated_sigma_m, tau_s : float
         Standard deviation and time constant of the source's time-correlated noise; 0 for none.
     """
 
     sigma_a_m_s2: float
     sigma_z_m: float
-    walk_m: float = 0.0
-    slow_m: float = 0.0
+    random_walk_m: float = 0.0
+    correlated_sigma_m: float = 0.0
     tau_s: float = 0.0
 
 
 # Search ranges by field of Noises
-SEARCHES = {
+SEARCH_RANGES = {
     "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2,
     "sigma_z_m": SIGMA_Z_SEARCH_M,
-    "walk_m": WALK_SEARCH_M,
-    "slow_m": SLOW_SEARCH_M,
-    "tau_s": SLOW_SEARCH_S,
+    "random_walk_m": RANDOM_WALK_SEARCH_M,
+    "correlated_sigma_m": CORRELATED_SIGMA_SEARCH_M,
+    "tau_s": CORRELATION_TIME_SEARCH_S,
 }
 
 
 class Likelihood:
     """-ln p of the measurements (without a constant) as a function of the noises.
 
-    With acceleration and measurement noise only, all but a scale depends smoothly on their ratio.
-    So -ln p is computed on demand at nodes of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z, and interpolated
-    with polynomials. Singularities of the likelihood are π/2 from the real axis, so the
-    interpolation error is at the level of rounding.
+    With acceleration and measurement noise only, -ln p is a smooth function of
+    ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z. It is computed on demand at nodes and interpolated with
+    polynomials. Its singularities are π/2 from the real axis, so the interpolation error is at the
+    level of rounding.
 
     Parameters
     ----------
@@ -96,8 +96,8 @@ class Likelihood:
         With one time offset.
     weight : ndarray, shape (m,)
     sigma_z_m : float
-        Approximate value; the limits for a known or unknown initial state scale with it.
-    rough : bool
+        Approximate SIGMA_Z, to which the limits for a known or unknown initial state are relative.
+    is_coarse : bool
         True if an approximate maximum is enough.
     """
 
@@ -106,14 +106,14 @@ class Likelihood:
         axis_positions: Sequence[Positions],
         weight: Array,
         sigma_z_m: float,
-        rough: bool = False,
+        is_coarse: bool = False,
     ) -> None:
         self.axis_positions, self.weight, self.sigma_z_m = axis_positions, weight, sigma_z_m
-        self.tabulated = not any(positions.noise_fixed.any() for positions in axis_positions)
-        self.nodes, self.step = nodes, step = ROUGH_NODES if rough else NODES
+        self.is_tabulated = not any(positions.noise_fixed.any() for positions in axis_positions)
+        self.nodes, self.step = nodes, step = COARSE_NODES if is_coarse else NODES
 
         @cache
-        def fits(ratio_index: int) -> list[FittedPositions]:
+        def fits_at_ratio(ratio_index: int) -> list[FittedPositions]:
             ratio = float(np.exp(step * ratio_index))
             return [
                 fit_ratios([positions], [ratio], 0.0, weight, sigma_z_m)[0]
@@ -121,29 +121,29 @@ class Likelihood:
             ]
 
         @cache
-        def row(ratio_index: int, z_index: int) -> Array:
+        def scores_at_ratio(ratio_index: int, z_index: int) -> Array:
             scales = np.exp(step * (z_index + np.arange(nodes)))
-            totals = [fitted_part.totals(scales)[:, 0] for fitted_part in fits(ratio_index)]
+            totals = [axis_fit.scores(scales)[:, 0] for axis_fit in fits_at_ratio(ratio_index)]
             return np.asarray(np.sum(totals, axis=0))
 
         @cache
-        def values(ratio_index: int, z_index: int) -> Array:
-            """Return -ln p at all nodes from the first ones on."""
-            return np.array([row(ratio_index + node, z_index) for node in range(nodes)])
+        def scores_at_nodes(ratio_index: int, z_index: int) -> Array:
+            """Return -ln p at all nodes, beginning with the given indices."""
+            return np.array([scores_at_ratio(ratio_index + node, z_index) for node in range(nodes)])
 
-        self._values = values
+        self._scores_at_nodes = scores_at_nodes
 
     def __call__(self, noises: Noises) -> float:
-        """Return -ln p for some noises."""
-        if noises.walk_m or noises.slow_m or not self.tabulated:
+        """Return -ln p for given noises."""
+        if noises.random_walk_m or noises.correlated_sigma_m or not self.is_tabulated:
             return negative_log_likelihood(self.axis_positions, noises, self.weight)
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
         node_offset = (self.nodes - 1) // 2
-        first, first_z = floor(ln_ratio) - node_offset, floor(ln_z) - node_offset
-        ratio_weights = _interpolation_weights(ln_ratio - first, self.nodes)
+        first_ratio, first_z = floor(ln_ratio) - node_offset, floor(ln_z) - node_offset
+        ratio_weights = _interpolation_weights(ln_ratio - first_ratio, self.nodes)
         z_weights = _interpolation_weights(ln_z - first_z, self.nodes)
-        return float(ratio_weights @ self._values(first, first_z) @ z_weights)
+        return float(ratio_weights @ self._scores_at_nodes(first_ratio, first_z) @ z_weights)
 
 
 @cache
@@ -153,7 +153,7 @@ def _barycentric_signs(count: int) -> Array:
 
 
 def _interpolation_weights(position: float, count: int) -> Array:
-    """Return barycentric weights of values at 0, 1, ... (Berrut and Trefethen 2004)."""
+    """Return barycentric weights of the values at 0, 1, ... (Berrut and Trefethen 2004)."""
     distances = position - np.arange(count)
     if not distances.all():
         return np.asarray(distances == 0.0, dtype=np.float64)
@@ -162,45 +162,52 @@ def _interpolation_weights(position: float, count: int) -> Array:
 
 
 def fit_ratios(
-    blocks: Iterable[Positions],
+    position_batches: Iterable[Positions],
     ratios: Sequence[float],
-    walk: float,
+    random_walk: float,
     weight: Array,
     sigma_z_m: float,
 ) -> list[FittedPositions]:
-    """Fit positions for some ratios SIGMA_A / SIGMA_Z; fixed noises are scaled by SIGMA_Z.
+    """Fit positions for given ratios SIGMA_A / SIGMA_Z, with all noises in units of SIGMA_Z.
 
     Parameters
     ----------
-    blocks : iterable of Positions
+    position_batches : iterable of Positions
         The same positions with different time offsets.
     ratios : sequence of float
         SIGMA_A / SIGMA_Z, 1/s².
-    walk : float
-        Random walk of the source / SIGMA_Z.
+    random_walk : float
+        Random walk of the source / SIGMA_Z, per √s.
     weight : ndarray, shape (m,)
     sigma_z_m : float
     """
-    scaled_blocks = (positions.over(sigma_z_m, walk, weight) for positions in blocks)
-    fits_by_block = [
-        [fit_positions(scaled_block, ratio, variance_m2) for ratio in ratios]
-        for scaled_block, variance_m2 in scaled_blocks
+    scaled_batches = (
+        positions.in_sigma_z_units(sigma_z_m, random_walk, weight) for positions in position_batches
+    )
+    fits_by_batch = [
+        [fit_positions(scaled_positions, ratio, variance_m2) for ratio in ratios]
+        for scaled_positions, variance_m2 in scaled_batches
     ]
     return [
         replace(
-            block_fits[0], gram=np.concatenate([block_fit.gram for block_fit in block_fits], axis=1)
+            batch_fits[0], gram=np.concatenate([batch_fit.gram for batch_fit in batch_fits], axis=1)
         )
-        for block_fits in zip(*fits_by_block, strict=True)
+        for batch_fits in zip(*fits_by_batch, strict=True)
     ]
 
 
-def fit_noises(blocks: Iterable[Positions], noises: Noises, weight: Array) -> FittedPositions:
+def fit_noises(
+    position_batches: Iterable[Positions], noises: Noises, weight: Array
+) -> FittedPositions:
     """Fit positions with given noises and weights."""
     sigma = noises.sigma_z_m
-    ratio, walk = noises.sigma_a_m_s2 / sigma, noises.walk_m / sigma
-    if noises.slow_m:
-        blocks = (replace(positions, slow=(noises.slow_m, noises.tau_s)) for positions in blocks)
-    return fit_ratios(blocks, [ratio], walk, weight, sigma)[0].scaled(sigma)
+    ratio, random_walk = noises.sigma_a_m_s2 / sigma, noises.random_walk_m / sigma
+    if noises.correlated_sigma_m:
+        position_batches = (
+            replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
+            for positions in position_batches
+        )
+    return fit_ratios(position_batches, [ratio], random_walk, weight, sigma)[0].scaled(sigma)
 
 
 def negative_log_likelihood(
@@ -208,7 +215,7 @@ def negative_log_likelihood(
 ) -> float:
     """Return -ln p of the measurements of all axes, without a constant."""
     return float(
-        sum(fit_noises([positions], noises, weight).totals()[0, 0] for positions in axis_positions)
+        sum(fit_noises([positions], noises, weight).scores()[0, 0] for positions in axis_positions)
     )
 
 
@@ -225,38 +232,38 @@ class NoiseFit:
         Probability that the measurement is an outlier.
     score : Likelihood
         With these weights.
-    widening : float
-        Factor on the variance of ln SIGMA_Z from the curvature: outliers, their share and their
-        width are estimated, too.
+    sigma_z_variance_factor : float
+        Factor on the variance of ln SIGMA_Z from the curvature of the likelihood, because the
+        outliers are estimated, too.
     """
 
     noises: Noises
     weight: Array
     outlier_probability: Array
     score: Likelihood
-    widening: float
+    sigma_z_variance_factor: float
 
 
 def filter_positions(intervals: Preintegrated) -> Positions:
-    """Return KF along one axis as positions: its constants are the errors of the initial state."""
+    """Return the input of KF as positions; the constants are the errors of KF's initial state."""
     count = len(intervals.measurement_m)
-    initial = np.zeros((count + 1, 2))
-    initial[0] = KNOWN_START_PRECISION
-    measured = np.concatenate([[np.nan], intervals.measurement_m - intervals.initial.position_m])[
+    prior_precision = np.zeros((count + 1, 2))
+    prior_precision[0] = KNOWN_START_PRECISION
+    measured_m = np.concatenate([[np.nan], intervals.measurement_m - intervals.initial.position_m])[
         :, None
     ]
     dp, dv = np.zeros((2, 1, 1, 3, count))
     dp[0, 0, 0], dv[0, 0, 0] = intervals.delta_position_m, intervals.delta_velocity_m_s
-    # an error of the initial state affects the first interval
+    # an error of the initial state acts as an increment in the first interval
     dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, intervals.length_s[0]), 1.0
     return centre_on_path(
         Positions(
-            measurement_m=measured,
-            start=np.array([0]),
+            measurement_m=measured_m,
+            segment_starts=np.array([0]),
             length_s=intervals.length_s,
             noise_unit=intervals.noise_unit.T,
             noise_fixed=intervals.noise_fixed.T,
-            initial=initial,
+            prior_precision=prior_precision,
             constant_sigma=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
             delta_position_m=dp,
             delta_velocity_m_s=dv,
@@ -274,33 +281,35 @@ def maximise_likelihood(
     axis_positions : sequence of Positions
         With the same measurements.
     start : Noises
-        Initial values. Random walk and time-correlated noise are fitted if not zero.
+        Initial values. Random walk and time-correlated noise are only fitted if not zero.
     weight : ndarray, shape (m,)
         Initial weight of each measurement.
     outliers : bool
-        True to estimate the outliers; else the weights are kept.
+        True to estimate the outliers; False to keep the weights.
     """
     outlier_probability = np.zeros_like(weight)
-    share, width, noises = FIRST_SHARE, FIRST_WIDTH, start
-    for pass_index in range(MAX_PASSES if outliers else 0):
-        likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, rough=True)
-        noises = _maximise(likelihood, noises, ROUGH_MAX_STEPS if pass_index else MAX_STEPS)
-        square, count = _squares(axis_positions, noises, weight)
-        # outliers increase the noise estimate and hide; the median is robust against them
+    share, width, noises = START_OUTLIER_SHARE, START_OUTLIER_WIDTH, start
+    for iteration in range(MAX_OUTLIER_ITERATIONS if outliers else 0):
+        likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, is_coarse=True)
+        noises = _maximise_by_gradient(
+            likelihood, noises, COARSE_MAX_STEPS if iteration else MAX_STEPS
+        )
+        square, count = _expected_squares_of_axes(axis_positions, noises, weight)
+        # outliers increase the estimated noise, which hides them; the median is robust
         median_square = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
         if (
             median_square > SIGMA_Z_SEARCH_M[1] ** 2
         ):  # noise beyond the search range is not due to outliers
             break
-        variance = min(noises.sigma_z_m**2, MAX_SIGMA_RATIO**2 * median_square)
+        variance = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
         probability = _outlier_probability(square / variance, count, share, width)
         if probability.sum() < 1.0 and probability.max() < 0.5 and not outlier_probability.any():
             break
-        share = float(np.clip(probability.mean(), 0.5 / len(probability), MAX_SHARE))
+        share = float(np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_SHARE))
         square_width = (
             float(np.sum(probability * square) / max(np.sum(probability * count), 1e-9)) / variance
         )
-        width = max(MIN_WIDTH, float(np.sqrt(square_width)))
+        width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(square_width)))
         weight = 1.0 - probability * (1.0 - width**-2.0)
         is_settled = bool(
             np.max(np.abs(probability - outlier_probability)) < MAX_PROBABILITY_CHANGE
@@ -310,25 +319,25 @@ def maximise_likelihood(
             break
         noises = replace(noises, sigma_z_m=float(np.sqrt(variance)))
     likelihood = Likelihood(axis_positions, weight, start.sigma_z_m)
-    noises = _maximise(likelihood, noises)
-    widening = 1.0
+    noises = _maximise_by_gradient(likelihood, noises)
+    sigma_z_variance_factor = 1.0
     if outlier_probability.any():
-        square, count = _squares(axis_positions, noises, weight)
-        widening = outlier_variance_factor(
+        square, count = _expected_squares_of_axes(axis_positions, noises, weight)
+        sigma_z_variance_factor = outlier_variance_factor(
             square / noises.sigma_z_m**2, count, outlier_probability, width
         )
-    return NoiseFit(noises, weight, outlier_probability, likelihood, widening)
+    return NoiseFit(noises, weight, outlier_probability, likelihood, sigma_z_variance_factor)
 
 
-def _squares(
+def _expected_squares_of_axes(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> tuple[Array, Array]:
-    """Return :func:`expected_squares` summed over axes, with maximum-likelihood constants."""
+    """Return :func:`expected_squares` summed over axes, at the maximum-likelihood constants."""
     results = []
     for positions in axis_positions:
         constants = fit_noises([positions], noises, weight).constants()[:, 0]
-        scaled_positions, variance = positions.over(
-            1.0, noises.walk_m, weight / noises.sigma_z_m**2
+        scaled_positions, variance = positions.in_sigma_z_units(
+            1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
         )
         results.append(expected_squares(scaled_positions, noises.sigma_a_m_s2, variance, constants))
     square, count = np.sum(results, axis=0)[:, -len(weight) :]
@@ -343,11 +352,11 @@ def _outlier_probability(square: Array, count: Array, share: float, width: float
 def outlier_variance_factor(
     square: Array, count: Array, outlier_probability: Array, width: float
 ) -> float:
-    """Return the ratio of the variance of ln σ to that with known outliers.
+    """Return the ratio of the variance of ln σ to its variance if the outliers were known.
 
-    The information of the data is that of the complete data (each measurement known as outlier or
-    not) minus the missing information: the covariance of the score over the possible assignments
-    (Louis 1982). Parameters are ln σ, ln width and the log odds of the share.
+    The information with known outliers minus the missing information is the information of the data
+    (Louis 1982). The missing information is the covariance of the score over the possible sets of
+    outliers. Parameters are ln σ, ln width and the log odds of the share of outliers.
 
     Parameters
     ----------
@@ -381,19 +390,21 @@ def outlier_variance_factor(
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = complete_information - missing_information
-    # with hardly any outlier, their estimation adds no uncertainty
+    # with hardly any outlier the estimate of the outliers adds no uncertainty
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
     return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))
 
 
-def _maximise(likelihood: Likelihood, start: Noises, max_steps: int = MAX_STEPS) -> Noises:
+def _maximise_by_gradient(
+    likelihood: Likelihood, start: Noises, max_steps: int = MAX_STEPS
+) -> Noises:
     values = {name: value for name, value in vars(start).items() if value}
-    bounds = np.log([SEARCHES[name] for name in values])
+    bounds = np.log([SEARCH_RANGES[name] for name in values])
     count = len(likelihood.weight)
 
-    def score(logs: Array) -> float:
-        # per measurement, so that the first step of L-BFGS-B is at most about 1
+    def score_per_measurement(logs: Array) -> float:
+        # -ln p per measurement limits the first step of L-BFGS-B to about 1
         try:
             return likelihood(to_noises(logs)) / count
         except (
@@ -405,10 +416,10 @@ def _maximise(likelihood: Likelihood, start: Noises, max_steps: int = MAX_STEPS)
         return Noises(**dict(zip(values, np.exp(logs).tolist(), strict=True)))
 
     result = minimize(
-        score,
+        score_per_measurement,
         np.clip(np.log([*values.values()]), *bounds.T),
         method="L-BFGS-B",
         bounds=bounds.tolist(),
-        options={"eps": SLOPE_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": max_steps},
+        options={"eps": DERIVATIVE_LOG_STEP, "ftol": 1e-10, "gtol": 1e-8, "maxiter": max_steps},
     )
     return to_noises(result.x)

@@ -1,13 +1,13 @@
 """Biases, scale factor error and jumps that explain the innovations better than noise.
 
-The filter is linear: a known signal added to the measurements or to the acceleration adds the
-filter's response to the innovations. Each hypothesis is therefore a column, the response of the
-innovations to its unit. Generalised least squares (whitened by √S) gives its size,
-its standard deviation and its likelihood (generalised likelihood ratio, Willsky and Jones 1976).
-Effects that could be confused with it are fitted too: constant accelerometer biases, a rotation of
-the frame, and a slow acceleration error as caused by tilt.
+KF is linear: a signal added to the measurements or to the acceleration adds the response of KF to
+the innovations. Each hypothesis is therefore a column of a design matrix: the response of the
+innovations to an error of size 1. Generalised least squares (whitened by √S) gives the size of the
+error, its standard deviation and its likelihood (generalised likelihood ratio, Willsky and Jones
+1976). Effects that could be confused with each other are fitted together: constant accelerometer
+biases, a rotation of the frame, and a slow acceleration error as caused by tilt.
 
-A scale factor also multiplies the noise of the acceleration, which would bias its regression
+A scale factor also multiplies the noise of the acceleration, which would bias the regression
 (errors in variables). So the residuals are weighted with their variance at each scale (Deming
 1943).
 """
@@ -43,17 +43,17 @@ from px4fuse.notebook_display import one_line_repr
 
 ANALYSIS_NAME = "causes beyond noise"
 MIN_MEASUREMENTS = 50
-# rad RMS, and s: slow error of the logged attitude, and spacing of its independent values
+# Slow error of the logged attitude (rad, RMS), and spacing (s) of its independent values
 TILT_SIGMA_RAD = 0.002
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
-# Factors on KF's SIGMA_A: without biases and tilt, less acceleration noise remains
+# Factors on KF's SIGMA_A; less acceleration noise remains after biases and tilt are fitted
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Limit of the number of times at which a step is tested
-MAX_STEP_TIMES = 800
+MAX_TESTED_TIMES = 800
 # Step times per batch; limits the memory of the responses
 STEP_BATCH_SIZE = 200
 # s; measurements in this time after a step are ignored, so that a burst of outliers is not a step
@@ -61,9 +61,10 @@ OUTLIER_BURST_S = 1.0
 # s; outliers in this time after a step are tested again as measurements after the step
 OUTLIERS_AFTER_STEP_S = 6.0
 # Probability of a detected step in a flight without one
-STEP_FALSE_ALARM_P = 1e-3
-# Probability that a good measurement near a step is taken for an outlier; tested step times
-FALSE_OUTLIER_P, MAX_TRIED_TIMES = 1e-3, 6
+MAX_STEP_FALSE_ALARM_P = 1e-3
+# Probability that a good measurement near a step is taken for an outlier, and number of times that
+# are tested for a step
+MAX_FALSE_OUTLIER_P, MAX_CANDIDATE_TIMES = 1e-3, 6
 MAX_JUMPS = 3
 MIN_BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
 MIN_BIAS_SIGMAS = 4.0  # false alarm probability 6e-5
@@ -81,7 +82,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Jump:
-    """Lasting step of the source: time (s), size along each axis (m), and its χ²."""
+    """Lasting step of the source: time (s), size along each axis (m), and χ² of the step."""
 
     time_s: float
     step_m: tuple[Estimate, ...]
@@ -100,7 +101,8 @@ class BiasScaleJumpFit:
     Attributes
     ----------
     forward_bias, right_bias : Estimate
-        Accelerometer bias (m/s²), body axes. At constant heading a constant tilt is equivalent.
+        Accelerometer bias (m/s²), body axes. At constant heading a constant tilt has the same
+        effect.
     rotation : Estimate
         Rotation of the source's frame relative to the attitude (rad, clockwise from above),
         fitted together with the biases.
@@ -108,7 +110,7 @@ class BiasScaleJumpFit:
         Ratio of the source's distances to the IMU's distances, minus 1.
     jumps : tuple of Jump
     sigma_a_m_s2 : float
-        Remaining white noise of the acceleration.
+        White noise of the acceleration after the fit.
     """
 
     forward_bias: Estimate
@@ -122,7 +124,7 @@ class BiasScaleJumpFit:
 
     @property
     def bias(self) -> Estimate:
-        """Magnitude of both biases together (m/s²)."""
+        """Magnitude of the horizontal accelerometer bias (m/s²)."""
         forward, right = self.forward_bias, self.right_bias
         return Estimate(
             math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
@@ -134,7 +136,7 @@ class BiasScaleJumpFit:
         return self.bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * self.bias.sigma)
 
 
-def bias_scale_jump_fit(
+def fit_bias_scale_jumps(
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
@@ -150,7 +152,7 @@ def bias_scale_jump_fit(
     ----------
     flight : Flight
     axes : tuple of Axis
-        Horizontal, with the same measurement times.
+        Horizontal axes with the same measurement times.
     settings : Settings
         Its ``dt_s`` defines the unit of SIGMA_A.
     sigma_a_m_s2, sigma_z_m : float
@@ -164,29 +166,31 @@ def bias_scale_jump_fit(
     -------
     BiasScaleJumpFit, or Unavailable without acceleration or with too few measurements.
     """
-    model = make_design_matrix(flight, axes, settings, sigma_z_m, clock_offset_s)
-    if isinstance(model, Unavailable):
-        return model
-    skip = np.isin(axes[0].measurement_time_s[-len(model.time_s) :], outlier_time_s)
-    if (count := int(np.count_nonzero(~skip))) < MIN_MEASUREMENTS:
+    design = make_design_matrix(flight, axes, settings, sigma_z_m, clock_offset_s)
+    if isinstance(design, Unavailable):
+        return design
+    is_skipped = np.isin(axes[0].measurement_time_s[-len(design.time_s) :], outlier_time_s)
+    if (count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
         return too_few_measurements(ANALYSIS_NAME, count, MIN_MEASUREMENTS)
     sigma_a_grid = sigma_a_m_s2 * SIGMA_A_FACTORS
-    sigma_a, fit = _fit_sigma_a(model, sigma_a_grid, skip)
-    jumps, skip = _find_jumps(model, sigma_a, skip)
+    sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
+    jumps, is_skipped = _find_jumps(design, sigma_a, is_skipped)
     if jumps:
-        model = replace(
-            model, step_columns=unit_steps(model.time_s, [jump.time_s for jump in jumps])
+        design = replace(
+            design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
-        sigma_a, fit = _fit_sigma_a(model, sigma_a_grid, skip)
-    forward, right, turn = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
-    return BiasScaleJumpFit(forward, right, turn, _fit_scale(model, sigma_a, skip), jumps, sigma_a)
+        sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
+    forward, right, rotation = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
+    return BiasScaleJumpFit(
+        forward, right, rotation, _fit_scale(design, sigma_a, is_skipped), jumps, sigma_a
+    )
 
 
 def _fit_sigma_a(
-    model: DesignMatrix, sigma_a_grid: Array, skip: BoolArray
+    design: DesignMatrix, sigma_a_grid: Array, is_skipped: BoolArray
 ) -> tuple[float, DesignFit]:
     """Return the maximum-likelihood SIGMA_A of a grid, and the fit with it."""
-    fit_at = cache(lambda index: model.fit(float(sigma_a_grid[index]), skip))
+    fit_at = cache(lambda index: design.fit(float(sigma_a_grid[index]), is_skipped))
     best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
     return float(sigma_a_grid[best_index]), fit_at(best_index)
 
@@ -200,56 +204,67 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
     return index
 
 
-def _fit_scale(model: DesignMatrix, sigma_a: float, skip: BoolArray) -> Estimate:
+def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
     """Estimate the scale factor error from the likelihood on a grid, corrected for rotation."""
-    fit_at = cache(lambda at: model.fit(sigma_a, skip, float(SCALE_GRID[at])))
-    # without ln S: it grows with the scale and would bias the estimate towards zero
-    lowest_index = _index_of_minimum(lambda at: fit_at(at).square_sum, len(SCALE_GRID))
-    at = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
-    scores = np.array([fit_at(neighbour).square_sum / 2.0 for neighbour in (at - 1, at, at + 1)])
-    shift, curvature = parabola_vertex(scores, 1)
+    fit_at = cache(
+        lambda grid_index: design.fit(sigma_a, is_skipped, float(SCALE_GRID[grid_index]))
+    )
+    # ln S is omitted: it grows with the scale and would bias the estimate towards zero
+    lowest_index = _index_of_minimum(
+        lambda grid_index: fit_at(grid_index).square_sum, len(SCALE_GRID)
+    )
+    grid_index = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
+    scores = np.array(
+        [
+            fit_at(neighbour).square_sum / 2.0
+            for neighbour in (grid_index - 1, grid_index, grid_index + 1)
+        ]
+    )
+    vertex_shift, curvature = parabola_vertex(scores, 1)
     step = float(SCALE_GRID[1] - SCALE_GRID[0])
     if curvature <= 0.0:
         return Estimate(0.0, float("inf"))
-    scale = SCALE_GRID[at] + float(np.clip(shift, -1.5, 1.5)) * step
-    sigma = step / np.sqrt(curvature) * max(fit_at(at).residual_rms, 1.0)
-    rotation_factor = np.hypot(1.0, fit_at(at).coefficients[ROTATION])
+    scale = SCALE_GRID[grid_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * step
+    sigma = step / np.sqrt(curvature) * max(fit_at(grid_index).residual_rms, 1.0)
+    rotation_factor = np.hypot(1.0, fit_at(grid_index).coefficients[ROTATION])
     return Estimate(float(scale * rotation_factor - 1.0), float(sigma))
 
 
 def _find_jumps(
-    model: DesignMatrix, sigma_a: float, skip: BoolArray
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray
 ) -> tuple[tuple[Jump, ...], BoolArray]:
-    """Detect lasting jumps of the source; return them in time order, and the outliers.
+    """Detect lasting jumps of the source; return the jumps in time order, and an outlier mask.
 
-    Candidate times are from a scan over all times and from the starts of outlier runs, since a jump
-    begins with one. Each is tested without the measurements of the next second, so that a burst of
-    outliers is not a jump. The exact time, on which the size depends, is found last.
+    Candidate times are from a scan over all times and from the starts of outlier runs, because the
+    first measurements after a jump look like outliers. Each candidate is tested without the
+    measurements of the next second, so that a burst of outliers is not a jump. The exact time, on
+    which the size depends, is determined last.
     """
     jumps: list[Jump] = []
     for _ in range(MAX_JUMPS):
-        model = replace(
-            model, step_columns=unit_steps(model.time_s, [jump.time_s for jump in jumps])
+        design = replace(
+            design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
-        outlier_run_starts = model.time_s[
-            np.flatnonzero(skip & ~np.concatenate([[False], skip[:-1]]))
+        outlier_run_starts = design.time_s[
+            np.flatnonzero(is_skipped & ~np.concatenate([[False], is_skipped[:-1]]))
         ]
         candidate_times = [
-            *_significant_step_times(model, sigma_a, skip, outlier_run_starts),
-            *_significant_step_times(model, sigma_a, skip)[:1],
+            *_significant_step_times(design, sigma_a, is_skipped, outlier_run_starts),
+            *_significant_step_times(design, sigma_a, is_skipped)[:1],
         ]
-        chance = STEP_FALSE_ALARM_P / max(len(outlier_run_starts), 1)
+        false_alarm_p = MAX_STEP_FALSE_ALARM_P / max(len(outlier_run_starts), 1)
         candidates = [
-            _test_step(model, sigma_a, skip, time_s, chance) for time_s in candidate_times
+            _test_step(design, sigma_a, is_skipped, time_s, false_alarm_p)
+            for time_s in candidate_times
         ]
         significant = [jump for jump in candidates if jump is not None]
         if not significant:
             break
-        best_jump, skip = _locate_jump(
-            model, sigma_a, skip, max(significant, key=lambda jump: jump.chi_square)
+        best_jump, is_skipped = _locate_jump(
+            design, sigma_a, is_skipped, max(significant, key=lambda jump: jump.chi_square)
         )
         jumps.append(best_jump)
-    return tuple(sorted(jumps, key=lambda jump: jump.time_s)), skip
+    return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
 
 
 def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
@@ -257,97 +272,107 @@ def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
 
 
 def _significant_step_times(
-    model: DesignMatrix, sigma_a: float, skip: BoolArray, times: Array | None = None
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array | None = None
 ) -> list[float]:
-    """Return the times of significant steps, largest χ² first; default: all times."""
+    """Return the significant step times of ``times`` (by default all), largest χ² first."""
     if times is None:
-        times = model.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
-        times = times[:: max(1, -(-len(times) // MAX_STEP_TIMES))]
+        times = design.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
+        times = times[:: max(1, -(-len(times) // MAX_TESTED_TIMES))]
     if not len(times):
         return []
-    chi_square = _step_chi_squares(model, sigma_a, skip, times)
-    threshold = chdtri(len(model.intervals), STEP_FALSE_ALARM_P / len(model.time_s))
+    chi_square = _step_chi_squares(design, sigma_a, is_skipped, times)
+    threshold = chdtri(len(design.intervals), MAX_STEP_FALSE_ALARM_P / len(design.time_s))
     order = np.argsort(-chi_square)
     return [float(times[index]) for index in order if chi_square[index] >= threshold]
 
 
-def _step_chi_squares(model: DesignMatrix, sigma_a: float, skip: BoolArray, times: Array) -> Array:
-    """Compute χ² of a step at each time: the reduction of the squares, summed over axes."""
-    data, columns, log_s = model.whitened_design(sigma_a, skip)
-    base_fit = model.regress(data, columns, log_s, skip)
+def _step_chi_squares(
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array
+) -> Array:
+    """Compute χ² of a step at each time: reduction of the residual squares, summed over axes."""
+    data, columns, log_s_sum = design.whitened_design(sigma_a, is_skipped)
+    base_fit = design.regress(data, columns, log_s_sum, is_skipped)
     chi_square = np.zeros(len(times))
     for batch in np.array_split(np.arange(len(times)), -(-len(times) // STEP_BATCH_SIZE)):
-        step_signals = unit_steps(model.time_s, times[batch])
-        for axis, intervals in enumerate(model.intervals):
-            if axis in (axis_group[0] for axis_group in model.axis_groups):
+        step_signals = unit_steps(design.time_s, times[batch])
+        for axis, intervals in enumerate(design.intervals):
+            if axis in (axis_group[0] for axis_group in design.axis_groups):
                 zero_signal = np.broadcast_to(0.0, step_signals.shape)
                 step_interval = _replace_signals(intervals, zero_signal, zero_signal, step_signals)
-                response = model.whitened(step_interval, sigma_a, skip)[0][~skip]
+                step_response = design.whitened(step_interval, sigma_a, is_skipped)[0][~is_skipped]
             residual, cross_product = (
                 base_fit.residual[base_fit.axis == axis],
-                columns[axis][~skip].T @ response,
+                columns[axis][~is_skipped].T @ step_response,
             )
-            information = np.sum(response**2, axis=0) - np.sum(
+            information = np.sum(step_response**2, axis=0) - np.sum(
                 cross_product * (base_fit.covariance @ cross_product), axis=0
             )
-            chi_square[batch] += (residual @ response / base_fit.axis_rms[axis]) ** 2 / np.maximum(
-                information, 1e-9
-            )
+            chi_square[batch] += (
+                residual @ step_response / base_fit.axis_rms[axis]
+            ) ** 2 / np.maximum(information, 1e-9)
     return chi_square
 
 
 def _locate_jump(
-    model: DesignMatrix, sigma_a: float, skip: BoolArray, jump: Jump
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """Find the exact time of a jump near its candidate; return it with size and outliers."""
-    is_near = np.abs(model.time_s - jump.time_s) <= OUTLIER_BURST_S
-    # without the uncertain interval, later measurements that agree with the step are not outliers
-    chi_square = model.with_step(jump.time_s)[0].residual_squares(sigma_a, skip | is_near)
-    is_after = is_near | _is_in_window(model.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
-    skip = np.where(
-        is_after & ~is_near, chi_square > chdtri(len(model.intervals), FALSE_OUTLIER_P), skip
+    """Find the exact time and size of a jump near its candidate time; return also the outliers."""
+    is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
+    # measurements close to the step are excluded; later ones that fit the step are not outliers
+    chi_square = design.with_step(jump.time_s)[0].residual_squares(sigma_a, is_skipped | is_near)
+    is_after = is_near | _is_in_window(design.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
+    is_skipped = np.where(
+        is_after & ~is_near,
+        chi_square > chdtri(len(design.intervals), MAX_FALSE_OUTLIER_P),
+        is_skipped,
     )
-    times = model.time_s[is_near]
-    best_indices = np.argsort(-_step_chi_squares(model, sigma_a, skip & ~is_near, times))[
-        :MAX_TRIED_TIMES
+    times = design.time_s[is_near]
+    best_indices = np.argsort(-_step_chi_squares(design, sigma_a, is_skipped & ~is_near, times))[
+        :MAX_CANDIDATE_TIMES
     ]
-    placements = []
+    candidates = []
     for candidate_s in times[best_indices].tolist():
-        chi_square = model.with_step(candidate_s)[0].residual_squares(sigma_a, skip | is_near)
-        placements.append(
+        chi_square = design.with_step(candidate_s)[0].residual_squares(
+            sigma_a, is_skipped | is_near
+        )
+        candidates.append(
             (
                 candidate_s,
-                np.where(is_near, chi_square > chdtri(len(model.intervals), FALSE_OUTLIER_P), skip),
+                np.where(
+                    is_near,
+                    chi_square > chdtri(len(design.intervals), MAX_FALSE_OUTLIER_P),
+                    is_skipped,
+                ),
             )
         )
-    # an outlier near a step looks like a step; the true time leaves the fewest outliers
-    time_s, skip = min(placements, key=lambda placement: np.count_nonzero(placement[1]))
-    stepped_model, columns = model.with_step(time_s)
-    design_fit = stepped_model.fit(sigma_a, skip)
+    # an outlier near a step looks like a step, so the time with the fewest outliers is chosen
+    time_s, is_skipped = min(candidates, key=lambda candidate: np.count_nonzero(candidate[1]))
+    stepped_design, columns = design.with_step(time_s)
+    design_fit = stepped_design.fit(sigma_a, is_skipped)
     step_m = tuple(design_fit.estimate(int(column)) for column in columns)
-    return replace(jump, time_s=time_s, step_m=step_m), skip
+    return replace(jump, time_s=time_s, step_m=step_m), is_skipped
 
 
 def _test_step(
-    model: DesignMatrix, sigma_a: float, skip: BoolArray, time_s: float, chance: float
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
-    """Return the jump at a time if it is significant without the next second, else None."""
-    skip_with_burst = skip | _is_in_window(model.time_s, time_s, OUTLIER_BURST_S)
-    model, columns = model.with_step(time_s)
-    count_before = np.count_nonzero(~skip_with_burst & (model.time_s < time_s))
+    """Return the jump at a time if it is significant without the data of the next second."""
+    is_skipped_with_burst = is_skipped | _is_in_window(design.time_s, time_s, OUTLIER_BURST_S)
+    design, columns = design.with_step(time_s)
+    count_before = np.count_nonzero(~is_skipped_with_burst & (design.time_s < time_s))
     if (
-        min(count_before, np.count_nonzero(~skip_with_burst & (model.time_s >= time_s)))
+        min(count_before, np.count_nonzero(~is_skipped_with_burst & (design.time_s >= time_s)))
         < MIN_SIDE_MEASUREMENTS
     ):
         return None
-    design_fit = model.fit(sigma_a, skip_with_burst)
+    design_fit = design.fit(sigma_a, is_skipped_with_burst)
     size, covariance = (
         design_fit.coefficients[columns],
         design_fit.covariance[np.ix_(columns, columns)],
     )
     size = size / design_fit.axis_rms
     chi_square = float(size @ np.linalg.solve(covariance, size))
-    if chi_square < chdtri(len(columns), chance):
+    if chi_square < chdtri(len(columns), false_alarm_p):
         return None
     return Jump(time_s, tuple(design_fit.estimate(int(column)) for column in columns), chi_square)
 
@@ -364,7 +389,7 @@ class DesignFit:
         Residual of the whitened innovations.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
     square_sum : float
-        Residual sum of squares, including the prior's term.
+        Residual sum of squares, including the term of the prior.
     score : float
         Restricted negative log-likelihood.
     residual_rms : float
@@ -386,23 +411,26 @@ class DesignFit:
         return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
-        """Return one coefficient; its σ is widened if the residual exceeds the assumed noise."""
+        """Return one coefficient with σ, which is larger if the residual exceeds the noise."""
         sigma = float(np.sqrt(self.covariance[column, column])) * max(self.residual_rms, 1.0)
         return Estimate(float(self.coefficients[column]), sigma)
 
 
 @dataclass(frozen=True)
 class DesignMatrix:
-    """Innovations of all axes and the columns that are common to all hypotheses.
+    """Innovations of all axes and the columns of all hypotheses, before whitening.
+
+    Symbols in shapes: m measurements, a axes, k columns, h hat functions, j steps.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
     intervals : tuple of Preintegrated
-        Signals of each axis: the measurements, then the effect of each constant.
+        Signals of each axis: the data, then the effect of each constant.
     hat_signals : (ndarray, ndarray), shape (m, h)
-        Position and velocity due to slow accelerations, with separate coefficients per axis.
+        Position and velocity increments by slow accelerations (hat functions of time), with
+        separate coefficients per axis.
     prior_sigma : ndarray, shape (k,)
         Prior standard deviations of the coefficients, without the steps.
     sigma_z_m : float
@@ -419,69 +447,71 @@ class DesignMatrix:
 
     def with_step(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
         """Return the design matrix with one more step, and the step's column of each axis."""
-        model = replace(
+        design = replace(
             self, step_columns=np.hstack([self.step_columns, unit_steps(self.time_s, [time_s])])
         )
-        first_step_column, count = len(self.prior_sigma), model.step_columns.shape[1]
-        return model, first_step_column + count * (1 + np.arange(len(self.intervals))) - 1
+        first_step_column, count = len(self.prior_sigma), design.step_columns.shape[1]
+        return design, first_step_column + count * (1 + np.arange(len(self.intervals))) - 1
 
     @cached_property
     def axis_groups(self) -> list[list[int]]:
-        """Axes that share a filter: all, unless gaps in the IMU affect them differently."""
-        has_same_filter = all(
+        """Groups of axes with equal filters: one group, unless IMU gaps affect axes differently."""
+        shares_filter = all(
             np.array_equal(intervals.noise_fixed, self.intervals[0].noise_fixed)
             for intervals in self.intervals
         )
         all_axes = list(range(len(self.intervals)))
-        return [all_axes] if has_same_filter else [[axis] for axis in all_axes]
+        return [all_axes] if shares_filter else [[axis] for axis in all_axes]
 
     def whitened(
-        self, intervals: Preintegrated, sigma_a: float, skip: BoolArray
+        self, intervals: Preintegrated, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
-        """Return innovations divided by √S for k signals, (m, k), and Σ ln S of those used."""
-        nu, s = innovations(intervals, sigma_a, self.sigma_z_m, skip)
+        """Return innovations divided by √S for k signals, (m, k), and Σ ln S of the fused ones."""
+        nu, s = innovations(intervals, sigma_a, self.sigma_z_m, is_skipped)
         nu /= np.sqrt(s)[:, None]
-        return nu, float(np.sum(np.log(s[~skip])))
+        return nu, float(np.sum(np.log(s[~is_skipped])))
 
-    def fit(self, sigma_a: float, skip: BoolArray, scale: float = 1.0) -> DesignFit:
-        """Fit all columns with a scale factor on the acceleration and its noise.
+    def fit(self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0) -> DesignFit:
+        """Fit all columns, with a scale factor on the acceleration and on its noise.
 
         Parameters
         ----------
         sigma_a : float
-        skip : ndarray of bool, shape (m,)
+        is_skipped : ndarray of bool, shape (m,)
             Measurements to exclude from filter and fit.
         scale : float
         """
-        return self.regress(*self.whitened_design(sigma_a, skip, scale), skip)
+        return self.regress(*self.whitened_design(sigma_a, is_skipped, scale), is_skipped)
 
-    def regress(self, data: Array, columns: Array, log_s: float, skip: BoolArray) -> DesignFit:
+    def regress(
+        self, data: Array, columns: Array, log_s_sum: float, is_skipped: BoolArray
+    ) -> DesignFit:
         """Fit the output of :meth:`whitened_design` without the skipped measurements."""
-        axis = np.repeat(np.arange(len(data)), np.count_nonzero(~skip))
-        data, columns = data[:, ~skip].ravel(), columns[:, ~skip].reshape(len(axis), -1)
+        axis = np.repeat(np.arange(len(data)), np.count_nonzero(~is_skipped))
+        data, columns = data[:, ~is_skipped].ravel(), columns[:, ~is_skipped].reshape(len(axis), -1)
         count = columns.shape[1]
         prior_sigma = np.append(self.prior_sigma, np.full(count - len(self.prior_sigma), np.inf))
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
-        # a column without excitation (rotation in hover) must not make the matrix singular
+        # the small diagonal keeps the matrix regular if a column is zero (rotation in hover)
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
         moment, factor = columns.T @ data, cho_factor(information)
         covariance = cho_solve(factor, np.eye(count))
         coefficients = covariance @ moment
         square_sum = float(data @ data - coefficients @ moment)
-        score = 0.5 * (square_sum + log_s) + float(np.sum(np.log(np.diag(factor[0]))))
+        score = 0.5 * (square_sum + log_s_sum) + float(np.sum(np.log(np.diag(factor[0]))))
         residual_rms = float(np.sqrt(max(square_sum, 0.0) / max(len(data) - CONSTANT_COUNT, 1)))
         residual = data - columns @ coefficients
         return DesignFit(axis, residual, coefficients, covariance, square_sum, score, residual_rms)
 
-    def residual_squares(self, sigma_a: float, skip: BoolArray) -> Array:
-        """Return the squared residual of every measurement over its variance, axes summed."""
-        data, columns, log_s = self.whitened_design(sigma_a, skip)
-        fit = self.regress(data, columns, log_s, skip)
+    def residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
+        """Return the squared residual of each measurement over its variance, summed over axes."""
+        data, columns, log_s_sum = self.whitened_design(sigma_a, is_skipped)
+        fit = self.regress(data, columns, log_s_sum, is_skipped)
         residual = data - columns @ fit.coefficients
         return np.asarray(np.sum(residual**2, axis=0)) / max(fit.residual_rms, 1.0) ** 2
 
     def whitened_design(
-        self, sigma_a: float, skip: BoolArray, scale: float = 1.0
+        self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
         """Return whitened innovations (a, m) and columns (a, m, k) of all axes, and Σ ln S."""
         hat_count, step_count, axes = (
@@ -489,38 +519,47 @@ class DesignMatrix:
             self.step_columns.shape[1],
             len(self.intervals),
         )
-        width = len(self.prior_sigma)
-        data = np.empty((axes, len(skip)))
-        columns = np.zeros((axes, len(skip), width + axes * step_count))
-        # scale the measured and the rotated acceleration to the source's unit of length
-        factor = np.ones(1 + CONSTANT_COUNT)
-        factor[[0, 1 + ROTATION]] = scale
-        zero_signal, log_s = np.zeros_like(self.hat_signals[0]), 0.0
+        column_count = len(self.prior_sigma)
+        data = np.empty((axes, len(is_skipped)))
+        columns = np.zeros((axes, len(is_skipped), column_count + axes * step_count))
+        # the scale multiplies the measured and the rotated acceleration
+        scale_factors = np.ones(1 + CONSTANT_COUNT)
+        scale_factors[[0, 1 + ROTATION]] = scale
+        zero_signal, log_s_sum = np.zeros_like(self.hat_signals[0]), 0.0
         for axis_group in self.axis_groups:
             intervals = [self.intervals[axis] for axis in axis_group]
-            dp = [*(factor * array.delta_position_m for array in intervals), self.hat_signals[0]]
-            dv = [*(factor * array.delta_velocity_m_s for array in intervals), self.hat_signals[1]]
+            dp = [
+                *(scale_factors * signal.delta_position_m for signal in intervals),
+                self.hat_signals[0],
+            ]
+            dv = [
+                *(scale_factors * signal.delta_velocity_m_s for signal in intervals),
+                self.hat_signals[1],
+            ]
             measurements = [
-                *(array.measurement_m for array in intervals),
+                *(signal.measurement_m for signal in intervals),
                 zero_signal,
                 self.step_columns,
             ]
-            dp, dv = ([*array, 0.0 * self.step_columns] for array in (dp, dv))
+            dp, dv = ([*signal, 0.0 * self.step_columns] for signal in (dp, dv))
             group_signals = _replace_signals(intervals[0], *map(np.hstack, (dp, dv, measurements)))
-            normalised, group_log_s = self.whitened(group_signals, scale * sigma_a, skip)
-            log_s += len(axis_group) * group_log_s
-            *axis_signals, common = np.split(
-                normalised, len(factor) * np.arange(1, 1 + len(intervals)), 1
+            normalised, group_log_s_sum = self.whitened(group_signals, scale * sigma_a, is_skipped)
+            log_s_sum += len(axis_group) * group_log_s_sum
+            *axis_signals, common_signals = np.split(
+                normalised, len(scale_factors) * np.arange(1, 1 + len(intervals)), 1
             )
             for axis, signals in zip(axis_group, axis_signals, strict=True):
                 data[axis] = signals[:, 0]
-                first_hat, first_step = CONSTANT_COUNT + hat_count * axis, width + step_count * axis
+                first_hat, first_step = (
+                    CONSTANT_COUNT + hat_count * axis,
+                    column_count + step_count * axis,
+                )
                 columns[axis][:, :CONSTANT_COUNT] = signals[:, 1:]
                 common_columns = np.r_[
                     first_hat : first_hat + hat_count, first_step : first_step + step_count
                 ]
-                columns[axis][:, common_columns] = common
-        return data, columns, log_s
+                columns[axis][:, common_columns] = common_signals
+        return data, columns, log_s_sum
 
 
 def _replace_signals(
@@ -561,50 +600,52 @@ def make_design_matrix(
             ANALYSIS_NAME, len(axes[0].measurement_time_s), MIN_MEASUREMENTS
         )
     time_s = axes[0].measurement_time_s + clock_offset_s
-    shifted = [replace(axis, measurement_time_s=time_s) for axis in axes]
+    shifted_axes = [replace(axis, measurement_time_s=time_s) for axis in axes]
     settings = replace(settings, input="imu")
-    line = make_timeline(shifted[0], settings)
-    common = _common_accelerations(attitude, acceleration)
+    timeline = make_timeline(shifted_axes[0], settings)
+    common_accelerations = _common_accelerations(attitude, acceleration)
     intervals = []
-    for axis in shifted:
+    for axis in shifted_axes:
         interval_input = preintegrate(axis, settings)
         columns = [(interval_input.delta_position_m, interval_input.delta_velocity_m_s)]
         columns += [
-            _integrate_signal(value @ axis.direction, input_time_s, line)
-            for input_time_s, value in common
+            _integrate_signal(value @ axis.direction, input_time_s, timeline)
+            for input_time_s, value in common_accelerations
         ]
         dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*columns, strict=True))
-        measured = np.zeros_like(dp)
+        measured_m = np.zeros_like(dp)
         # KF starts at the first measurement
-        measured[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
-        start = replace(interval_input.initial, position_m=0.0)
-        intervals.append(replace(_replace_signals(interval_input, dp, dv, measured), initial=start))
-    time_s = axes[0].measurement_time_s[-len(measured) :]
+        measured_m[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
+        initial = replace(interval_input.initial, position_m=0.0)
+        intervals.append(
+            replace(_replace_signals(interval_input, dp, dv, measured_m), initial=initial)
+        )
+    time_s = axes[0].measurement_time_s[-len(measured_m) :]
     hat_time_s, hat_functions = _hat_functions(
         time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s
     )
-    hat_responses = [_integrate_signal(hat, hat_time_s, line) for hat in hat_functions]
+    hat_responses = [_integrate_signal(hat, hat_time_s, timeline) for hat in hat_functions]
     position, velocity = (np.stack(arrays, axis=1) for arrays in zip(*hat_responses, strict=True))
-    tilt = np.full(len(axes) * len(hat_functions), TILT_SIGMA_RAD * constants.g)
-    prior_sigma = np.append(np.full(CONSTANT_COUNT, np.inf), tilt)
+    tilt_sigma = np.full(len(axes) * len(hat_functions), TILT_SIGMA_RAD * constants.g)
+    prior_sigma = np.append(np.full(CONSTANT_COUNT, np.inf), tilt_sigma)
     return DesignMatrix(
         time_s, tuple(intervals), (position, velocity), prior_sigma, sigma_z, unit_steps(time_s, [])
     )
 
 
 def _integrate_signal(
-    acceleration_m_s2: Array, time_s: ArrayLike, line: Timeline
+    acceleration_m_s2: Array, time_s: ArrayLike, timeline: Timeline
 ) -> tuple[Array, Array]:
     """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements."""
     time = np.asarray(time_s, dtype=np.float64)
-    velocity = np.interp(line.time_s, time, cumulative_integral(acceleration_m_s2, time))
-    return integrate_acceleration(line, np.diff(velocity) / np.diff(line.time_s))
+    velocity = np.interp(timeline.time_s, time, cumulative_integral(acceleration_m_s2, time))
+    return integrate_acceleration(timeline, np.diff(velocity) / np.diff(timeline.time_s))
 
 
 def _common_accelerations(
     attitude: pd.DataFrame, acceleration: pd.DataFrame
 ) -> list[tuple[pd.Index, Array]]:
-    """Return NED accelerations, with times: minus unit biases forward and right, and rotation."""
+    """Return times and NED accelerations of unit biases forward and right, and of a rotation."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
@@ -613,11 +654,11 @@ def _common_accelerations(
 
 
 def _hat_functions(start_s: float, end_s: float) -> tuple[Array, Array]:
-    """Return times (s) and hat functions (h, n) between knots, which model a slow signal."""
-    count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
-    time = np.linspace(start_s, end_s, 20 * (count - 1) + 1)
-    knots = np.linspace(start_s, end_s, count)
-    return time, np.array([np.interp(time, knots, weights) for weights in np.eye(count)])
+    """Return times (s) and hat functions (h, n) that interpolate a slow signal between knots."""
+    knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
+    time = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
+    knots = np.linspace(start_s, end_s, knot_count)
+    return time, np.array([np.interp(time, knots, weights) for weights in np.eye(knot_count)])
 
 
 def unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:

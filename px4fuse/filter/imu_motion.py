@@ -1,13 +1,15 @@
-"""Motion from the IMU alone, and the effect of every constant IMU error on it.
+"""Motion from the IMU alone, and the effect of every constant IMU error on the motion.
 
-The attitude is integrated from the gyroscopes, starting at the logged attitude of each stretch.
-EKF2's later attitude is not used: EKF2 corrected it with the positions to be tested, so it contains
-their delay. To first order the acceleration is linear in ten constants of each stretch: errors of
-the initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body) and
-the scale of the positions. The signal of each constant is integrated once; a time offset only
-changes the times at which the integrals are read. The signal of the scale is the acceleration of
-the smooth path, inserted by :func:`px4fuse.filter.marginal_likelihood.centre_on_path`. The IMU's
-acceleration would contain the noise to be estimated and explain much of it as scale (errors in
+A segment is a part of at most 30 s that IMU and attitude cover without a gap. The attitude is
+integrated from the gyroscopes, starting at the logged attitude of each segment. EKF2's later
+attitude is not used: EKF2 corrected it with the positions to be tested, so it contains their delay.
+
+To first order the acceleration is linear in ten constants of each segment: errors of the initial
+attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body) and the scale of
+the positions. The signal of a constant is its effect on the motion. It is integrated once; a time
+offset only changes the times at which the integrals are read. The signal of the scale is the
+acceleration of the smooth path of :func:`px4fuse.filter.marginal_likelihood.centre_on_path`. The
+acceleration of the IMU would not do: much of its noise would be explained as scale (errors in
 variables, Fuller 1987).
 """
 
@@ -27,27 +29,27 @@ from px4fuse.filter.marginal_likelihood import Positions, centre_on_path
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.trajectory.rotation import from_vector, matrix, multiply, running_product
+from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, to_matrix
 
 # Prior σ of the constants, wide for consumer sensors: tilt and heading (rad), gyro bias (rad/s),
 # accelerometer bias (m/s²), scale of the positions (1)
-CONSTANT_SIGMA = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# s; longer flights are cut, since the linearisation needs small angles: a gyro bias of 0.004
-# rad/s rotates by 0.12 rad in a stretch, with a second-order error of 0.07 m/s²
-STRETCH_S = 30.0
+CONSTANT_SIGMAS = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+# s; the linearisation needs small angles: a gyro bias of 0.004 rad/s rotates by 0.12 rad in a
+# segment, with a second-order error of 0.07 m/s²
+MAX_SEGMENT_S = 30.0
 # s; largest time offset of the search
 MAX_OFFSET_S = 0.6
 # Coarse search: number of offsets, and approximate number of measurements
-COARSE_POINTS, COARSE_MEASUREMENTS = 25, 600
+COARSE_OFFSETS, COARSE_MEASUREMENTS = 25, 600
 # Limit of the signal values per batch, and minimum number of offsets in it
-SIGNALS_PER_BATCH, MIN_OFFSETS = 2**16, 3
-# Measurements required in all stretches together, and in one
-MIN_MEASUREMENTS, MIN_STRETCH_MEASUREMENTS = 30, 15
-# Measurements required in a stretch after downsampling
+SIGNALS_PER_BATCH, MIN_BATCH_OFFSETS = 2**16, 3
+# Measurements required in all segments together, and in each segment
+MIN_MEASUREMENTS, MIN_SEGMENT_MEASUREMENTS = 30, 15
+# Measurements required in a segment after downsampling
 MIN_KEPT_MEASUREMENTS = 5
 # s; the IMU is averaged over this interval before integration
-STEP_S = 0.02
-# Prior precision of position (1/m²) and velocity (s²/m²) at the start of a stretch: negligible, but
+INTEGRATION_STEP_S = 0.02
+# Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, but
 # enough for an axis with hardly any measurement
 START_PRECISION = 1e-6, 1e-4
 # s; above this IMU interval the motion between samples is unknown
@@ -56,11 +58,11 @@ MAX_IMU_INTERVAL_S = 0.025
 
 @dataclass(frozen=True)
 class Signals:
-    """Acceleration of one stretch and of each constant, with their integrals.
+    """Motion of one segment by the IMU, and the effect of each constant on the motion.
 
     ``table`` has shape (n, 3, 3, constants): position, velocity and acceleration along each axis of
-    NED. The first column is for all constants zero; the others are the effects of each constant
-    except the scale. Each acceleration holds until the next time.
+    NED. The first column is the motion with all constants zero; the others are the effects of each
+    constant except the scale. Each acceleration holds until the next time.
     """
 
     time_s: Array
@@ -69,9 +71,9 @@ class Signals:
     def at(self, time_s: Array) -> tuple[Array, Array]:
         """Return position and velocity at other times, shape (..., 3, constants)."""
         last_index = len(self.time_s) - 1
-        at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
-        elapsed_s = (time_s - self.time_s[at])[..., None, None]
-        position, velocity, acceleration = np.moveaxis(self.table[at], -3, 0)
+        row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
+        elapsed_s = (time_s - self.time_s[row])[..., None, None]
+        position, velocity, acceleration = np.moveaxis(self.table[row], -3, 0)
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
         return position, velocity
@@ -83,27 +85,27 @@ SignalCache = dict[tuple[float, float], Signals]
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Positions of one source with the IMU's motion, in stretches, for any time offset.
+    """Positions of one source with the motion by the IMU, in segments, for any time offset.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
-        Timestamps of the measurements in stretches.
+        Timestamps of the measurements in segments.
     measurement_m : ndarray, shape (m, a)
-        Relative to the first of each stretch; NaN if missing.
+        Positions along each axis relative to the first of each segment; NaN if missing.
     weight : ndarray, shape (m,)
         Weight of each measurement.
     edges : ndarray of int, shape (s + 1,)
-        First measurement of each stretch, and their number.
+        First measurement of each segment, and the number of measurements.
     signals : tuple of Signals
-        Signals of each stretch.
+        Signals of each segment.
     directions : ndarray, shape (a, 3)
         Unit vectors in NED.
     dt_s : float
         DT, which defines the unit of SIGMA_A.
     imu_interval_s : float
     heading_sigma_rad : float
-        Prior σ of the heading at the start of a stretch.
+        Prior σ of the heading at the start of a segment.
     """
 
     time_s: Array
@@ -114,28 +116,28 @@ class PreparedMotion:
     directions: Array
     dt_s: float
     imu_interval_s: float
-    heading_sigma_rad: float = float(CONSTANT_SIGMA[2])
+    heading_sigma_rad: float = float(CONSTANT_SIGMAS[2])
 
     def downsample(self, count: int) -> PreparedMotion:
-        """Return about ``count`` of the measurements; all if no stretch keeps enough."""
+        """Return about ``count`` of the measurements; all if no segment keeps enough."""
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
         counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
-        has_enough = counts >= MIN_KEPT_MEASUREMENTS
-        if not has_enough.any():
+        keeps_enough = counts >= MIN_KEPT_MEASUREMENTS
+        if not keeps_enough.any():
             return self
-        is_kept &= np.repeat(has_enough, np.diff(self.edges))
+        is_kept &= np.repeat(keeps_enough, np.diff(self.edges))
         arrays = {
             name: getattr(self, name)[is_kept] for name in ("time_s", "measurement_m", "weight")
         }
         signals = tuple(
-            stretch_signals
-            for stretch_signals, is_good in zip(self.signals, has_enough, strict=True)
+            segment_signals
+            for segment_signals, is_good in zip(self.signals, keeps_enough, strict=True)
             if is_good
         )
-        return replace(self, **arrays, edges=np.cumsum([0, *counts[has_enough]]), signals=signals)
+        return replace(self, **arrays, edges=np.cumsum([0, *counts[keeps_enough]]), signals=signals)
 
     def positions(self, offset_s: Array) -> Positions:
-        """Return positions and increments for each time offset; the scale's signal is zero.
+        """Return positions and increments for T time offsets; the signal of the scale is zero.
 
         Parameters
         ----------
@@ -143,9 +145,9 @@ class PreparedMotion:
         """
         length_s = np.diff(self.time_s)
         noise_unit = self.dt_s * np.stack(continuous_noise_unit(length_s))
-        initial = np.zeros((len(self.time_s), 2))
-        initial[self.edges[:-1]] = START_PRECISION
-        shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMA), len(length_s)
+        prior_precision = np.zeros((len(self.time_s), 2))
+        prior_precision[self.edges[:-1]] = START_PRECISION
+        shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMAS), len(length_s)
         dp, dv = np.zeros((2, *shape))
         for begin, end, signals in zip(self.edges, self.edges[1:], self.signals, strict=False):
             time = self.time_s[begin:end]
@@ -159,50 +161,52 @@ class PreparedMotion:
             dp[rows] = np.diff(position) - velocity[..., :-1] * np.diff(time)
         return Positions(
             measurement_m=self.measurement_m,
-            start=self.edges[:-1],
+            segment_starts=self.edges[:-1],
             length_s=length_s,
             noise_unit=noise_unit,
             noise_fixed=np.zeros_like(noise_unit),
-            initial=initial,
+            prior_precision=prior_precision,
             constant_sigma=np.concatenate(
-                [CONSTANT_SIGMA[:2], [self.heading_sigma_rad], CONSTANT_SIGMA[3:]]
+                [CONSTANT_SIGMAS[:2], [self.heading_sigma_rad], CONSTANT_SIGMAS[3:]]
             ),
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
 
     def at(self, offset_s: float) -> Positions:
-        """Return positions at one time offset, relative to a smooth path, with a scale."""
-        return next(self.blocks(np.array([offset_s])))
+        """Return positions at one time offset relative to a smooth path, with scale as constant."""
+        return next(self.position_batches(np.array([offset_s])))
 
-    def blocks(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
-        """Yield positions for some time offsets in batches, with or without a scale."""
-        signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMA))
-        batch_size = max(MIN_OFFSETS, SIGNALS_PER_BATCH // signal_count)
+    def position_batches(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
+        """Yield positions for given time offsets in batches, with or without scale as constant."""
+        signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMAS))
+        batch_size = max(MIN_BATCH_OFFSETS, SIGNALS_PER_BATCH // signal_count)
         for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
             positions = self.positions(batch)
             yield centre_on_path(positions, scaled=True) if scaled else positions
 
-    def search(
+    def search_offset(
         self, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
     ) -> tuple[float, Noises]:
-        """Return the best time offset of the whole search range, and the best SIGMA_A of some.
+        """Return the time offset and the noises with the greatest likelihood on a coarse grid.
 
         Parameters
         ----------
         noises : Noises
         factors : sequence of float
-            Factors on SIGMA_A.
+            Factors on SIGMA_A that are tried.
         scaled : bool
             True if the scale of the positions is one of the constants.
         """
-        offsets = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_POINTS)
+        offsets = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
         sigma = noises.sigma_z_m
         ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
         coarse_motion = self.downsample(COARSE_MEASUREMENTS)
-        blocks = coarse_motion.blocks(offsets, scaled=scaled)
-        fits = fit_ratios(blocks, ratios, noises.walk_m / sigma, coarse_motion.weight, sigma)
-        scores = np.stack([fit.scaled(sigma).totals()[0] for fit in fits])
+        position_batches = coarse_motion.position_batches(offsets, scaled=scaled)
+        ratio_fits = fit_ratios(
+            position_batches, ratios, noises.random_walk_m / sigma, coarse_motion.weight, sigma
+        )
+        scores = np.stack([fit.scaled(sigma).scores()[0] for fit in ratio_fits])
         factor_index, offset_index = np.unravel_index(np.argmin(scores), scores.shape)
         sigma_a = noises.sigma_a_m_s2 * factors[int(factor_index)]
         return float(offsets[offset_index]), replace(noises, sigma_a_m_s2=sigma_a)
@@ -217,9 +221,9 @@ def prepare_motion(
     dt_s: float,
     weight: Array | None = None,
     signals: SignalCache | None = None,
-    heading_sigma_rad: float = float(CONSTANT_SIGMA[2]),
+    heading_sigma_rad: float = float(CONSTANT_SIGMAS[2]),
 ) -> PreparedMotion | Unavailable:
-    """Cut measurements into stretches that IMU and attitude cover without a gap.
+    """Cut measurements into segments that IMU and attitude cover without a gap.
 
     Parameters
     ----------
@@ -227,7 +231,7 @@ def prepare_motion(
     time_s : ndarray, shape (m,)
     measurement_m : ndarray, shape (m, a)
     directions, dt_s, weight, heading_sigma_rad
-        See :class:`PreparedMotion`; default weight: 1.
+        See :class:`PreparedMotion`; weights are 1 by default.
     signals : dict, optional
         Signals of this flight to reuse; new ones are added.
 
@@ -241,29 +245,29 @@ def prepare_motion(
     if isinstance(attitude, Unavailable):
         return attitude
     signals = {} if signals is None else signals
-    stretch_signals: list[Signals] = []
-    imu_time, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
-    rows_by_stretch: list[IntArray] = []
-    for begin, end in _covered_spans(imu_time, attitude_s):
-        inside_rows = np.flatnonzero(
+    segment_signals: list[Signals] = []
+    imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    rows_by_segment: list[IntArray] = []
+    for begin, end in _covered_spans(imu_s, attitude_s):
+        covered_rows = np.flatnonzero(
             (time_s >= begin + MAX_OFFSET_S) & (time_s <= end - MAX_OFFSET_S)
         )
-        if not len(inside_rows):
+        if not len(covered_rows):
             continue
-        inside_s = time_s[inside_rows]
-        count = max(1, int(np.ceil((inside_s[-1] - inside_s[0]) / STRETCH_S)))
-        cuts = np.linspace(inside_s[0], inside_s[-1], count + 1)[1:-1]
-        for stretch_rows in np.split(inside_rows, np.searchsorted(inside_s, cuts)):
-            if len(stretch_rows) >= MIN_STRETCH_MEASUREMENTS:
-                rows_by_stretch.append(stretch_rows)
+        covered_s = time_s[covered_rows]
+        count = max(1, int(np.ceil((covered_s[-1] - covered_s[0]) / MAX_SEGMENT_S)))
+        cut_times_s = np.linspace(covered_s[0], covered_s[-1], count + 1)[1:-1]
+        for segment_rows in np.split(covered_rows, np.searchsorted(covered_s, cut_times_s)):
+            if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
+                rows_by_segment.append(segment_rows)
                 span = (
-                    time_s[stretch_rows[0]] - MAX_OFFSET_S,
-                    time_s[stretch_rows[-1]] + MAX_OFFSET_S,
+                    time_s[segment_rows[0]] - MAX_OFFSET_S,
+                    time_s[segment_rows[-1]] + MAX_OFFSET_S,
                 )
                 if span not in signals:
                     signals[span] = make_signals(imu, attitude, span)
-                stretch_signals.append(signals[span])
-    used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_stretch])
+                segment_signals.append(signals[span])
+    used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_MEASUREMENTS:
         return Unavailable(
             "clock offset",
@@ -271,60 +275,60 @@ def prepare_motion(
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
-    edges = np.cumsum([0, *map(len, rows_by_stretch)])
-    # relative to the first of each stretch, whose position is unknown anyway: numbers stay small
-    measured = pd.DataFrame(measurement_m[used_rows])
-    first = measured.groupby(np.repeat(np.arange(len(rows_by_stretch)), np.diff(edges))).transform(
-        "first"
-    )
+    edges = np.cumsum([0, *map(len, rows_by_segment)])
+    # positions relative to the first of each segment are small; its position is unknown anyway
+    measured_m = pd.DataFrame(measurement_m[used_rows])
+    first_m = measured_m.groupby(
+        np.repeat(np.arange(len(rows_by_segment)), np.diff(edges))
+    ).transform("first")
     return PreparedMotion(
         time_s[used_rows],
-        (measured - first).to_numpy(),
+        (measured_m - first_m).to_numpy(),
         np.ones(len(used_rows)) if weight is None else weight[used_rows],
         edges,
-        tuple(stretch_signals),
+        tuple(segment_signals),
         directions,
         dt_s,
-        float(np.median(np.diff(imu_time))),
+        float(np.median(np.diff(imu_s))),
         heading_sigma_rad,
     )
 
 
-def _covered_spans(imu_time: Array, attitude_time: Array) -> list[tuple[float, float]]:
-    """Return the time spans that IMU and attitude cover; none if the IMU rate is too low."""
-    if len(imu_time) < 2 or np.median(np.diff(imu_time)) > MAX_IMU_INTERVAL_S:
+def _covered_spans(imu_s: Array, attitude_s: Array) -> list[tuple[float, float]]:
+    """Return the time spans (s) that IMU and attitude cover; none if the IMU rate is too low."""
+    if len(imu_s) < 2 or np.median(np.diff(imu_s)) > MAX_IMU_INTERVAL_S:
         return []
-    gaps = np.flatnonzero(imu_gaps(imu_time))
-    begins = np.maximum(imu_time[np.r_[0, gaps + 1]], attitude_time[0])
-    ends = np.minimum(imu_time[np.r_[gaps, len(imu_time) - 1]], attitude_time[-1])
+    gaps = np.flatnonzero(imu_gaps(imu_s))
+    begins = np.maximum(imu_s[np.r_[0, gaps + 1]], attitude_s[0])
+    ends = np.minimum(imu_s[np.r_[gaps, len(imu_s) - 1]], attitude_s[-1])
     return list(zip(begins.tolist(), ends.tolist(), strict=True))
 
 
 def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
-    """Compute the NED acceleration from gyroscopes, and the effect of each constant on it."""
+    """Compute the motion in NED from IMU data alone, and the effect of each constant on it."""
     time = imu.index.to_numpy()
-    first_row, last_axis = np.searchsorted(
-        time, [span[0] - 2 * STEP_S, span[1] + 2 * STEP_S], side="left"
+    first_row, end_row = np.searchsorted(
+        time, [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S], side="left"
     )
-    samples, time = imu.iloc[first_row:last_axis], time[first_row:last_axis]
+    samples, time = imu.iloc[first_row:end_row], time[first_row:end_row]
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
     integral = cumulative_integral(samples[columns].to_numpy(), time)
-    edges = np.arange(time[0], time[-1], STEP_S)
-    integrals_at_edges = np.column_stack([np.interp(edges, time, column) for column in integral.T])
-    force, angle = integrals_at_edges[:, :3], integrals_at_edges[:, 3:]
-    attitude_quaternion = _integrate_gyros(edges, angle, attitude)
-    # attitude in the middle of each step
-    mean = np.diff(force, axis=0) / STEP_S
-    body_to_ned = matrix(
+    step_times_s = np.arange(time[0], time[-1], INTEGRATION_STEP_S)
+    integrals = np.column_stack([np.interp(step_times_s, time, column) for column in integral.T])
+    force, angle = integrals[:, :3], integrals[:, 3:]
+    attitude_quaternion = _integrate_gyros(step_times_s, angle, attitude)
+    # rotation by the attitude in the middle of each step
+    mean_force = np.diff(force, axis=0) / INTEGRATION_STEP_S
+    body_to_ned = to_matrix(
         multiply(attitude_quaternion[:-1], from_vector(np.diff(angle, axis=0) / 2.0))
     )
-    force_ned = np.einsum("nij,nj->ni", body_to_ned, mean)
-    table = np.zeros((len(mean), 3, 3, len(CONSTANT_SIGMA)))
+    force_ned = np.einsum("nij,nj->ni", body_to_ned, mean_force)
+    table = np.zeros((len(mean_force), 3, 3, len(CONSTANT_SIGMAS)))
     position, velocity, acceleration = np.moveaxis(table, 1, 0)
     acceleration[:, :, 0] = force_ned
     acceleration[:, 2, 0] += constants.g
     # a small rotation θ of the attitude adds θ × f; a gyro bias b rotates it by -∫ R b dt
-    gyro_bias_rotation = -STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
+    gyro_bias_rotation = -INTEGRATION_STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
         next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3
         acceleration[:, next_axis, 1 + axis] = -force_ned[:, last_axis]
@@ -332,21 +336,26 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
         acceleration[:, axis, 4:7] = gyro_bias_rotation[:, next_axis] * force_ned[:, [last_axis]]
         acceleration[:, axis, 4:7] -= gyro_bias_rotation[:, last_axis] * force_ned[:, [next_axis]]
     acceleration[:, :, 7:10] = -body_to_ned
-    np.cumsum(acceleration[:-1] * STEP_S, axis=0, out=velocity[1:])
-    mean_velocity = velocity[:-1] + acceleration[:-1] * (STEP_S / 2.0)
-    np.cumsum(mean_velocity * STEP_S, axis=0, out=position[1:])
-    return Signals(edges[:-1], table)
+    np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
+    mean_velocity = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
+    np.cumsum(mean_velocity * INTEGRATION_STEP_S, axis=0, out=position[1:])
+    return Signals(step_times_s[:-1], table)
 
 
-def _integrate_gyros(edges: Array, angle: Array, attitude: pd.DataFrame) -> Array:
-    """Integrate the gyroscopes to an attitude (body to NED, w first) from a logged start."""
+def _integrate_gyros(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:
+    """Integrate the gyroscopes to an attitude (body to NED, w first) from the logged attitude.
+
+    ``angle`` is the integral of the angular rate (rad).
+    """
     attitude_s = attitude.index.to_numpy()
     near_rows = slice(
-        *np.clip(np.searchsorted(attitude_s, edges[0]) + np.array([-2, 3]), 0, len(attitude_s))
+        *np.clip(
+            np.searchsorted(attitude_s, step_times_s[0]) + np.array([-2, 3]), 0, len(attitude_s)
+        )
     )
-    logged = attitude.iloc[near_rows][Columns.QUATERNION].to_numpy(copy=True)
-    at_start = np.clip(edges[0], attitude_s[near_rows][0], attitude_s[near_rows][-1])
-    slerp = Slerp(attitude_s[near_rows], Rotation.from_quat(logged, scalar_first=True))
-    start = slerp(at_start).as_quat(scalar_first=True)
-    rotation_since_start = running_product(from_vector(np.diff(angle, axis=0)))
-    return np.vstack([start, multiply(start, rotation_since_start)])
+    logged_quaternions = attitude.iloc[near_rows][Columns.QUATERNION].to_numpy(copy=True)
+    start_s = np.clip(step_times_s[0], attitude_s[near_rows][0], attitude_s[near_rows][-1])
+    slerp = Slerp(attitude_s[near_rows], Rotation.from_quat(logged_quaternions, scalar_first=True))
+    start_quaternion = slerp(start_s).as_quat(scalar_first=True)
+    rotation_since_start = cumulative_product(from_vector(np.diff(angle, axis=0)))
+    return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

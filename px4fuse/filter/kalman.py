@@ -7,7 +7,8 @@ State x = [position, velocity] along one axis; the input u is the acceleration o
                x = x + Ky         P = (I - KH)P
 
 F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the steps in :mod:`px4fuse.filter.steps`.
-``quick`` and the likelihoods, which run many times, have faster recursions, equal to 1e-9.
+:mod:`~px4fuse.filter.fast_replay` and the likelihoods run many times and have faster recursions,
+with the same results to 1e-9.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, make_timeline
 from px4fuse.notebook_display import one_line_repr
 
-Row = tuple[float, ...]
+StateRow = tuple[float, ...]
 # Columns of ``Replay.updates``
 UPDATE_COLUMNS = [
     "measurement_m",
@@ -46,16 +47,17 @@ class Replay:
     axis : Axis
     settings : Settings
     steps : DataFrame, shape (n, 7)
-        After each prediction and its update, if any: ``position_m, velocity_m_s,
-        position_variance_m2, covariance_m2_s, velocity_variance_m2_s2``, and of the step that
-        *starts* there (0 at the last) the input ``acceleration_m_s2`` and
-        ``input_variance_m2_s4``, added to SIGMA_A² in gaps of the IMU.
+        State after each prediction and its update, if any: ``position_m, velocity_m_s,
+        position_variance_m2, covariance_m2_s, velocity_variance_m2_s2``. Input of the step that
+        starts at this time (0 in the last row): ``acceleration_m_s2``, and
+        ``input_variance_m2_s4``, which is added to SIGMA_A² in gaps of the IMU.
     updates : DataFrame, shape (m, 8)
-        At each measurement after the first: ``measurement_m, innovation_m`` (z - Hx, prior),
-        ``innovation_variance_m2`` (HPHᵀ + R), ``gain_position`` (1), ``gain_velocity`` (1/s), and
-        ``prior_position_m``, ``prior_position_variance_m2``, ``prior_velocity_variance_m2_s2``.
+        At each measurement after the first: ``measurement_m, innovation_m`` (z - Hx⁻),
+        ``innovation_variance_m2`` (HP⁻Hᵀ + R), ``gain_position`` (1), ``gain_velocity`` (1/s), and
+        before the update ``prior_position_m``, ``prior_position_variance_m2``,
+        ``prior_velocity_variance_m2_s2``.
     input_gap_s : float
-        Time without IMU data (s), in which Q is increased by the input's mean square.
+        Time without IMU data (s), in which Q is increased by the mean square of the input.
     """
 
     axis: Axis
@@ -75,7 +77,8 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     axis : Axis
     settings : Settings
     initial : InitialState, optional
-        Default: first measurement, at rest; that measurement is not fused again.
+        By default the position of the first measurement and velocity zero; the first measurement is
+        then not fused.
 
     Returns
     -------
@@ -89,86 +92,104 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     # late import: filterpy imports scipy.stats, which takes 0.3 s
     from filterpy.kalman import KalmanFilter  # noqa: PLC0415
 
-    line = make_timeline(axis, settings, initial)
-    start = initial or InitialState(line.time_s[0], axis.measurement_m[0])
+    timeline = make_timeline(axis, settings, initial)
+    initial_state = initial or InitialState(timeline.time_s[0], axis.measurement_m[0])
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[start.position_m], [start.velocity_m_s]])
+    kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
     kalman.P = model.symmetric_matrix(model.INITIAL_COVARIANCE)
     kalman.H = model.H
     kalman.R = np.array([[settings.sigma_z_m**2]])
     kalman.inv = np.reciprocal  # S is 1 by 1
     states, updates = [_state_row(kalman.x, kalman.P)], []
-    for dt, u, extra, measurement in zip(
-        np.diff(line.time_s),
-        line.acceleration_m_s2,
-        line.input_variance_m2_s4,
-        line.measurement[1:],
+    for dt_s, acceleration, gap_variance, measurement_index in zip(
+        np.diff(timeline.time_s),
+        timeline.acceleration_m_s2,
+        timeline.input_variance_m2_s4,
+        timeline.measurement_index[1:],
         strict=True,
     ):
         Q = (
-            (settings.sigma_a_m_s2**2 + extra)
+            (settings.sigma_a_m_s2**2 + gap_variance)
             * settings.dt_s
-            * model.symmetric_matrix(model.process_noise_unit(dt))
+            * model.symmetric_matrix(model.process_noise_unit(dt_s))
         )
-        kalman.predict(u=np.array([[u]]), B=model.input_matrix(dt), F=model.transition(dt), Q=Q)
-        if measurement >= 0:
-            z = axis.measurement_m[measurement]
+        kalman.predict(
+            u=np.array([[acceleration]]), B=model.input_matrix(dt_s), F=model.transition(dt_s), Q=Q
+        )
+        if measurement_index >= 0:
+            z = axis.measurement_m[measurement_index]
             kalman.update(z)
             y, S, K = kalman.y[0, 0], kalman.S[0, 0], kalman.K[:, 0]
             x, P = kalman.x_prior, kalman.P_prior
             updates.append((z, y, S, *K, x[0, 0], P[0, 0], P[1, 1]))
         states.append(_state_row(kalman.x, kalman.P))
-    return as_replay(axis, settings, line, states, updates)
+    return make_replay(axis, settings, timeline, states, updates)
 
 
-def as_replay(
-    axis: Axis, settings: Settings, line: Timeline, states: Sequence[Row], updates: Sequence[Row]
+def make_replay(
+    axis: Axis,
+    settings: Settings,
+    timeline: Timeline,
+    states: Sequence[StateRow],
+    updates: Sequence[StateRow],
 ) -> Replay:
-    """Build a replay from its rows: state and covariance per step, and the updates."""
-    times = line.time_s, line.time_s[line.measurement >= 0]
-    time, update_index = (pd.Index(update_time_s, name="time_s") for update_time_s in times)
+    """Build a replay from the rows of its steps (state and covariance) and updates."""
+    time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
+    time, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
     steps = pd.DataFrame(states, index=time, columns=model.STATES + model.COVARIANCES)
-    steps["acceleration_m_s2"] = np.append(line.acceleration_m_s2, 0.0)
-    steps["input_variance_m2_s4"] = np.append(line.input_variance_m2_s4, 0.0)
+    steps["acceleration_m_s2"] = np.append(timeline.acceleration_m_s2, 0.0)
+    steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
     return Replay(
-        axis, settings, steps, pd.DataFrame(updates, update_index, UPDATE_COLUMNS), line.input_gap_s
+        axis,
+        settings,
+        steps,
+        pd.DataFrame(updates, update_index, UPDATE_COLUMNS),
+        timeline.input_gap_s,
     )
 
 
-def _state_row(x: Array, P: Array) -> Row:
+def _state_row(x: Array, P: Array) -> StateRow:
     """Return state and covariance as a row of ``Replay.steps``."""
     return x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]
 
 
-def _step_before(run: Replay, times: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Return the index of the step before each time, the time since (s), and if it is outside."""
-    edges = run.steps.index.to_numpy()
-    step_index = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(edges) - 1)
-    return step_index, times - edges[step_index], (times < edges[0]) | (times > edges[-1])
+def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
+    """Return the last step before each time, the time since (s), and a mask of times outside."""
+    step_times_s = run.steps.index.to_numpy()
+    step_index = np.clip(
+        np.searchsorted(step_times_s, times_s, side="right") - 1, 0, len(step_times_s) - 1
+    )
+    return (
+        step_index,
+        times_s - step_times_s[step_index],
+        (times_s < step_times_s[0]) | (times_s > step_times_s[-1]),
+    )
 
 
-def state_at(run: Replay, times: Array) -> tuple[Array, Array]:
-    """Return position (m) and velocity (m/s) at other times, predicted from the step before.
+def state_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
+    """Predict position (m) and velocity (m/s) at other times from the last step before.
 
-    Nothing later than the time is used: interpolation between two steps would use a measurement
-    before it is received. NaN outside the replay.
+    Interpolation between two steps would use a measurement before it is received. The result is NaN
+    outside the replay.
     """
-    index, elapsed_s, outside = _step_before(run, times)
+    index, elapsed_s, is_outside = _step_before(run, times_s)
     position, velocity, acceleration = (
         run.steps[column].to_numpy()[index] for column in (*model.STATES, "acceleration_m_s2")
     )
     position, velocity = model.propagate_state(position, velocity, acceleration, elapsed_s)
-    return np.where(outside, np.nan, position), np.where(outside, np.nan, velocity)
+    return np.where(is_outside, np.nan, position), np.where(is_outside, np.nan, velocity)
 
 
-def variance_at(run: Replay, times: Array) -> tuple[Array, Array]:
-    """Return the variances (m², m²/s²) of :func:`state_at`: FPFᵀ + Q from the step before."""
-    index, elapsed_s, outside = _step_before(run, times)
+def variance_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
+    """Return the variances (m², m²/s²) of :func:`state_at`: FPFᵀ + Q from the last step before."""
+    index, elapsed_s, is_outside = _step_before(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[index].T
-    extra = run.steps["input_variance_m2_s4"].to_numpy()[index]
-    q = (run.settings.sigma_a_m_s2**2 + extra) * run.settings.dt_s
+    gap_variance = run.steps["input_variance_m2_s4"].to_numpy()[index]
+    noise_density = (run.settings.sigma_a_m_s2**2 + gap_variance) * run.settings.dt_s
     (p00, _, p11), (q00, _, q11) = (
         model.propagate_covariance((p00, p01, p11), elapsed_s),
         model.process_noise_unit(elapsed_s),
     )
-    return np.where(outside, np.nan, p00 + q * q00), np.where(outside, np.nan, p11 + q * q11)
+    return np.where(is_outside, np.nan, p00 + noise_density * q00), np.where(
+        is_outside, np.nan, p11 + noise_density * q11
+    )

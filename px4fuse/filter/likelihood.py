@@ -1,8 +1,8 @@
-"""KF as in :mod:`px4fuse.filter.kalman`, for whole grids of settings at once.
+"""KF for grids of settings: innovations, likelihood and 95 % intervals.
 
-No other data enter the filter between two position measurements, so the input is preintegrated:
-one step per measurement instead of one per DT, with an array element for every setting. Agrees with
-the filterpy replay to 1e-9 for SIGMA_A and SIGMA_Z from 1e-3.
+The input is integrated between position measurements, so there is one step per measurement instead
+of one per DT, with an array element for every setting. The result equals that of
+:func:`px4fuse.filter.kalman.replay` to 1e-9 for SIGMA_A and SIGMA_Z from 1e-3.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, make_timeline
 
-# nats; drop of the log-likelihood at the ends of a 95 % interval: half the 95 % point of χ²
+# nats; drop of the log-likelihood at the ends of a 95 % interval: half of the 95 % point of χ²(1)
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
-# Distance in ln σ at which the search for the end of an interval starts
-FIRST_LOG_DISTANCE = 0.05
-# Step in ln σ for second differences; limits of a parabola's steps per iteration, and of iterations
+# Distance in ln σ from the maximum at which the search for the end of an interval starts
+START_LOG_DISTANCE = 0.05
+# Step in ln σ for second differences; limits of the steps per iteration, and of the iterations
 CURVATURE_STEP = 0.05
-MAX_PARABOLA_STEPS, MAX_PARABOLAS = 6.0, 4
+MAX_PARABOLA_STEPS, MAX_PARABOLA_ITERATIONS = 6.0, 4
 
 
 @dataclass(frozen=True)
 class Preintegrated:
-    """Input integrated between consecutive measurements; arrays of shape (m,).
+    """Input of KF integrated between consecutive measurements; arrays of shape (m,).
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Preintegrated:
     measurement_m: Array
     initial: InitialState
 
-    def first(self, count: int) -> Preintegrated:
+    def first_measurements(self, count: int) -> Preintegrated:
         """Return the first ``count`` measurements only."""
         arrays = {name: values[:count] for name, values in vars(self).items() if name != "initial"}
         return replace(self, **arrays)
@@ -78,36 +78,36 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    line = make_timeline(axis, settings)
-    end_steps, interval_index, remaining_s = _interval_index(line)
-    time = line.time_s
+    timeline = make_timeline(axis, settings)
+    last_steps, interval_index, remaining_s = _interval_index(timeline)
+    time = timeline.time_s
     noise_unit = settings.dt_s * np.stack(
         propagate_covariance(process_noise_unit(np.diff(time)), remaining_s), 1
     )
-    dp, dv = integrate_acceleration(line, line.acceleration_m_s2)
+    dp, dv = integrate_acceleration(timeline, timeline.acceleration_m_s2)
     return Preintegrated(
-        length_s=np.diff(time[np.concatenate([[0], end_steps])]),
+        length_s=np.diff(time[np.concatenate([[0], last_steps])]),
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         noise_unit=np.stack([np.bincount(interval_index, noise_unit[:, i]) for i in range(3)], 1),
         noise_fixed=np.stack(
             [
-                np.bincount(interval_index, noise_unit[:, i] * line.input_variance_m2_s4)
+                np.bincount(interval_index, noise_unit[:, i] * timeline.input_variance_m2_s4)
                 for i in range(3)
             ],
             1,
         ),
-        measurement_m=axis.measurement_m[line.measurement[end_steps]],
+        measurement_m=axis.measurement_m[timeline.measurement_index[last_steps]],
         initial=InitialState(float(time[0]), float(axis.measurement_m[0])),
     )
 
 
-def integrate_acceleration(line: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
+def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
     """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements.
 
     Parameters
     ----------
-    line : Timeline
+    timeline : Timeline
     acceleration_m_s2 : ndarray, shape (n - 1,)
         Acceleration of each step.
 
@@ -115,11 +115,11 @@ def integrate_acceleration(line: Timeline, acceleration_m_s2: Array) -> tuple[Ar
     -------
     delta_position_m, delta_velocity_m_s : ndarray, shape (m,)
     """
-    _, interval_index, remaining_s = _interval_index(line)
-    zero_state = np.zeros(len(remaining_s))
+    _, interval_index, remaining_s = _interval_index(timeline)
+    zeros = np.zeros(len(remaining_s))
     dp, dv = propagate_state(
-        *propagate_state(zero_state, zero_state, acceleration_m_s2, np.diff(line.time_s)),
-        zero_state,
+        *propagate_state(zeros, zeros, acceleration_m_s2, np.diff(timeline.time_s)),
+        zeros,
         remaining_s,
     )
     # numpy's stubs declare weighted bincounts as integers
@@ -128,18 +128,25 @@ def integrate_acceleration(line: Timeline, acceleration_m_s2: Array) -> tuple[Ar
     )
 
 
-def _interval_index(line: Timeline) -> tuple[IntArray, IntArray, Array]:
-    """Return each interval's last step, each step's interval, and the time to its end (s)."""
-    end_steps = np.flatnonzero(line.measurement >= 0)
-    interval_index = np.searchsorted(end_steps, np.arange(1, len(line.time_s)))
-    return end_steps, interval_index, line.time_s[end_steps[interval_index]] - line.time_s[1:]
+def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
+    """Return the last step of each interval, and of each step the interval and time to its end.
+
+    Times are in s.
+    """
+    last_steps = np.flatnonzero(timeline.measurement_index >= 0)
+    interval_index = np.searchsorted(last_steps, np.arange(1, len(timeline.time_s)))
+    return (
+        last_steps,
+        interval_index,
+        timeline.time_s[last_steps[interval_index]] - timeline.time_s[1:],
+    )
 
 
 def innovations(
     intervals: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
-    skip: BoolArray | None = None,
+    is_skipped: BoolArray | None = None,
 ) -> tuple[Array, Array]:
     """Compute innovations and their variances for every combination of settings.
 
@@ -148,15 +155,15 @@ def innovations(
     intervals : Preintegrated
     sigma_a_m_s2, sigma_z_m : array_like
         Broadcast against each other to a grid of shape (...).
-    skip : ndarray of bool, shape (m,), optional
+    is_skipped : ndarray of bool, shape (m,), optional
         Measurements with an innovation but without an update.
 
     Returns
     -------
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
-        For k signals through one filter: shapes (m, k) and (m,).
+        For k signals with one pair of settings: shapes (m, k) and (m,).
     """
-    steps = run_filter(intervals, sigma_a_m_s2, sigma_z_m, skip)
+    steps = run_filter(intervals, sigma_a_m_s2, sigma_z_m, is_skipped)
     nu, s = zip(*(step[:2] for step in steps), strict=True)
     return np.array(nu), np.array(s)
 
@@ -194,20 +201,20 @@ def run_filter(
     intervals: Preintegrated,
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
-    skip: BoolArray | None,
+    is_skipped: BoolArray | None,
     weight: Array | None = None,
 ) -> Iterator[tuple[Array, Array, Array, Array, Array, Symmetric[Array]]]:
     """Run KF over a grid of settings, measurement by measurement.
 
-    The filter is linear: with Δp, Δv and measurements of shape (m, k) and one
-    pair of settings, k signals run through one filter at once.
+    KF is linear in its signals. With one pair of settings, Δp, Δv and measurements may therefore
+    have shape (m, k): k signals are filtered with the same gains.
 
     Parameters
     ----------
     intervals : Preintegrated
     sigma_a_m_s2, sigma_z_m : array_like
         Broadcast against each other to a grid of shape (...).
-    skip : ndarray of bool, shape (m,), or None
+    is_skipped : ndarray of bool, shape (m,), or None
         Measurements with an innovation but without an update.
     weight : ndarray, shape (m,), optional
         Weight of each measurement: its variance is SIGMA_Z² / weight.
@@ -227,34 +234,34 @@ def run_filter(
         intervals.initial.velocity_m_s + 0.0 * q,
     )  # of the grid's shape
     covariance: Symmetric[Any] = INITIAL_COVARIANCE
-    variance = r
-    for dt, dp, dv, unit, fixed, z, is_skipped, weight_k in zip(
+    sigma_z_squared = r
+    for dt, dp, dv, noise_unit, noise_fixed, z, skips_update, weight_k in zip(
         intervals.length_s.tolist(),
-        _measurement_rows(intervals.delta_position_m),
-        _measurement_rows(intervals.delta_velocity_m_s),
+        _values_by_measurement(intervals.delta_position_m),
+        _values_by_measurement(intervals.delta_velocity_m_s),
         intervals.noise_unit.tolist(),
         intervals.noise_fixed.tolist(),
-        _measurement_rows(intervals.measurement_m),
-        [False] * len(intervals.measurement_m) if skip is None else skip.tolist(),
+        _values_by_measurement(intervals.measurement_m),
+        [False] * len(intervals.measurement_m) if is_skipped is None else is_skipped.tolist(),
         [1.0] * len(intervals.measurement_m) if weight is None else weight.tolist(),
         strict=True,
     ):
-        r = variance / weight_k
+        r = sigma_z_squared / weight_k
         # x = Fx + Ba, P = FPFᵀ + Q
         p, v = p + dt * v + dp, v + dv
         p00, p01, p11 = propagate_covariance(covariance, dt)
-        p00 = p00 + q * unit[0] + fixed[0]
-        p01 = p01 + q * unit[1] + fixed[1]
-        p11 = p11 + q * unit[2] + fixed[2]
+        p00 = p00 + q * noise_unit[0] + noise_fixed[0]
+        p01 = p01 + q * noise_unit[1] + noise_fixed[1]
+        p11 = p11 + q * noise_unit[2] + noise_fixed[2]
         covariance = p00, p01, p11
-        (nu, s, k0, _), updated = update_step(p, v, covariance, z, r)
-        if not is_skipped:
-            p, v, covariance = updated
+        (nu, s, k0, _), updated_state = update_step(p, v, covariance, z, r)
+        if not skips_update:
+            p, v, covariance = updated_state
         yield nu, s, k0, p, v, covariance
 
 
-def _measurement_rows(values: Array) -> list[Any]:
-    """Return the values per measurement: numbers, or rows of several signals."""
+def _values_by_measurement(values: Array) -> list[Any]:
+    """Return the values of each measurement: a number, or an array of several signals."""
     return values.tolist() if values.ndim == 1 else list(values)
 
 
@@ -301,7 +308,7 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
 
 
 def profile_interval(
-    grid: Array, profile: Array, allowed: float = PROFILE_DROP
+    grid: Array, profile: Array, max_drop: float = PROFILE_DROP
 ) -> tuple[float | None, float | None]:
     """Return the ends of the 95 % interval of a profile; None for an end outside the grid.
 
@@ -309,19 +316,21 @@ def profile_interval(
     ----------
     grid, profile : ndarray, shape (n,)
         Parameter values and their negative log-likelihood, interpolated linearly.
-    allowed : float
-        Height above the minimum at the ends of the interval.
+    max_drop : float
+        Increase of the negative log-likelihood from the minimum to the ends of the interval.
     """
     drop = profile - profile.min()
-    inside_indices = np.flatnonzero(drop <= allowed)
+    inside_indices = np.flatnonzero(drop <= max_drop)
     ends: list[float | None] = []
     for edge_index, outside_index in (
         (inside_indices[0], inside_indices[0] - 1),
         (inside_indices[-1], inside_indices[-1] + 1),
     ):
         if 0 <= outside_index < len(grid):
-            share = (allowed - drop[edge_index]) / (drop[outside_index] - drop[edge_index])
-            ends.append(float(grid[edge_index] + share * (grid[outside_index] - grid[edge_index])))
+            fraction = (max_drop - drop[edge_index]) / (drop[outside_index] - drop[edge_index])
+            ends.append(
+                float(grid[edge_index] + fraction * (grid[outside_index] - grid[edge_index]))
+            )
         else:
             ends.append(None)
     return ends[0], ends[1]
@@ -329,49 +338,50 @@ def profile_interval(
 
 def profile_ends(
     score: Callable[[float, float], float],
-    best: tuple[float, float],
+    best_logs: tuple[float, float],
     bounds: tuple[float, float],
-    widening: float = 1.0,
+    variance_factor: float = 1.0,
 ) -> tuple[float | None, float | None]:
     """Return the ends of a 95 % profile-likelihood interval; None for an end beyond a bound.
 
     Parameters
     ----------
     score : callable
-        -ln p as a function of ln of the parameter and ln of the other one, which is maximised out.
-    best : (float, float)
+        -ln p as a function of ln of the parameter and ln of the other parameter, which is
+        optimised at each value.
+    best_logs : (float, float)
         Logarithms at the minimum.
     bounds : (float, float)
         Bounds of the parameter (not of its logarithm).
-    widening : float
+    variance_factor : float
         Factor on the variance for uncertainty that the score does not contain.
     """
-    best_score, root_drop = score(*best), float(np.sqrt(PROFILE_DROP * widening))
+    best_score, max_root_drop = score(*best_logs), float(np.sqrt(PROFILE_DROP * variance_factor))
 
     def find_end(direction: float, bound: float) -> float | None:
-        other_log = best[1]
+        other_log = best_logs[1]
 
         @cache  # the search for the other parameter starts at the previous result
         def excess(distance: float) -> float:
-            """Return √drop minus its value at the interval's end; √drop is nearly linear."""
+            """Return √drop minus √drop at the end of the interval; √drop is nearly linear."""
             nonlocal other_log
             if distance == 0.0:
-                return -root_drop
+                return -max_root_drop
             lowest_score, other_log = _minimise_by_parabolas(
-                lambda other_log_value: score(best[0] + direction * distance, other_log_value),
+                lambda other_log_value: score(best_logs[0] + direction * distance, other_log_value),
                 other_log,
             )
-            return float(np.sqrt(max(lowest_score - best_score, 0.0)) - root_drop)
+            return float(np.sqrt(max(lowest_score - best_score, 0.0)) - max_root_drop)
 
-        max_distance = direction * (float(np.log(bound)) - best[0])
-        distance_limit = min(FIRST_LOG_DISTANCE, max_distance)
+        max_distance = direction * (float(np.log(bound)) - best_logs[0])
+        distance_limit = min(START_LOG_DISTANCE, max_distance)
         while excess(distance_limit) < 0.0:
             if distance_limit == max_distance:
                 return None
             distance_limit = min(2.0 * distance_limit, max_distance)
         return float(
             np.exp(
-                best[0]
+                best_logs[0]
                 + direction * brentq(excess, 0.0, distance_limit, xtol=1e-3 * distance_limit)
             )
         )
@@ -379,16 +389,16 @@ def profile_ends(
     return find_end(-1.0, bounds[0]), find_end(1.0, bounds[1])
 
 
-def _minimise_by_parabolas(score: Callable[[float], float], start: float) -> tuple[float, float]:
-    """Return the minimum of a score and its place, by parabolas from a nearby start."""
-    for _ in range(MAX_PARABOLAS):
-        profile = np.array([score(start + k * CURVATURE_STEP) for k in (-1.0, 0.0, 1.0)])
-        middle = float(profile[1])
+def _minimise_by_parabolas(score: Callable[[float], float], position: float) -> tuple[float, float]:
+    """Return the minimum of a score and its position, by parabolas from a nearby ``position``."""
+    for _ in range(MAX_PARABOLA_ITERATIONS):
+        profile = np.array([score(position + k * CURVATURE_STEP) for k in (-1.0, 0.0, 1.0)])
+        middle_score = float(profile[1])
         if np.ptp(profile) == 0.0:  # there is no other parameter
-            return middle, start
+            return middle_score, position
         shift, curvature = parabola_vertex(profile, 1)
         step = shift if curvature > 0.0 else np.sign(profile[0] - profile[2]) * MAX_PARABOLA_STEPS
-        start += float(np.clip(step, -MAX_PARABOLA_STEPS, MAX_PARABOLA_STEPS)) * CURVATURE_STEP
+        position += float(np.clip(step, -MAX_PARABOLA_STEPS, MAX_PARABOLA_STEPS)) * CURVATURE_STEP
         if curvature > 0.0 and abs(step) <= 1.0:
-            return middle - 0.5 * shift**2 * curvature, start
-    return score(start), start
+            return middle_score - 0.5 * shift**2 * curvature, position
+    return score(position), position

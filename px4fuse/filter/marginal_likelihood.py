@@ -1,14 +1,19 @@
-"""Likelihood of positions along a few axes, with the constants of each stretch marginalised.
+"""Likelihood of positions along a few axes, with the constants of each segment marginalised.
 
-Given the acceleration, the information about the states x_k = [p, v] at the measurements is a sum
-of squares: x_{k+1} - Fx_k - [Δp, Δv] of each interval over its Q, and z - p of each measurement
-over its variance. Its matrix A has three bands below the diagonal, so LAPACK factorises a flight in
-a millisecond. The marginal likelihood of the measurements equals that of the filter's innovations
-(Schweppe 1965) and follows from log|A| and the residual squares at the minimum. Signals that enter
-linearly (data, or the effect of a bias) are columns; the factorisation does not depend on them.
-Biases and other constants have a prior and are marginalised by the Schur complement of their
-products. Time-correlated noise of the source is a third state, c_{k+1} = ρ c_k + noise, in the
-measurement: z - p - c. It starts anew in each stretch.
+A segment is a part of the flight without a gap of the IMU. It has its own initial state and its own
+constants (biases and other constant errors).
+
+Given the acceleration, -2 ln p of the states x_k = [p, v] at the measurements is a sum of squares:
+x_{k+1} - Fx_k - [Δp, Δv] of each interval over its Q, and z - p of each measurement over its
+variance. Its matrix A has three bands below the diagonal, so LAPACK factorises a flight in a
+millisecond. The marginal likelihood of the measurements equals that of KF's innovations (Schweppe
+1965) and follows from log|A| and the residual squares at the minimum. Signals that enter linearly
+(data, or the effect of a bias) are columns; the factorisation does not depend on them. Constants
+have a prior and are marginalised by the Schur complement of their inner products. Time-correlated
+noise of the source is a third state, c_{k+1} = ρ c_k + noise, in the measurement: z - p - c. It is
+independent in each segment.
+
+Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
 
 from __future__ import annotations
@@ -25,15 +30,15 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
 # SIGMA_A (m/s²) and SIGMA_Z (m) for the smooth path that is subtracted
-PATH_SIGMAS = 0.5, 0.1
+PATH_NOISES = 0.5, 0.1
 # 1/m²; precision above which the initial position counts as known
-KNOWN_START_PRECISION = 1e-3
-# Minimum position noise of an interval, relative to the measurement noise and to its own Q: makes Q
-# invertible for a single step (rank one) or without process noise
+MIN_KNOWN_START_PRECISION = 1e-3
+# Minimum position noise of an interval, relative to the measurement noise and to the Q of the
+# interval. It makes Q invertible for a single step (rank one) or without process noise
 MIN_NOISE_SHARE = 1e-5
-# Signals per batch: larger batches need more memory and are not faster
+# Signals per batch; larger batches need more memory and are not faster
 SIGNAL_BATCH_SIZE = 8
-# Determinants below this share of their terms are rounding errors
+# Determinants below this fraction of their terms are rounding errors
 MIN_DETERMINANT_SHARE = 1e-12
 
 
@@ -45,66 +50,74 @@ class Positions:
     ----------
     measurement_m : ndarray, shape (m, a)
         NaN if an axis has no measurement.
-    start : ndarray of int, shape (s,)
-        First state of each stretch.
+    segment_starts : ndarray of int, shape (s,)
+        First state of each segment.
     length_s : ndarray, shape (m - 1,)
-        Intervals between successive measurements, also between stretches.
+        Intervals between successive measurements, also between segments.
     noise_unit, noise_fixed : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q of each interval for SIGMA_A = 1 m/s², and the part that does not
         depend on SIGMA_A.
-    initial : ndarray, shape (m, 2)
+    prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
     constant_sigma : ndarray, shape (c,)
-        Prior standard deviations of the constants of each stretch.
+        Prior standard deviations of the constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
-        Δp and Δv of each interval, and the effect of each constant on them, for T time offsets;
-        ignored between stretches.
-    slow : (float, float) or None
+        Δp and Δv of each interval, and the effect of each constant on Δp and Δv, for T time
+        offsets; ignored between segments.
+    correlated_noise : (float, float) or None
         Standard deviation (m) and time constant (s) of the source's time-correlated noise.
     """
 
     measurement_m: Array
-    start: IntArray
+    segment_starts: IntArray
     length_s: Array
     noise_unit: Array
     noise_fixed: Array
-    initial: Array
+    prior_precision: Array
     constant_sigma: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
-    slow: tuple[float, float] | None = None
+    correlated_noise: tuple[float, float] | None = None
 
     @cached_property
-    def stretches(self) -> list[tuple[int, int]]:
-        """First state of each stretch, and the one after its last."""
-        return list(pairwise([*self.start.tolist(), len(self.measurement_m)]))
+    def segments(self) -> list[tuple[int, int]]:
+        """First state of each segment, and the state after its last."""
+        return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
 
     @cached_property
-    def joined(self) -> BoolArray:
-        """True for intervals inside a stretch, shape (m - 1,)."""
-        return ~np.isin(np.arange(1, len(self.measurement_m)), self.start)
+    def is_joined(self) -> BoolArray:
+        """Mask of the intervals inside a segment, shape (m - 1,)."""
+        return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
 
-    def over(self, sigma_z_m: float, walk: float, weight: Array) -> tuple[Positions, Array]:
-        """Return positions in units of SIGMA_Z, and the measurement variances, (m,).
+    def in_sigma_z_units(
+        self, sigma_z_m: float, random_walk: float, weight: Array
+    ) -> tuple[Positions, Array]:
+        """Return the positions with noises in units of SIGMA_Z, and measurement variances, (m,).
 
         Parameters
         ----------
         sigma_z_m : float
-        walk : float
+        random_walk : float
             Random walk of the source / SIGMA_Z, per √s.
         weight : ndarray
-            Weight of each of the last measurements; an additional first one is KF's initial state.
+            Weight of each measurement; without that of KF's initial state, if this is the first.
         """
         noise_fixed = self.noise_fixed / sigma_z_m**2
-        noise_fixed[0] += self.length_s * walk**2
+        noise_fixed[0] += self.length_s * random_walk**2
         start_weights = np.ones(len(self.measurement_m) - len(weight))
-        slow = self.slow and (self.slow[0] / sigma_z_m, self.slow[1])
+        correlated_noise = self.correlated_noise and (
+            self.correlated_noise[0] / sigma_z_m,
+            self.correlated_noise[1],
+        )
         scaled_positions = replace(
-            self, noise_fixed=noise_fixed, initial=self.initial * sigma_z_m**2, slow=slow
+            self,
+            noise_fixed=noise_fixed,
+            prior_precision=self.prior_precision * sigma_z_m**2,
+            correlated_noise=correlated_noise,
         )
         return scaled_positions, 1.0 / np.concatenate([start_weights, weight])
 
-    def systems(
+    def factorised_systems(
         self, sigma_a_m_s2: float, variance_m2: Array
     ) -> Iterator[tuple[list[int], BandedSystem, int]]:
         """Yield banded systems, each with its axes and degrees of freedom.
@@ -113,31 +126,32 @@ class Positions:
         """
         is_measured = np.isfinite(self.measurement_m)
         noise = sigma_a_m_s2**2 * self.noise_unit + self.noise_fixed
-        remaining_axes = list(range(is_measured.shape[1]))
-        while remaining_axes:
-            is_axis_measured = is_measured[:, remaining_axes[0]]
+        axes_left = list(range(is_measured.shape[1]))
+        while axes_left:
+            is_axis_measured = is_measured[:, axes_left[0]]
             axes = [
-                axis
-                for axis in remaining_axes
-                if np.array_equal(is_measured[:, axis], is_axis_measured)
+                axis for axis in axes_left if np.array_equal(is_measured[:, axis], is_axis_measured)
             ]
-            remaining_axes = [axis for axis in remaining_axes if axis not in axes]
-            precision = self.initial.copy()
-            # a stretch with fewer than two measurements gets a prior and has no likelihood
-            has_few = np.add.reduceat(is_axis_measured.astype(int), self.start) < 2
+            axes_left = [axis for axis in axes_left if axis not in axes]
+            precision = self.prior_precision.copy()
+            # a segment with fewer than two measurements gets a prior and has no likelihood
+            has_too_few = np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
             is_used = is_axis_measured & ~np.repeat(
-                has_few, np.diff([*self.start, len(is_measured)])
+                has_too_few, np.diff([*self.segment_starts, len(is_measured)])
             )
             precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
-            precision[self.start[has_few]] += 1.0
+            precision[self.segment_starts[has_too_few]] += 1.0
             is_known = (precision > 0.0) & (
-                (precision > self.initial) | (self.initial > KNOWN_START_PRECISION)
+                (precision > self.prior_precision)
+                | (self.prior_precision > MIN_KNOWN_START_PRECISION)
             )
-            system = factorise(self.length_s, noise, self.joined, precision, self.slow)
-            # an initial state that is practically unknown does not count in the likelihood
+            system = factorise(
+                self.length_s, noise, self.is_joined, precision, self.correlated_noise
+            )
+            # a practically unknown initial state does not count in the likelihood
             log_unknown_precision = float(np.sum(np.log(precision[(precision > 0.0) & ~is_known])))
             system = replace(system, log_determinant=system.log_determinant + log_unknown_precision)
-            yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.start)
+            yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.segment_starts)
 
 
 @dataclass(frozen=True)
@@ -147,22 +161,25 @@ class FittedPositions:
     Attributes
     ----------
     gram : ndarray, shape (s, T, 1 + c, 1 + c)
-        Inner products of data and constants' signals, weighted with the inverse covariance.
+        Inner products of the data and of the signals of the constants, weighted with the inverse
+        covariance.
     log_determinant : float
-    freedom : int
-        Measured positions minus those that determine initial states: factor of ln(scale of all
-        noises) in -ln p.
+    degrees_of_freedom : int
+        Number of measured positions minus the number that determines initial states. It is the
+        factor of ln(scale of all noises) in -ln p.
     constant_sigma : ndarray, shape (c,)
     """
 
     gram: Array
     log_determinant: float
-    freedom: int
+    degrees_of_freedom: int
     constant_sigma: Array
 
     def scaled(self, sigma: float) -> FittedPositions:
         """Return the fit with all noises multiplied by ``sigma``."""
-        log_determinant = self.log_determinant + 2.0 * self.freedom * float(np.log(sigma))
+        log_determinant = self.log_determinant + 2.0 * self.degrees_of_freedom * float(
+            np.log(sigma)
+        )
         return replace(self, gram=self.gram / sigma**2, log_determinant=log_determinant)
 
     def constants(self) -> Array:
@@ -170,8 +187,8 @@ class FittedPositions:
         information = self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0)
         return np.asarray(-np.linalg.solve(information, self.gram[..., 1:, :1])[..., 0])
 
-    def by_stretch(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of each stretch without the noises' determinant, shape (k, s, T).
+    def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
+        """Return -ln p of each segment without the determinant of the noises, shape (k, s, T).
 
         Parameters
         ----------
@@ -182,15 +199,17 @@ class FittedPositions:
         sigma = self.constant_sigma
         information = gram[..., 1:, 1:] * np.outer(sigma, sigma) + np.eye(len(sigma))
         cross = gram[..., 1:, 0] * sigma
-        lower = np.linalg.cholesky(information)
-        solved = np.linalg.solve(information, cross[..., None])[..., 0]
-        log_lower = np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
-        return np.asarray(0.5 * (gram[..., 0, 0] - np.sum(cross * solved, axis=-1)) + log_lower)
+        cholesky = np.linalg.cholesky(information)
+        solution = np.linalg.solve(information, cross[..., None])[..., 0]
+        log_diagonal = np.log(np.diagonal(cholesky, axis1=-2, axis2=-1)).sum(axis=-1)
+        return np.asarray(
+            0.5 * (gram[..., 0, 0] - np.sum(cross * solution, axis=-1)) + log_diagonal
+        )
 
-    def totals(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of all stretches (without a constant) for scaled noises, shape (k, T)."""
-        noises_alone = 0.5 * self.log_determinant + self.freedom * np.log(scales)
-        return np.asarray(self.by_stretch(scales).sum(axis=1) + noises_alone[:, None])
+    def scores(self, scales: Array = UNIT_SCALE) -> Array:
+        """Return -ln p of all segments (without a constant) for scaled noises, shape (k, T)."""
+        determinant_terms = 0.5 * self.log_determinant + self.degrees_of_freedom * np.log(scales)
+        return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
 
 
 def fit_positions(
@@ -205,23 +224,25 @@ def fit_positions(
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     measured_m : ndarray, shape (a, 1 or T, 1 + c, m), optional
-        Signals of the data and of each constant; ``positions`` then only states which are
-        measured.
+        Signals of the data and of each constant; ``positions.measurement_m`` then only gives the
+        axes and times that are measured.
     """
     if measured_m is None:
         states, axes = positions.measurement_m.shape
         measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), states))
         measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
     dp, dv = positions.delta_position_m, positions.delta_velocity_m_s
-    gram = np.zeros((len(positions.start), *dp.shape[1:3], dp.shape[2]))
-    log_determinant, freedom = 0.0, 0
-    for axes, system, axis_freedom in positions.systems(sigma_a_m_s2, variance_m2):
+    gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
+    log_determinant, degrees_of_freedom = 0.0, 0
+    for axes, system, axis_degrees_of_freedom in positions.factorised_systems(
+        sigma_a_m_s2, variance_m2
+    ):
         log_determinant += len(axes) * system.log_determinant
-        freedom += len(axes) * axis_freedom
+        degrees_of_freedom += len(axes) * axis_degrees_of_freedom
         data = measured_m[axes]
         intervals, explained = system.whiten(data, dp[axes], dv[axes])
         signals = (np.sqrt(system.precision[:, 0]) * data, *intervals, explained)
-        for segment_index, (begin, end) in enumerate(positions.stretches):
+        for segment_index, (begin, end) in enumerate(positions.segments):
             rows = slice(begin, end - 1)
             states = slice(system.states * begin, system.states * end)
             for sign, array, columns in zip(
@@ -229,32 +250,34 @@ def fit_positions(
             ):
                 signal = array[..., columns]
                 gram[segment_index] += sign * (signal @ np.swapaxes(signal, -1, -2)).sum(axis=0)
-    return FittedPositions(gram, log_determinant, freedom, positions.constant_sigma)
+    return FittedPositions(gram, log_determinant, degrees_of_freedom, positions.constant_sigma)
 
 
 def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
     """Subtract a smooth path through the positions from measurements and increments.
 
-    The likelihood is unchanged, but no longer a small difference of large squares. The path starts
-    at zero in each stretch.
+    The likelihood is unchanged, but no longer the small difference of large squares, so rounding
+    errors are smaller. The path starts at zero in each segment.
 
     Parameters
     ----------
     positions : Positions
     scaled : bool
-        True if the last constant is a scale of the positions: its signal becomes that of the path.
+        True if the last constant is a scale of the positions: the path becomes its signal.
     """
     measured = positions.measurement_m.copy()
     dp, dv = positions.delta_position_m.copy(), positions.delta_velocity_m_s.copy()
-    sigma_a, sigma_z = PATH_SIGMAS
-    for axes, system, _ in positions.systems(sigma_a, np.full(len(measured), sigma_z**2)):
+    sigma_a, sigma_z = PATH_NOISES
+    for axes, system, _ in positions.factorised_systems(
+        sigma_a, np.full(len(measured), sigma_z**2)
+    ):
         data = np.nan_to_num(measured[:, axes].T)[:, None]
         state = system.solve(data, dp[axes, :, 0], dv[axes, :, 0])
-        state[:, :, positions.start] = 0.0
+        state[:, :, positions.segment_starts] = 0.0
         path, speed = state[..., 0], state[..., 1]
         measured[:, axes] -= path[:, 0].T
         path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
-        # the first offset's path is subtracted for all; a scale multiplies each offset's path
+        # the path of the first time offset is subtracted for all; a scale has the path of each
         for array, increment in ((dp, path_increment), (dv, np.diff(speed))):
             array[axes, :, 0] -= increment[:, :1]
             if scaled:
@@ -265,7 +288,7 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
 def expected_squares(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, constants: Array
 ) -> tuple[Array, Array]:
-    """Return the expected square of each measurement error given all data, axes summed.
+    """Return the expected square of each measurement error given all data, summed over axes.
 
     Parameters
     ----------
@@ -274,7 +297,7 @@ def expected_squares(
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
     constants : ndarray, shape (s, c)
-        Maximum-likelihood estimates.
+        Maximum-likelihood estimates of the constants.
 
     Returns
     -------
@@ -282,45 +305,47 @@ def expected_squares(
     count : ndarray, shape (m,)
         Number of measured axes.
     """
-    weight = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
-    # weights of each interval: those of the stretch in which it ends
-    interval_weight = np.repeat(weight, np.diff([*positions.start, len(variance_m2)]), axis=0)[1:]
+    coefficients = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
+    # the coefficients of an interval are those of the segment in which the interval ends
+    interval_coefficients = np.repeat(
+        coefficients, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
+    )[1:]
     increments = positions.delta_position_m, positions.delta_velocity_m_s
-    dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_weight) for array in increments)
-    square = np.zeros(len(variance_m2))
-    for axes, system, _ in positions.systems(sigma_a_m_s2, variance_m2):
+    dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_coefficients) for array in increments)
+    square_m2 = np.zeros(len(variance_m2))
+    for axes, system, _ in positions.factorised_systems(sigma_a_m_s2, variance_m2):
         measured = positions.measurement_m[:, axes].T
-        error = measured - system.solve(np.nan_to_num(measured), dp[axes], dv[axes])[..., 0]
-        position_variance = np.where(np.isnan(error), np.nan, system.position_variance())
-        square += np.nansum(error**2 + position_variance, axis=0)
-    return square, np.isfinite(positions.measurement_m).sum(axis=1)
+        error_m = measured - system.solve(np.nan_to_num(measured), dp[axes], dv[axes])[..., 0]
+        position_variance = np.where(np.isnan(error_m), np.nan, system.position_variance())
+        square_m2 += np.nansum(error_m**2 + position_variance, axis=0)
+    return square_m2, np.isfinite(positions.measurement_m).sum(axis=1)
 
 
-def products_by_stretch(
+def products_by_segment(
     positions: Positions,
     sigma_a_m_s2: float,
     variance_m2: Array,
     signals: Sequence[Array],
     measured_m: Array,
 ) -> Array:
-    """Return inner products of two sets of signals by stretch, constants marginalised.
+    """Return inner products of two sets of k signals by segment, with marginalised constants.
 
     Parameters
     ----------
     positions : Positions
-        For one time offset; only states which measurements there are.
+        For one time offset; ``measurement_m`` only gives the axes and times that are measured.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
     signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
         Measurements, Δp and Δv of k signals.
     measured_m : ndarray, shape (a, k, m)
-        Measurements of the second set, which has no Δp and Δv.
+        Measurements of the second set; its Δp and Δv are zero.
 
     Returns
     -------
     ndarray, shape (s, k)
     """
-    measurement_errors, *increments = signals
+    first_measured_m, *increments = signals
     constants = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
     results = []
     for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
@@ -332,12 +357,12 @@ def products_by_stretch(
             ]
             for increment, constant_signal in zip(increments, constants, strict=True)
         )
-        measured = np.zeros((*dp.shape[:3], measurement_errors.shape[-1]))
+        measured = np.zeros((*dp.shape[:3], first_measured_m.shape[-1]))
         first_rows, second_rows, constant_rows = np.split(
-            np.arange(dp.shape[2]), np.array([1, 2]) * measurement_errors[batch].shape[1]
+            np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch].shape[1]
         )
         measured[:, 0, first_rows], measured[:, 0, second_rows] = (
-            measurement_errors[batch],
+            first_measured_m[batch],
             measured_m[batch],
         )
         all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
@@ -357,19 +382,19 @@ def products_by_stretch(
 
 @dataclass(frozen=True)
 class BandedSystem:
-    """Factorised normal equations of all states.
+    """Factorised normal equations of the states at all measurements.
 
     Attributes
     ----------
     precision : ndarray, shape (m, 2)
-        Precision of the measured position (1/m²) and of the velocity prior zero (s²/m²); 0
-        without.
+        Precision of the measured position (1/m²), and of the prior velocity zero (s²/m²); 0 if
+        there is none.
     length_s : ndarray, shape (m - 1,)
         Intervals between successive states.
-    inverse : ndarray, shape (3, m - 1)
-        Elements 00, 01, 11 of Q⁻¹; zero between stretches.
+    inverse_q : ndarray, shape (3, m - 1)
+        Elements 00, 01, 11 of Q⁻¹; zero between segments.
     inverse_sqrt_q11 : ndarray, shape (m - 1,)
-        1/√Q₁₁, without the rounding of Q⁻¹; zero between stretches.
+        1/√Q₁₁, without the rounding of Q⁻¹; zero between segments.
     bands, lower : ndarray, shape (2 + states, states · m)
         Bands of A and of its Cholesky factor.
     log_determinant : float
@@ -378,7 +403,7 @@ class BandedSystem:
 
     precision: Array
     length_s: Array
-    inverse: Array
+    inverse_q: Array
     inverse_sqrt_q11: Array
     bands: Array
     lower: Array
@@ -390,43 +415,44 @@ class BandedSystem:
         return len(self.bands) - 2
 
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[tuple[Array, Array], Array]:
-        """Whiten signals: products under the inverse covariance become a difference of two.
+        """Whiten signals, so that their inner products under the inverse covariance are simple.
 
-        They are the products of ``intervals`` minus those of ``explained``, plus those of the
-        measurements over their σ, which most signals do not have.
+        These are the products of ``intervals``, minus the products of ``explained``, plus the
+        products of the measurements over their σ (zero for most signals).
 
         Parameters
         ----------
         measured_m : ndarray, shape (..., m)
         dp, dv : ndarray, shape (..., m - 1)
-            Δp (m) and Δv (m/s) of the intervals; ignored between stretches.
+            Δp (m) and Δv (m/s) of the intervals; ignored between segments.
 
         Returns
         -------
         intervals : two ndarray, shape (..., m - 1)
-            Whitened Δp and Δv; zero between stretches.
+            Whitened Δp and Δv; zero between segments.
         explained : ndarray, shape (..., states · m)
+            Part of the signals that the states explain.
         """
-        intervals, right = self._interval_sides(measured_m, dp, dv)
-        explained, _ = lapack.dtbtrs(self.lower, right.T, uplo="L", overwrite_b=1)
+        intervals, right_side = self._interval_sides(measured_m, dp, dv)
+        explained, _ = lapack.dtbtrs(self.lower, right_side.T, uplo="L", overwrite_b=1)
         return intervals, explained.T.reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
         """Return the estimated states, position and velocity first, shape (..., m, states)."""
-        _, right = self._interval_sides(measured_m, dp, dv)
-        state, _ = lapack.dpbtrs(self.lower, right.T, lower=1, overwrite_b=1)
+        _, right_side = self._interval_sides(measured_m, dp, dv)
+        state, _ = lapack.dpbtrs(self.lower, right_side.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.states))
 
     def _interval_sides(
         self, measured_m: Array, dp: Array, dv: Array
     ) -> tuple[tuple[Array, Array], Array]:
-        """Return whitened intervals, and the right side, shape (columns, states · m)."""
-        i00, i01, _ = self.inverse
-        # Q⁻¹ = UᵀU; zero between stretches
+        """Return whitened intervals, and the right side of the equations, (columns, states · m)."""
+        i00, i01, _ = self.inverse_q
+        # Q⁻¹ = UᵀU; zero between segments
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
-        first, second = u00 * dp + u01 * dv, self.inverse_sqrt_q11 * dv
-        g0, g1 = u00 * first, u01 * first + self.inverse_sqrt_q11 * second
+        whitened_0, whitened_1 = u00 * dp + u01 * dv, self.inverse_sqrt_q11 * dv
+        g0, g1 = u00 * whitened_0, u01 * whitened_0 + self.inverse_sqrt_q11 * whitened_1
         right_side = np.zeros((*dp.shape[:-1], len(self.precision), self.states))
         right_side[..., 1:, 0], right_side[..., 1:, 1] = g0, g1
         right_side[..., :-1, 0] -= g0
@@ -437,13 +463,13 @@ class BandedSystem:
             weighted_m = self.precision[:, 0] * measured_m
             right_side[..., 0] += weighted_m
             right_side[..., 2:] += weighted_m[..., None]
-        return (first, second), right_side.reshape(-1, self.states * len(self.precision))
+        return (whitened_0, whitened_1), right_side.reshape(-1, self.states * len(self.precision))
 
     def position_variance(self) -> Array:
         """Return the variance of each state's position given all data (m²), shape (m,).
 
-        The information about a state is that from all earlier and all later states on its block of
-        A: the blocks of the Cholesky factors from both ends (Fraser and Potter 1969).
+        The information about a state is the sum of the information from all earlier and from all
+        later states: blocks of the Cholesky factors from both ends (Fraser and Potter 1969).
         """
         # A with reversed rows and columns
         reversed_bands, size = np.zeros_like(self.bands), self.bands.shape[1]
@@ -462,9 +488,9 @@ class BandedSystem:
 def factorise(
     length_s: Array,
     noise: Array,
-    joined: BoolArray,
+    is_joined: BoolArray,
     precision: Array,
-    slow: tuple[float, float] | None = None,
+    correlated_noise: tuple[float, float] | None = None,
 ) -> BandedSystem:
     """Factorise the normal equations of the states at the measurements.
 
@@ -474,34 +500,36 @@ def factorise(
         Intervals between the states.
     noise : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q of each interval.
-    joined : ndarray of bool, shape (m - 1,)
-        False between stretches, which are independent.
+    is_joined : ndarray of bool, shape (m - 1,)
+        False between segments, which are independent.
     precision : ndarray, shape (m, 2)
-        Precision of the measured positions (1/m², 0 if not used) and of the velocity prior zero.
-    slow : (float, float), optional
+        Precision of the measured positions (1/m², 0 if not used), and of the prior velocity zero.
+    correlated_noise : (float, float), optional
         See :class:`Positions`; positions must then have measurements only, without priors.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        A stretch has too few measurements for a position and a velocity.
+        A segment has too few measurements for a position and a velocity.
     """
     q00, q01, q11 = noise
-    measured = precision[:, 0]
-    min_noise = MIN_NOISE_SHARE**2 * (1.0 / np.median(measured[measured > 0.0]) + q00)
-    # Q of a single step is invertible only by min_noise, which rounding would hide
+    measured_precision = precision[:, 0]
+    min_noise = MIN_NOISE_SHARE**2 * (
+        1.0 / np.median(measured_precision[measured_precision > 0.0]) + q00
+    )
+    # Q of a single step has rank one: only min_noise, which rounding can hide, makes it invertible
     product = q00 * q11
     raw_determinant = product - q01**2
     determinant = (
         np.where(raw_determinant > MIN_DETERMINANT_SHARE * product, raw_determinant, 0.0)
         + min_noise * q11
     )
-    inverse = np.where(joined, np.stack([q11, -q01, q00 + min_noise]) / determinant, 0.0)
-    i00, i01, i11 = inverse
+    inverse_q = np.where(is_joined, np.stack([q11, -q01, q00 + min_noise]) / determinant, 0.0)
+    i00, i01, i11 = inverse_q
     slope = i00 * length_s
     cross = slope + i01
     # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I], by columns as in LAPACK's band storage
-    states = 2 if slow is None else 3
+    states = 2 if correlated_noise is None else 3
     columns = np.zeros((len(precision), states, states + 2))
     position, velocity = columns[:, 0], columns[:, 1]
     position[:, 0], velocity[:, 0] = precision.T
@@ -513,24 +541,26 @@ def factorise(
     velocity[:-1, 0] += (cross + i01) * length_s + i11
     position[:-1, states], position[:-1, states + 1] = -i00, -i01
     velocity[:-1, states - 1], velocity[:-1, states] = -cross, -(i01 * length_s + i11)
-    log_noise = np.sum(np.log(determinant[joined]))
-    if slow is not None:
-        sigma, tau_s = slow
-        rho = np.where(joined, np.exp(-length_s / tau_s), 0.0)
-        variance = sigma**2 * np.append(1.0, 1.0 - rho**2)  # variance of the new part in each state
-        error = columns[:, 2]
-        position[:, 2] = measured
-        error[:, 0] = measured + 1.0 / variance
-        error[:-1, 0] += rho**2 / variance[1:]
-        error[:-1, states] = -rho / variance[1:]
-        log_noise += np.sum(np.log(variance))
+    log_noise = np.sum(np.log(determinant[is_joined]))
+    if correlated_noise is not None:
+        correlated_sigma_m, tau_s = correlated_noise
+        rho = np.where(is_joined, np.exp(-length_s / tau_s), 0.0)
+        correlated_variance = correlated_sigma_m**2 * np.append(
+            1.0, 1.0 - rho**2
+        )  # variance of the new part in each state
+        correlated = columns[:, 2]
+        position[:, 2] = measured_precision
+        correlated[:, 0] = measured_precision + 1.0 / correlated_variance
+        correlated[:-1, 0] += rho**2 / correlated_variance[1:]
+        correlated[:-1, states] = -rho / correlated_variance[1:]
+        log_noise += np.sum(np.log(correlated_variance))
     bands = columns.reshape(-1, states + 2).T
     lower, is_singular = lapack.dpbtrf(bands, lower=1)
     if is_singular:
-        raise np.linalg.LinAlgError("a stretch has too few measurements")
+        raise np.linalg.LinAlgError("a segment has too few measurements")
     log_lower = 2.0 * np.sum(np.log(lower[0]))
     log_determinant = log_lower + log_noise - np.sum(np.log(precision[precision > 0.0]))
-    inverse_sqrt_q11 = np.where(joined, 1.0 / np.sqrt(q11), 0.0)
+    inverse_sqrt_q11 = np.where(is_joined, 1.0 / np.sqrt(q11), 0.0)
     return BandedSystem(
-        precision, length_s, inverse, inverse_sqrt_q11, bands, lower, float(log_determinant)
+        precision, length_s, inverse_q, inverse_sqrt_q11, bands, lower, float(log_determinant)
     )

@@ -1,4 +1,4 @@
-"""Formulas of KF along one axis, which the replay and all estimates share.
+"""Formulas of KF along one axis, used by the replay and by all estimates.
 
 State x = [position, velocity]; input a, the acceleration averaged over the step::
 
@@ -8,9 +8,8 @@ State x = [position, velocity]; input a, the acceleration averaged over the step
 With dt = DT, Q equals the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]]. For other steps the
 velocity noise per second is the same, so SIGMA_A does not depend on the rate.
 
-The functions compute element by element, so they accept floats (one filter, fifty times faster than
-arrays of one element) and arrays (many filters). A covariance is the tuple of its elements 00, 01,
-11.
+The functions accept floats (one filter, fifty times faster than arrays of one element) and arrays
+(many filters). A covariance is the tuple of its elements 00, 01, 11.
 """
 
 from typing import TypeVar
@@ -28,6 +27,7 @@ INITIAL_COVARIANCE = (INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2)
 H = np.array([[1.0, 0.0]])
 
 T = TypeVar("T", float, Array)
+# Elements 00, 01, 11 of a symmetric 2 × 2 matrix
 Symmetric = tuple[T, T, T]
 
 
@@ -55,8 +55,8 @@ def process_noise_unit(dt_s: T) -> Symmetric[T]:
 def continuous_noise_unit(dt_s: T) -> Symmetric[T]:
     """Return the process noise of many short steps of total ``dt_s``, per SIGMA_A² · DT.
 
-    Limit of ΣFQFᵀ: the position element dt³/4 of one step becomes dt³/3, since the acceleration may
-    change within the interval.
+    Limit of ΣFQFᵀ: the position element dt³/4 of one step becomes dt³/3, because the acceleration
+    may change within the interval.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
@@ -74,33 +74,33 @@ def propagate_covariance(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
 
 
 def predict_step(
-    position: T, velocity: T, covariance: Symmetric[T], acceleration: T, density: T, dt_s: T
+    position: T, velocity: T, covariance: Symmetric[T], acceleration: T, noise_density: T, dt_s: T
 ) -> tuple[T, T, Symmetric[T]]:
     """Predict position, velocity and covariance: x = Fx + Ba, P = FPFᵀ + Q.
 
-    ``density`` (m²/s³) is the increase of the velocity variance per second, SIGMA_A² · DT.
+    ``noise_density`` (m²/s³) is the increase of the velocity variance per second, SIGMA_A² · DT.
     """
     (p00, p01, p11), (q00, q01, q11) = (
         propagate_covariance(covariance, dt_s),
         process_noise_unit(dt_s),
     )
-    after = p00 + density * q00, p01 + density * q01, p11 + density * q11
+    predicted = p00 + noise_density * q00, p01 + noise_density * q01, p11 + noise_density * q11
     position, velocity = propagate_state(position, velocity, acceleration, dt_s)
-    return position, velocity, after
+    return position, velocity, predicted
 
 
 def update_step(
-    position: T, velocity: T, covariance: Symmetric[T], measured: T, variance: T
+    position: T, velocity: T, covariance: Symmetric[T], measured_m: T, variance: T
 ) -> tuple[tuple[T, T, T, T], tuple[T, T, Symmetric[T]]]:
     """Update with a measurement: ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P.
 
     Returns
     -------
     tuple
-        ν (m), S (m²) and both gains; then position, velocity and covariance after the update.
+        ν (m), S (m²) and the two gains; then position, velocity and covariance after the update.
     """
     p00, p01, p11 = covariance
-    nu, s = measured - position, p00 + variance
+    nu, s = measured_m - position, p00 + variance
     k0, k1 = p00 / s, p01 / s
-    after = variance * k0, variance * k1, p11 - k1 * p01
-    return (nu, s, k0, k1), (position + k0 * nu, velocity + k1 * nu, after)
+    updated = variance * k0, variance * k1, p11 - k1 * p01
+    return (nu, s, k0, k1), (position + k0 * nu, velocity + k1 * nu, updated)

@@ -13,6 +13,9 @@ SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
 SIGMA_Z_RANGE_M = (1e-4, 100.0)
 DT_RANGE_S = (1e-3, 1.0)
 CLOCK_OFFSET_RANGE_S = (-10.0, 10.0)
+_RANGES = (SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M, DT_RANGE_S, CLOCK_OFFSET_RANGE_S)
+# Unit of each setting that is a number
+UNITS = {"sigma_a_m_s2": "m/s²", "sigma_z_m": "m", "dt_s": "s", "clock_offset_s": "s"}
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class Settings:
     dt_s : float
         Prediction interval DT.
     input : {"imu", "zero"}
-        Acceleration measured by the IMU, or the lesson's constant-velocity case.
+        Acceleration measured by the IMU, or zero: the lesson's constant-velocity model.
     clock_offset_s : float
         Added to the timestamps of the position source.
 
@@ -45,12 +48,8 @@ class Settings:
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value, (low, high), unit in (
-            ("sigma_a_m_s2", self.sigma_a_m_s2, SIGMA_A_RANGE_M_S2, "m/s²"),
-            ("sigma_z_m", self.sigma_z_m, SIGMA_Z_RANGE_M, "m"),
-            ("dt_s", self.dt_s, DT_RANGE_S, "s"),
-            ("clock_offset_s", self.clock_offset_s, CLOCK_OFFSET_RANGE_S, "s"),
-        ):
+        for (name, unit), (low, high) in zip(UNITS.items(), _RANGES, strict=True):
+            value = getattr(self, name)
             if not low <= value <= high:  # false for NaN too
                 raise SettingsError(
                     f"`{name}` {value:g} is out of range: give {low:g} to {high:g} {unit}."

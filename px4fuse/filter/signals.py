@@ -1,4 +1,4 @@
-"""One-dimensional signals of a flight: axes, NED acceleration, resampling.
+"""Positions and acceleration of a flight along its axes.
 
 NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
@@ -55,9 +55,9 @@ class Acceleration:
     integral_m_s : ndarray, shape (n,)
         Integral along the axis (trapezoidal, from the first sample), for step averages.
     gap_time_s, gap_integral_s : ndarray, shape (k,)
-        Ends of the gaps and of the data, and accumulated gap time (s) at each.
+        Start and end times of the gaps and of the data, and accumulated gap time (s) at each.
     rms_m_s2 : float
-        Root mean square of the signal: error of the input inside a gap.
+        Root mean square of the acceleration: standard deviation of the input in a gap.
     """
 
     time_s: Array
@@ -95,7 +95,7 @@ class Axis:
     acceleration : Acceleration or Unavailable
         Input of KF.
     elongation : float or None
-        Ratio of the track's length to its width; None if the direction was given.
+        Ratio of the track's length to its width; None if the heading was given.
     """
 
     name: str
@@ -110,30 +110,30 @@ class Axis:
     __repr__ = one_line_repr
 
     @property
-    def called(self) -> str:
+    def label(self) -> str:
         """Name in messages; "the aisle" only for an elongated track or with --heading."""
         if self.name != AISLE:
             return self.name
-        flown = self.elongation is None or self.elongation >= MIN_AISLE_ELONGATION
-        return "the aisle" if flown else "the main direction"
+        is_aisle = self.elongation is None or self.elongation >= MIN_AISLE_ELONGATION
+        return "the aisle" if is_aisle else "the main direction"
 
 
 def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity, at the IMU's timestamps.
 
-    The attitude is interpolated on the sphere (slerp, Shoemake 1985), since default logs contain it
-    at a tenth of the IMU's rate. The result is cached as long as the flight exists.
+    Default logs contain the attitude at a tenth of the IMU's rate, so it is interpolated (slerp,
+    Shoemake 1985). The result is cached as long as the flight exists.
 
     Returns
     -------
     DataFrame, shape (n, 3), m/s², or Unavailable
     """
-    if flight not in _ACCELERATION_CACHE:
-        _ACCELERATION_CACHE[flight] = _ned_acceleration(flight)
-    return _ACCELERATION_CACHE[flight]
+    if flight not in _NED_ACCELERATIONS:
+        _NED_ACCELERATIONS[flight] = _ned_acceleration(flight)
+    return _NED_ACCELERATIONS[flight]
 
 
-_ACCELERATION_CACHE: WeakKeyDictionary[Flight, pd.DataFrame | Unavailable] = WeakKeyDictionary()
+_NED_ACCELERATIONS: WeakKeyDictionary[Flight, pd.DataFrame | Unavailable] = WeakKeyDictionary()
 
 
 def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
@@ -141,8 +141,8 @@ def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
         return flight.imu
     if isinstance(flight.attitude, Unavailable):
         return flight.attitude
-    known = flight.attitude.index.to_numpy()
-    imu = flight.imu[(flight.imu.index >= known[0]) & (flight.imu.index <= known[-1])]
+    attitude_s = flight.attitude.index.to_numpy()
+    imu = flight.imu[(flight.imu.index >= attitude_s[0]) & (flight.imu.index <= attitude_s[-1])]
     if len(imu) < 2:
         return Unavailable(
             "acceleration in NED",
@@ -151,7 +151,7 @@ def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
         )
     quaternions = flight.attitude[Columns.QUATERNION].to_numpy(copy=True)
     rotations = Rotation.from_quat(quaternions, scalar_first=True)
-    body_to_ned = Slerp(known, rotations)(imu.index.to_numpy())
+    body_to_ned = Slerp(attitude_s, rotations)(imu.index.to_numpy())
     acceleration = body_to_ned.apply(imu[Columns.SPECIFIC_FORCE].to_numpy(copy=True))
     acceleration[:, 2] += constants.g
     return pd.DataFrame(acceleration, index=imu.index, columns=list(AXIS_NAMES))
@@ -163,16 +163,19 @@ def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]
     Returns
     -------
     heading_deg : float
-        In [0, 180): an aisle has no front.
+        In [0, 180): both directions along an aisle are equivalent.
     elongation : float
-        Ratio of the standard deviations along and across it; 1 without a distinct direction.
+        Ratio of the standard deviations along and across this direction; 1 without a main
+        direction.
     """
-    horizontal = within(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
+    horizontal = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
     centred = horizontal - horizontal.mean(axis=0)
-    _, singular, directions = np.linalg.svd(centred, full_matrices=False)
-    heading = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
-    elongation = float(singular[0] / singular[1]) if singular[1] > 0 else float("inf")
-    return heading, elongation
+    _, singular_values, directions = np.linalg.svd(centred, full_matrices=False)
+    heading_deg = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
+    elongation = (
+        float(singular_values[0] / singular_values[1]) if singular_values[1] > 0 else float("inf")
+    )
+    return heading_deg, elongation
 
 
 def make_axes(
@@ -191,7 +194,7 @@ def make_axes(
     track : PositionTrack
     segment : Segment
     names : tuple of str, optional
-        From "north", "east", "down", "aisle"; default: all that the source supports.
+        Some of "north", "east", "down", "aisle"; by default all for which the source has positions.
     heading_deg : float, optional
         Heading of the aisle, clockwise from north; default: main direction of the track.
 
@@ -203,21 +206,23 @@ def make_axes(
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
     acceleration = ned_acceleration(flight)
-    known = (*AXIS_NAMES, AISLE)
-    axis_names = tuple(dict.fromkeys(known if names is None else names))
+    valid_names = (*AXIS_NAMES, AISLE)
+    axis_names = tuple(dict.fromkeys(valid_names if names is None else names))
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
-    if unknown := [name for name in axis_names if name not in known]:
-        raise SettingsError(f"Axis {unknown[0]} is not known.", f"Use one of {', '.join(known)}.")
+    if unknown := [name for name in axis_names if name not in valid_names]:
+        raise SettingsError(
+            f"Axis {unknown[0]} is not known.", f"Use one of {', '.join(valid_names)}."
+        )
     source_label = f"{flight.log.name}: {track.name}"
     axes = []
     for name in axis_names:
-        direction, heading, note, elongation = _direction(name, track, segment, heading_deg)
+        direction, heading, note, elongation = _axis_direction(name, track, segment, heading_deg)
         samples = track.samples
         if name == "down" and track.barometer is not None:
             samples = track.barometer.reindex(columns=Columns.POSITION)
-        samples = within(samples, segment)
-        projected = along(samples, Columns.POSITION, direction)
+        samples = cut_to_segment(samples, segment)
+        projected = weighted_sum(samples, Columns.POSITION, direction)
         is_finite = np.isfinite(projected)
         if np.count_nonzero(is_finite) < MIN_MEASUREMENTS:
             if names is None:
@@ -233,16 +238,16 @@ def make_axes(
     return tuple(axes)
 
 
-def too_few_measurements(what: str, count: int, least: int) -> Unavailable:
-    """Return Unavailable for an estimate from too few measurements."""
+def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
+    """Return Unavailable for an analysis with too few measurements."""
     return Unavailable(
-        what,
-        f"only {count} measurements (at least {least} are needed)",
+        name,
+        f"only {count} measurements (at least {min_count} are needed)",
         "Analyse a longer segment, or log the source at a higher rate.",
     )
 
 
-def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
+def weighted_sum(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
     """Return the weighted sum of columns; columns with weight zero may be NaN."""
     total = np.zeros(len(frame))
     for column, weight in zip(columns, weights, strict=True):
@@ -251,7 +256,7 @@ def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
     return total
 
 
-def _direction(
+def _axis_direction(
     name: str, track: PositionTrack, segment: Segment, heading_deg: float | None
 ) -> tuple[Array, float | None, str, float | None]:
     elongation = None
@@ -259,12 +264,12 @@ def _direction(
         axis_index = AXIS_NAMES.index(name)
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), "", None
     if heading_deg is None:
-        heading, elongation = aisle_heading(track, segment)
+        axis_heading_deg, elongation = aisle_heading(track, segment)
         note = f"main direction of the track, length / width {elongation:.1f}"
     else:
-        heading, note = heading_deg, "given with --heading"
-    angle = np.radians(heading)
-    return np.array([np.cos(angle), np.sin(angle), 0.0]), heading, note, elongation
+        axis_heading_deg, note = heading_deg, "given with --heading"
+    angle_rad = np.radians(axis_heading_deg)
+    return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note, elongation
 
 
 def project_acceleration(
@@ -277,42 +282,42 @@ def project_acceleration(
     acceleration : DataFrame, shape (n, 3), m/s², NED, or Unavailable
     direction : ndarray, shape (3,)
     segment : Segment
-        Segment of the root mean square.
+        Segment over which the root mean square is computed.
     """
     if isinstance(acceleration, Unavailable):
         return acceleration
-    time = acceleration.index.to_numpy()
-    ned = acceleration.to_numpy()
-    value = ned @ direction
-    inside = (time >= segment.start_s) & (time <= segment.end_s)
-    if np.count_nonzero(inside) < 2:
+    time_s = acceleration.index.to_numpy()
+    ned_m_s2 = acceleration.to_numpy()
+    along_m_s2 = ned_m_s2 @ direction
+    is_inside = (time_s >= segment.start_s) & (time_s <= segment.end_s)
+    if np.count_nonzero(is_inside) < 2:
         return Unavailable(
             "IMU",
             "no IMU samples in the analysed segment",
             "Choose --start and --end within the IMU data.",
         )
-    is_gap = imu_gaps(time)
-    gap, passed_s = np.flatnonzero(is_gap), np.cumsum(np.where(is_gap, np.diff(time), 0.0))
-    ends = np.unique([0, *gap, *(gap + 1), len(time) - 1])
+    is_gap = imu_gaps(time_s)
+    gap_rows, gap_sum_s = np.flatnonzero(is_gap), np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
+    gap_ends = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
-        time_s=time,
-        ned_m_s2=ned,
+        time_s=time_s,
+        ned_m_s2=ned_m_s2,
         direction=direction,
-        integral_m_s=cumulative_integral(value, time),
-        gap_time_s=time[ends],
-        gap_integral_s=np.append(0.0, passed_s)[ends],
-        rms_m_s2=float(np.sqrt(np.mean(value[inside] ** 2))),
+        integral_m_s=cumulative_integral(along_m_s2, time_s),
+        gap_time_s=time_s[gap_ends],
+        gap_integral_s=np.append(0.0, gap_sum_s)[gap_ends],
+        rms_m_s2=float(np.sqrt(np.mean(along_m_s2[is_inside] ** 2))),
     )
 
 
 def imu_gaps(time_s: Array) -> BoolArray:
-    """Return True for intervals between IMU samples that are gaps, shape (n - 1,)."""
+    """Return a mask of the intervals between IMU samples that are gaps, shape (n - 1,)."""
     interval = np.diff(time_s)
     return interval > max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(interval)))
 
 
 def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Array]:
-    """Return the mean acceleration over each step, and the share of the step in an IMU gap.
+    """Return the mean acceleration over each step, and the fraction of the step in an IMU gap.
 
     Parameters
     ----------
@@ -324,17 +329,19 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
     -------
     mean_m_s2 : ndarray, shape (n,)
     gap_fraction : ndarray, shape (n,)
-        1 also outside the IMU's time span, with mean 0.
+        1 outside the time span of the IMU, where the mean is 0.
     """
     edges = np.asarray(edges, dtype=np.float64)
-    length = np.diff(edges)
-    velocity = np.interp(edges, acceleration.time_s, acceleration.integral_m_s)
-    gap = np.interp(edges, acceleration.gap_time_s, acceleration.gap_integral_s)
-    covered = np.clip(edges, acceleration.time_s[0], acceleration.time_s[-1])
-    outside = 1.0 - np.diff(covered) / length
-    return np.diff(velocity) / length, np.clip(np.diff(gap) / length + outside, 0.0, 1.0)
+    length_s = np.diff(edges)
+    velocity_m_s = np.interp(edges, acceleration.time_s, acceleration.integral_m_s)
+    gap_s = np.interp(edges, acceleration.gap_time_s, acceleration.gap_integral_s)
+    covered_s = np.clip(edges, acceleration.time_s[0], acceleration.time_s[-1])
+    outside_fraction = 1.0 - np.diff(covered_s) / length_s
+    return np.diff(velocity_m_s) / length_s, np.clip(
+        np.diff(gap_s) / length_s + outside_fraction, 0.0, 1.0
+    )
 
 
-def within(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
+def cut_to_segment(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
     """Return the rows of a time-indexed frame inside a segment, both ends included."""
     return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]

@@ -10,8 +10,8 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight import Unavailable
 
-# s; closer times are one step: timestamps have a resolution of 1 µs
-SAME_TIME_S = 5e-7
+# s; times within this distance are one step: timestamps have a resolution of 1 µs
+MAX_SAME_TIME_S = 5e-7
 
 
 @dataclass(frozen=True)
@@ -22,16 +22,18 @@ class Timeline:
     ----------
     time_s : ndarray, shape (n,)
         Strictly increasing; the first is the time of the initial state.
-    measurement : ndarray of int, shape (n,)
+    measurement_index : ndarray of int, shape (n,)
         Index of the measurement at that time, -1 without one.
     acceleration_m_s2 : ndarray, shape (n - 1,)
         Mean acceleration over each step.
     input_variance_m2_s4 : ndarray, shape (n - 1,)
-        Added to SIGMA_A² in gaps of the IMU.
+        Variance that is added to SIGMA_A² in gaps of the IMU.
+    input_gap_s : float
+        Time without IMU data.
     """
 
     time_s: Array
-    measurement: IntArray
+    measurement_index: IntArray
     acceleration_m_s2: Array
     input_variance_m2_s4: Array
     input_gap_s: float
@@ -47,32 +49,36 @@ def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None =
         the start.
     """
     start_s = axis.measurement_time_s[0] if initial is None else initial.time_s
-    is_usable = axis.measurement_time_s > start_s + SAME_TIME_S
+    is_usable = axis.measurement_time_s > start_s + MAX_SAME_TIME_S
     measured_s = axis.measurement_time_s[is_usable]
     if not len(measured_s):
         raise SettingsError(f"axis {axis.name}: no measurement after the start at {start_s:.2f} s.")
     count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
-    grid = start_s + settings.dt_s * np.arange(count)
+    grid_s = start_s + settings.dt_s * np.arange(count)
     # a measurement's timestamp replaces a grid time that coincides with it
-    nearest = measured_s[np.clip(np.searchsorted(measured_s, grid), 0, len(measured_s) - 1)]
-    previous = measured_s[np.clip(np.searchsorted(measured_s, grid) - 1, 0, len(measured_s) - 1)]
-    distance = np.minimum(np.abs(nearest - grid), np.abs(previous - grid))
-    time = np.union1d(grid[distance > SAME_TIME_S], measured_s)
-    if time[0] > start_s + SAME_TIME_S:
-        time = np.concatenate([[start_s], time])
-    measurement = np.full(len(time), -1, dtype=np.intp)
-    measurement[np.searchsorted(time, measured_s)] = np.flatnonzero(is_usable)
-    step_count = len(time) - 1
+    next_s = measured_s[np.clip(np.searchsorted(measured_s, grid_s), 0, len(measured_s) - 1)]
+    previous_s = measured_s[
+        np.clip(np.searchsorted(measured_s, grid_s) - 1, 0, len(measured_s) - 1)
+    ]
+    distance_s = np.minimum(np.abs(next_s - grid_s), np.abs(previous_s - grid_s))
+    time_s = np.union1d(grid_s[distance_s > MAX_SAME_TIME_S], measured_s)
+    if time_s[0] > start_s + MAX_SAME_TIME_S:
+        time_s = np.concatenate([[start_s], time_s])
+    measurement_index = np.full(len(time_s), -1, dtype=np.intp)
+    measurement_index[np.searchsorted(time_s, measured_s)] = np.flatnonzero(is_usable)
+    step_count = len(time_s) - 1
     if settings.input == "zero":
-        return Timeline(time, measurement, np.zeros(step_count), np.zeros(step_count), 0.0)
+        return Timeline(time_s, measurement_index, np.zeros(step_count), np.zeros(step_count), 0.0)
     if isinstance(axis.acceleration, Unavailable):
         raise SettingsError("`input` imu needs an acceleration", f"{axis.acceleration}")
-    mean, gap = step_means(axis.acceleration, time)
-    gap_s = gap * np.diff(time)
-    # In a gap of T seconds the unknown acceleration is constant: its velocity error is rms·T, not
-    # rms·√(DT·T) as for white noise, so its variance is scaled by T/DT.
-    interval_index = np.searchsorted(np.flatnonzero(measurement >= 0), np.arange(1, len(time)))
+    mean_m_s2, gap_fraction = step_means(axis.acceleration, time_s)
+    gap_s = gap_fraction * np.diff(time_s)
+    # In a gap of T seconds the unknown acceleration is assumed constant. The velocity error is then
+    # rms·T, not rms·√(DT·T) as for white noise, so the variance is scaled by T/DT.
+    interval_index = np.searchsorted(
+        np.flatnonzero(measurement_index >= 0), np.arange(1, len(time_s))
+    )
     gap_of_interval = np.bincount(interval_index, weights=gap_s)[interval_index]
-    persistence = np.maximum(gap_of_interval / settings.dt_s, 1.0)
-    variance = gap * persistence * axis.acceleration.rms_m_s2**2
-    return Timeline(time, measurement, mean, variance, float(np.sum(gap_s)))
+    variance_scale = np.maximum(gap_of_interval / settings.dt_s, 1.0)
+    variance = gap_fraction * variance_scale * axis.acceleration.rms_m_s2**2
+    return Timeline(time_s, measurement_index, mean_m_s2, variance, float(np.sum(gap_s)))

@@ -1,13 +1,14 @@
 """Time offset between position source and IMU, by joint maximum likelihood.
 
-Positions whose timestamps are wrong by τ lag or lead the measured acceleration. Innovations hardly
-grow, because the filter follows; the disagreement with the acceleration shows the offset. So the
-likelihood of the positions is maximised over τ. The constants of :mod:`px4fuse.filter.imu_motion`
-that could be confused with τ are marginalised, and the noises are maximised at every τ.
+Positions with timestamps that are wrong by τ lag or lead the measured acceleration. Innovations
+hardly grow, because KF follows the positions; the difference from the acceleration shows the
+offset. So the likelihood of the positions is maximised over τ. The constants of
+:mod:`px4fuse.filter.imu_motion` that could be confused with τ are marginalised, and the likelihood
+is maximised over the noises at every τ.
 
-The noise of the IMU moves with τ, too: it looks like motion that the positions do not follow. That
-does not bias the estimate, but increases its scatter beyond the curvature of the likelihood. The
-factor is simulated, and the interval is widened by it (sandwich estimate, White 1982).
+The noise of the IMU looks like motion that the positions do not follow, and is shifted by τ, too.
+It does not bias the estimate, but increases the variance of the estimate beyond the curvature of
+the likelihood. The factor is simulated and widens the interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -22,34 +23,34 @@ from px4fuse.arrays import Array
 from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
-    COARSE_POINTS,
-    CONSTANT_SIGMA,
+    COARSE_OFFSETS,
+    CONSTANT_SIGMAS,
     MAX_OFFSET_S,
     PreparedMotion,
     SignalCache,
     prepare_motion,
 )
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal_likelihood import FittedPositions, products_by_stretch
+from px4fuse.filter.marginal_likelihood import FittedPositions, products_by_segment
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, within
+from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share, Span
 
-FINE_POINTS, CURVE_POINTS = 11, 121
-# Prior σ of the heading. With a wrong GNSS delay, EKF2 rotates its heading until positions agree,
-# by 5° for 0.2 s: a narrow prior with GNSS would hide the time offset
-HEADING_SIGMA_RAD, GNSS_HEADING_SIGMA_RAD = float(CONSTANT_SIGMA[2]), 0.2
-# s; a wider interval gives no usable time offset
+FINE_OFFSETS, CURVE_OFFSETS = 11, 121
+# Prior σ of the heading. With a wrong GNSS delay, EKF2 rotates its heading to fit the positions, by
+# 5° for 0.2 s: a narrow prior with GNSS would hide the time offset
+HEADING_SIGMA_RAD, GNSS_HEADING_SIGMA_RAD = float(CONSTANT_SIGMAS[2]), 0.2
+# s; with a wider half-interval the time offset is not determined
 MAX_HALF_INTERVAL_S = 0.15
-# s; parts with a larger σ are not used to detect a change
+# s; parts with a larger σ are not used to detect a change of the offset
 MAX_PART_SIGMA_S = 0.15
-# p value below which the offsets of the parts differ significantly
+# p value below which the offset changes significantly
 MAX_CHANGE_P = 0.005
 # Significance limit of an offset in σ: false alarm probability 0.3 %
 OFFSET_SIGMAS = 3.0
-# Simulations of the scatter due to IMU noise
+# Number of simulations of the IMU noise
 SIMULATION_COUNT = 96
 # Step of ln σ for the derivatives with respect to the noises
 LOG_SIGMA_STEP = 0.1
@@ -65,7 +66,7 @@ class PartOffset(Record, frozen=True):
 
 
 class Clock(Record, frozen=True, kw_only=True):
-    """Seconds to add to the position source's timestamps, including the applied offset.
+    """Time offset to add to the timestamps of the position source, including the applied offset.
 
     Attributes
     ----------
@@ -74,7 +75,7 @@ class Clock(Record, frozen=True, kw_only=True):
     interval_s : (float, float)
         95 % profile-likelihood interval, widened by the IMU's noise.
     sigma_s : float
-        Standard deviation by the curvature at the maximum, widened likewise.
+        Standard deviation from the curvature at the maximum, widened by the noise of the IMU.
     applied_s : float
         Offset already added to the timestamps.
     is_determinable : bool
@@ -155,7 +156,8 @@ def estimate_time_offset(
     settings : Settings
         Its ``dt_s`` defines the unit of SIGMA_A.
     noises : Noises
-        Initial values without biases; with a random walk for a source that may drift (odometry).
+        Initial values, for a model with biases; with a random walk for a source that may drift
+        (odometry).
     outlier_time_s : ndarray, optional
         Timestamps of measurements to exclude.
     progress : callable
@@ -168,7 +170,7 @@ def estimate_time_offset(
     """
     # GNSS is noisier vertically, and all axes share one SIGMA_Z
     axes = 2 if track.origin.is_gnss else 3
-    samples = within(track.samples, segment)[Columns.POSITION[:axes]]
+    samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axes]]
     samples = samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
         samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]
@@ -185,58 +187,60 @@ def estimate_time_offset(
         return prepared_motion
     progress("time offset")
     coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
-    offset, _ = prepared_motion.search(noises)
-    sigma, width = 0.0, 0.1
-    for each_motion in (coarse_motion, prepared_motion):
+    offset_s, _ = prepared_motion.search_offset(noises)
+    sigma_s, half_width_s = 0.0, 0.1
+    for motion in (coarse_motion, prepared_motion):
         noises = maximise_likelihood(
-            [each_motion.at(offset)], noises, each_motion.weight, outliers=False
+            [motion.at(offset_s)], noises, motion.weight, outliers=False
         ).noises
-        curve = _offset_grid(offset, width, FINE_POINTS)
-        totals = fit_noises(each_motion.blocks(curve), noises, each_motion.weight).totals()[0]
-        offset, sigma = _minimum_and_sigma(curve, totals)
-        width = float(np.clip(3.5 * sigma, 0.01, MAX_OFFSET_S))
-    factor = _variance_inflation(prepared_motion, offset, noises, sigma**-2.0)
+        curve_s = _offset_grid(offset_s, half_width_s, FINE_OFFSETS)
+        totals = fit_noises(motion.position_batches(curve_s), noises, motion.weight).scores()[0]
+        offset_s, sigma_s = _minimum_and_sigma(curve_s, totals)
+        half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
+    variance_factor = _simulate_variance_factor(prepared_motion, offset_s, noises, sigma_s**-2.0)
     while True:
-        points, curve = (
-            _offset_grid(offset, width, count) for count in (FINE_POINTS, CURVE_POINTS)
+        nodes_s, curve_s = (
+            _offset_grid(offset_s, half_width_s, count) for count in (FINE_OFFSETS, CURVE_OFFSETS)
         )
-        profile = CubicSpline(
-            points, _profile_over_noises(prepared_motion, points, noises, offset)
-        )(curve)
-        low, high = profile_interval(curve, profile, PROFILE_DROP * factor)
-        is_closed = low is not None and high is not None
-        if is_closed or width >= 2.0 * MAX_OFFSET_S:
+        scores = CubicSpline(
+            nodes_s, _profile_over_noises(prepared_motion, nodes_s, noises, offset_s)
+        )(curve_s)
+        low_s, high_s = profile_interval(curve_s, scores, PROFILE_DROP * variance_factor)
+        is_closed = low_s is not None and high_s is not None
+        if is_closed or half_width_s >= 2.0 * MAX_OFFSET_S:
             break
-        width *= 2.0
-    offset = _minimum_and_sigma(curve, profile)[0]
-    # an IMU sample is the mean over its interval; its timestamp may be anywhere in it
-    resolution = 0.5 * prepared_motion.imu_interval_s
-    ends = curve[0] if low is None else low, curve[-1] if high is None else high
-    half_widths = np.hypot(np.array(ends) - offset, 1.96 * resolution)
-    low, high = float(offset - half_widths[0]), float(offset + half_widths[1])
+        half_width_s *= 2.0
+    offset_s = _minimum_and_sigma(curve_s, scores)[0]
+    # an IMU sample is the mean over its interval, and its timestamp may be anywhere in the interval
+    resolution_s = 0.5 * prepared_motion.imu_interval_s
+    ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
+    half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
+    low_s, high_s = float(offset_s - half_intervals_s[0]), float(offset_s + half_intervals_s[1])
     reason = ""
-    if not is_closed or (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
-        range_text = f"offsets from {low:+.2f} s to {high:+.2f} s have nearly the same likelihood"
+    if not is_closed or (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
+        range_text = (
+            f"offsets from {low_s:+.2f} s to {high_s:+.2f} s have nearly the same likelihood"
+        )
         reason = f"{range_text}: too little acceleration, or too much position noise"
     parts: tuple[PartOffset, ...] = ()
     change_p_value = None
     if not reason:
         progress("changes of the time offset")
-        parts, change_p_value = _offset_per_part(prepared_motion, offset, noises, factor)
-    drift, drift_sigma = _clock_drift(parts)
-    applied = settings.clock_offset_s
+        parts, change_p_value = _offset_per_part(prepared_motion, offset_s, noises, variance_factor)
+    drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
+    applied_s = settings.clock_offset_s
     return ClockOffset(
-        offset_s=applied + offset,
-        interval_s=(applied + low, applied + high),
-        applied_s=applied,
-        sigma_s=float(np.hypot(sigma * np.sqrt(factor), resolution)),
+        offset_s=applied_s + offset_s,
+        interval_s=(applied_s + low_s, applied_s + high_s),
+        applied_s=applied_s,
+        sigma_s=float(np.hypot(sigma_s * np.sqrt(variance_factor), resolution_s)),
         is_determinable=not reason,
         reason=reason,
-        curve_s=applied + curve,
-        curve_drop=profile - profile.min(),
-        parts=tuple(structs.replace(part, offset_s=applied + part.offset_s) for part in parts),
-        drift_ppm=drift,
-        drift_sigma_ppm=drift_sigma,
+        curve_s=applied_s + curve_s,
+        curve_drop=scores - scores.min(),
+        parts=tuple(structs.replace(part, offset_s=applied_s + part.offset_s) for part in parts),
+        drift_ppm=drift_ppm,
+        drift_sigma_ppm=drift_sigma_ppm,
         change_p_value=change_p_value,
         sigma_a_m_s2=noises.sigma_a_m_s2,
         sigma_z_m=noises.sigma_z_m,
@@ -244,90 +248,101 @@ def estimate_time_offset(
     )
 
 
-def _offset_grid(offset: float, width: float, count: int) -> Array:
+def _offset_grid(centre_s: float, half_width_s: float, count: int) -> Array:
     """Return offsets from ``offset - width`` to ``offset + width``, within the search range."""
-    low, high = np.clip([offset - width, offset + width], -MAX_OFFSET_S, MAX_OFFSET_S).tolist()
+    low, high = np.clip(
+        [centre_s - half_width_s, centre_s + half_width_s], -MAX_OFFSET_S, MAX_OFFSET_S
+    ).tolist()
     return np.linspace(low, high, count)
 
 
 def _profile_over_noises(
-    prepared_motion: PreparedMotion, curve: Array, noises: Noises, offset: float
+    prepared_motion: PreparedMotion, offsets_s: Array, noises: Noises, best_offset_s: float
 ) -> Array:
-    """Compute -ln p over offsets, with the noises maximised at each by a Newton step.
+    """Compute -ln p over offsets, minimised over the noises at each offset by a Newton step.
 
-    The gradient is evaluated at each offset, the Hessian, which hardly changes, at the best one.
+    The gradient is evaluated at each offset; the Hessian hardly changes and is evaluated at
+    ``best_offset_s`` only.
     """
     sigma_z, sigma_a = noises.sigma_z_m, noises.sigma_a_m_s2
-    offsets = np.append(curve, offset)
+    all_offsets_s = np.append(offsets_s, best_offset_s)
     ratios = sigma_a / sigma_z * np.exp(LOG_SIGMA_STEP * np.array([-1.0, 0.0, 1.0]))
 
     @cache
-    def fits_at_walk(walk: float) -> list[FittedPositions]:
+    def fits_at_random_walk(random_walk: float) -> list[FittedPositions]:
         return fit_ratios(
-            prepared_motion.blocks(offsets), ratios.tolist(), walk, prepared_motion.weight, sigma_z
+            prepared_motion.position_batches(all_offsets_s),
+            ratios.tolist(),
+            random_walk,
+            prepared_motion.weight,
+            sigma_z,
         )
 
-    def profile_at(shift_a: int, shift_z: int) -> Array:
+    def scores_at(shift_a: int, shift_z: int) -> Array:
         scale = sigma_z * float(np.exp(LOG_SIGMA_STEP * shift_z))
-        fit = fits_at_walk(noises.walk_m / scale)[1 + shift_a - shift_z]
-        return np.asarray(fit.totals(np.array([scale]))[0])
+        fit = fits_at_random_walk(noises.random_walk_m / scale)[1 + shift_a - shift_z]
+        return np.asarray(fit.scores(np.array([scale]))[0])
 
-    centre = profile_at(0, 0)
-    forward, backward = (np.array([profile_at(sign, 0), profile_at(0, sign)]) for sign in (1, -1))
-    slope = (forward - backward)[:, :-1] / (2.0 * LOG_SIGMA_STEP)
+    centre = scores_at(0, 0)
+    forward, backward = (np.array([scores_at(sign, 0), scores_at(0, sign)]) for sign in (1, -1))
+    gradient = (forward - backward)[:, :-1] / (2.0 * LOG_SIGMA_STEP)
     hessian = np.diag((forward + backward)[:, -1] - 2.0 * centre[-1])
-    mixed = profile_at(1, 1)[-1] + profile_at(-1, -1)[-1] - 2.0 * centre[-1]
+    mixed = scores_at(1, 1)[-1] + scores_at(-1, -1)[-1] - 2.0 * centre[-1]
     hessian[0, 1] = hessian[1, 0] = 0.5 * (mixed - hessian[0, 0] - hessian[1, 1])
     hessian /= LOG_SIGMA_STEP**2
     if np.any(np.linalg.eigvalsh(hessian) <= 0.0):  # SIGMA_A is at the end of its search range
         return centre[:-1]
-    gain = 0.5 * np.einsum("it,ij,jt->t", slope, np.linalg.inv(hessian), slope)
+    gain = 0.5 * np.einsum("it,ij,jt->t", gradient, np.linalg.inv(hessian), gradient)
     return np.asarray(centre[:-1] - gain)
 
 
-def _variance_inflation(
-    prepared_motion: PreparedMotion, offset: float, noises: Noises, information: float
+def _simulate_variance_factor(
+    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, information: float
 ) -> float:
-    """Ratio of the estimate's variance to that from the curvature, from simulated noise.
+    """Simulate noise to compute the ratio of the offset's variance to that from the curvature.
 
-    The score of τ is eᵀM(v + n): e the residuals, v the velocity, n the velocity noise of the IMU,
-    M the inverse covariance with the constants marginalised. Its part eᵀMn is random even without
-    motion, and e contains the same noise.
+    The score of τ is eᵀM(v + n), with e the residuals, v the velocity, n the velocity noise of the
+    IMU, M the inverse covariance with the constants marginalised. The term eᵀMn is random even
+    without motion, because e contains the same noise.
     """
-    positions = prepared_motion.at(offset)
-    joined, count, axes = (
-        positions.joined,
+    positions = prepared_motion.at(offset_s)
+    is_joined, count, axes = (
+        positions.is_joined,
         len(prepared_motion.time_s),
         len(prepared_motion.directions),
     )
-    interval_count, rng = int(np.count_nonzero(joined)), np.random.default_rng(count)
+    interval_count, rng = int(np.count_nonzero(is_joined)), np.random.default_rng(count)
 
     def draw_normal(size: int) -> Array:
         return rng.standard_normal((size, axes, SIMULATION_COUNT)).transpose(1, 2, 0)
 
-    q00, q01, q11 = noises.sigma_a_m_s2**2 * positions.noise_unit[:, joined]
+    q00, q01, q11 = noises.sigma_a_m_s2**2 * positions.noise_unit[:, is_joined]
     dp, dv = np.zeros((2, axes, SIMULATION_COUNT, count - 1))
-    dp[..., joined] = np.sqrt(q00) * draw_normal(interval_count)
-    dv[..., joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
-    dv[..., joined] += q01 / q00 * dp[..., joined]
-    error = noises.sigma_z_m * draw_normal(count)
-    # velocity noise from the start of each stretch
-    speed = np.zeros_like(error)
-    for begin, end in positions.stretches:
-        np.cumsum(dv[..., begin : end - 1], axis=-1, out=speed[..., begin + 1 : end])
-    if noises.walk_m:  # random walk of the source: in the residuals, not in the IMU
-        dp[..., joined] += (
-            noises.walk_m * np.sqrt(positions.length_s[joined]) * draw_normal(interval_count)
+    dp[..., is_joined] = np.sqrt(q00) * draw_normal(interval_count)
+    dv[..., is_joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
+    dv[..., is_joined] += q01 / q00 * dp[..., is_joined]
+    error_m = noises.sigma_z_m * draw_normal(count)
+    # velocity noise accumulates from the start of each segment
+    velocity_noise = np.zeros_like(error_m)
+    for begin, end in positions.segments:
+        np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
+    if noises.random_walk_m:  # random walk of the source: in the residuals, not in the IMU
+        dp[..., is_joined] += (
+            noises.random_walk_m
+            * np.sqrt(positions.length_s[is_joined])
+            * draw_normal(interval_count)
         )
-    positions, variance = positions.over(
-        1.0, noises.walk_m, prepared_motion.weight / noises.sigma_z_m**2
+    positions, variance = positions.in_sigma_z_units(
+        1.0, noises.random_walk_m, prepared_motion.weight / noises.sigma_z_m**2
     )
-    products = products_by_stretch(positions, noises.sigma_a_m_s2, variance, (error, dp, dv), speed)
+    products = products_by_segment(
+        positions, noises.sigma_a_m_s2, variance, (error_m, dp, dv), velocity_noise
+    )
     return 1.0 + float(np.var(products.sum(axis=0))) / information
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Return the minimum of a profile (parabola) and the σ from its curvature."""
+    """Return the minimum of a profile by a parabola, and σ from the curvature."""
     index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
     shift, curvature = parabola_vertex(profile, index)
@@ -337,33 +352,33 @@ def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
 
 
 def _offset_per_part(
-    prepared_motion: PreparedMotion, offset: float, noises: Noises, factor: float
+    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, variance_factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
-    """Estimate the offset of each stretch, and the p-value of a constant offset."""
-    coarse = offset + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_POINTS)
-    coarse = coarse[np.abs(coarse) <= MAX_OFFSET_S]
+    """Estimate the offset of each segment, and the p-value of a constant offset."""
+    coarse_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
+    coarse_s = coarse_s[np.abs(coarse_s) <= MAX_OFFSET_S]
     coarse_profiles = fit_noises(
-        prepared_motion.blocks(coarse), noises, prepared_motion.weight
-    ).by_stretch()[0]
-    grid = np.linspace(coarse[0], coarse[-1], CURVE_POINTS)
-    profiles = CubicSpline(coarse, coarse_profiles, axis=1)(grid)
+        prepared_motion.position_batches(coarse_s), noises, prepared_motion.weight
+    ).scores_by_segment()[0]
+    grid_s = np.linspace(coarse_s[0], coarse_s[-1], CURVE_OFFSETS)
+    profiles = CubicSpline(coarse_s, coarse_profiles, axis=1)(grid_s)
     part_offsets, drops = [], []
     for begin, end, profile in zip(
         prepared_motion.edges, prepared_motion.edges[1:], profiles, strict=False
     ):
-        middle, sigma = _minimum_and_sigma(grid, profile)
-        sigma *= float(np.sqrt(factor))
-        if sigma < MAX_PART_SIGMA_S:
-            first, last = prepared_motion.time_s[[begin, end - 1]].tolist()
-            part_offsets.append(PartOffset(first, last, middle, sigma))
+        part_offset_s, sigma_s = _minimum_and_sigma(grid_s, profile)
+        sigma_s *= float(np.sqrt(variance_factor))
+        if sigma_s < MAX_PART_SIGMA_S:
+            start_s, end_s = prepared_motion.time_s[[begin, end - 1]].tolist()
+            part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
             drops.append(profile - profile.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    ratio = 2.0 * float(np.sum(drops, axis=0).min()) / factor
+    ratio = 2.0 * float(np.sum(drops, axis=0).min()) / variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, ratio))
 
 
-def _clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
+def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
     """Return the drift of the source's clock (ppm) and its standard deviation."""
     if len(part_offsets) < 3:
         return None, None
@@ -371,6 +386,8 @@ def _clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, fl
         ((part_offset.start_s + part_offset.end_s) / 2.0, part_offset.offset_s, part_offset.sigma_s)
         for part_offset in part_offsets
     ]
-    time, offset, sigma = np.transpose(rows)
-    line, covariance = np.polyfit(time - time.mean(), offset, 1, w=1.0 / sigma, cov="unscaled")
-    return float(line[0]) * 1e6, float(np.sqrt(covariance[0, 0])) * 1e6
+    time_s, offset_s, sigma_s = np.transpose(rows)
+    coefficients, covariance = np.polyfit(
+        time_s - time_s.mean(), offset_s, 1, w=1.0 / sigma_s, cov="unscaled"
+    )
+    return float(coefficients[0]) * 1e6, float(np.sqrt(covariance[0, 0])) * 1e6

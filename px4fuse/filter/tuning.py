@@ -1,9 +1,9 @@
 """Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals, and a held-out check.
 
-Constant errors are not noise: with IMU data, biases, tilt and time offset are fitted, too
-(:mod:`px4fuse.filter.imu_motion`), so that SIGMA_A is the noise of the acceleration and SIGMA_Z
-that of the source. KF has no states for biases. The SIGMA_A that it needs to cover them is larger
-and is estimated separately.
+Constant errors are not noise. With IMU data, biases, tilt and time offset are therefore fitted, too
+(:mod:`px4fuse.filter.imu_motion`): SIGMA_A is then the noise of the acceleration, and SIGMA_Z the
+noise of the source. KF has no states for biases, so KF needs a larger SIGMA_A, which is estimated
+separately.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
 # Initial values: factors on KF's SIGMA_A, and random walk of a drifting source (m/√s)
-SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
-START_WALK_M = 0.02
-# Factor from the end of the search range within which a value counts as at the end
-SEARCH_END_RATIO = 1.001
+START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
+START_RANDOM_WALK_M = 0.02
+# Factor; a value within this factor of an end of the search range counts as at the end
+MAX_SEARCH_END_RATIO = 1.001
 
 
 class Noise(Record, frozen=True):
@@ -73,7 +73,7 @@ class Noise(Record, frozen=True):
 
     @classmethod
     def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """Build a noise from the fields of :class:`NoiseEstimate`."""
+        """Make a noise from the fields of :class:`NoiseEstimate`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
@@ -86,7 +86,7 @@ class Noise(Record, frozen=True):
 
 @dataclass(frozen=True)
 class LikelihoodMap:
-    """Drop of the log-likelihood from its maximum, shape (n, m), over SIGMA_A × SIGMA_Z."""
+    """Drop of the log-likelihood from its maximum, shape (n, m), for n SIGMA_A and m SIGMA_Z."""
 
     sigma_a_m_s2: Array
     sigma_z_m: Array
@@ -118,21 +118,22 @@ class HeldOutCheck(Record, frozen=True):
 class NoiseEstimate(Record, frozen=True, kw_only=True):
     """Noises of one axis, or of the horizontal axes together, with 95 % intervals.
 
-    A value is None if the likelihood has its maximum at an end of the search range; the interval is
-    then the bound. Its lower end is 0 if the noise may be zero, its upper end None without a bound.
+    A value is None if the likelihood has its maximum at an end of the search range; the interval
+    then contains the bound. The lower end of an interval is 0 if the noise may be zero, the upper
+    end None without a bound.
 
     Attributes
     ----------
     sigma_a_m_s2, sigma_z_m : float or None
         Noise without biases and tilt, if the IMU data are sufficient to estimate these.
     sigma_a_two_state_m_s2 : float or None
-        SIGMA_A that KF needs at this SIGMA_Z, since it has no states for biases.
+        SIGMA_A that KF needs at this SIGMA_Z, because KF has no states for biases.
     log_likelihood_gain_per_measurement : float
         Gain of log-likelihood per measurement of KF with ``sigma_a_two_state`` and ``sigma_z`` over
         the chosen settings.
     before, after : Consistency or Unavailable
-        Consistency with the chosen and the estimated settings, without outliers; along the first
-        axis of several.
+        Consistency of KF with the chosen and with the estimated settings, without outliers; along
+        the first axis of several.
     count, outliers : int
         Measurements, and those with an outlier probability above 0.5.
     held_out : HeldOutCheck or Unavailable
@@ -236,13 +237,13 @@ def tune(
             horizontal_axes[0].measurement_time_s, horizontal_axes[1].measurement_time_s
         ):
             groups[HORIZONTAL] = horizontal_axes
-    tuned = {}
+    tunings = {}
     signals = {} if signals is None else signals
     for name, group in groups.items():
         if names is None or name in names:
             progress(name)
-            tuned[name] = tune_axes(name, group, settings, flight, drifts, signals)
-    return tuned
+            tunings[name] = tune_axes(name, group, settings, flight, drifts, signals)
+    return tunings
 
 
 def tune_axes(
@@ -275,12 +276,12 @@ def tune_axes(
         return too_few_measurements(f"tuning, {name}", count, MIN_MEASUREMENTS)
     axis_positions = [filter_positions(interval_input) for interval_input in intervals]
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
-    two_state_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(count))
+    kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(count))
     motion_fit = None  # with the IMU's constants and the time offset
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # KF starts at the first measurement, which has no weight in its fit
-        weight = np.concatenate([np.ones(len(measured_m) - count), two_state_fit.weight])
+        # KF starts at the first measurement, so the fit of KF has no weight for it
+        weight = np.concatenate([np.ones(len(measured_m) - count), kf_fit.weight])
         axis_directions = np.array([axis.direction for axis in axes])
         time_s, dt_s = axes[0].measurement_time_s, settings.dt_s
         prepared_motion = prepare_motion(
@@ -293,73 +294,74 @@ def tune_axes(
             signals=signals,
         )
         if not isinstance(prepared_motion, Unavailable):
-            start_noises = replace(two_state_fit.noises, walk_m=START_WALK_M if drifts else 0.0)
-            # a coarse time offset is enough: its fine value hardly changes the noises
-            offset_s, start_noises = prepared_motion.search(
-                start_noises, SIGMA_A_FACTORS, scaled=False
+            start_noises = replace(
+                kf_fit.noises, random_walk_m=START_RANDOM_WALK_M if drifts else 0.0
+            )
+            # a coarse time offset is enough: a finer value hardly changes the noises
+            offset_s, start_noises = prepared_motion.search_offset(
+                start_noises, START_SIGMA_A_FACTORS, scaled=False
             )
             motion_fit = maximise_likelihood(
                 [prepared_motion.at(offset_s)], start_noises, prepared_motion.weight
             )
-    best_fit = two_state_fit if motion_fit is None else motion_fit
-    skip = two_state_fit.outlier_probability > 0.5
-    if np.mean(skip) > MAX_OUTLIER_SHARE:
+    best_fit = kf_fit if motion_fit is None else motion_fit
+    is_outlier = kf_fit.outlier_probability > 0.5
+    if np.mean(is_outlier) > MAX_OUTLIER_SHARE:
         return Unavailable(
             f"tuning, {name}",
-            f"{100 * np.mean(skip):.0f} % of the measurements are outliers, too many to estimate "
-            "the noise",
+            f"{100 * np.mean(is_outlier):.0f} % of the measurements are outliers, too many to "
+            "estimate the noise",
             "Remove the outliers at the source first.",
         )
     sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noises.sigma_z_m
-    two_state_sigma_a = (
-        sigma_a if motion_fit is None else _two_state_sigma_a(two_state_fit, final_sigma_z_m)
-    )
+    kf_sigma_a = sigma_a if motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
     if motion_fit is None and flight is not None and settings.input == "imu":
-        # the noise alone cannot be estimated; KF's SIGMA_A is an upper bound
-        sigma_a = Noise(None, None, two_state_sigma_a.high)
-    after = Noises(
-        two_state_sigma_a.value or two_state_sigma_a.high or two_state_fit.noises.sigma_a_m_s2,
+        # without biases and tilt the noise cannot be estimated; KF's SIGMA_A is an upper bound
+        sigma_a = Noise(None, None, kf_sigma_a.high)
+    final_noises = Noises(
+        kf_sigma_a.value or kf_sigma_a.high or kf_fit.noises.sigma_a_m_s2,
         final_sigma_z_m,
     )
-    gain = two_state_fit.score(chosen_noises) - two_state_fit.score(after)
+    gain_nats = kf_fit.score(chosen_noises) - kf_fit.score(final_noises)
     return AxisTuning(
         name=name,
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
-        **two_state_sigma_a.as_fields("sigma_a_two_state_m_s2"),
-        log_likelihood_gain_per_measurement=gain / count,
-        before=_assess_innovations(intervals[0], chosen_noises, skip),
-        after=_assess_innovations(intervals[0], after, skip),
-        outlier_time_s=axes[0].measurement_time_s[-count:][skip],
+        **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
+        log_likelihood_gain_per_measurement=gain_nats / count,
+        before=_assess_innovations(intervals[0], chosen_noises, is_outlier),
+        after=_assess_innovations(intervals[0], final_noises, is_outlier),
+        outlier_time_s=axes[0].measurement_time_s[-count:][is_outlier],
         count=count,
-        outliers=int(np.count_nonzero(skip)),
-        held_out=_hold_out(name, intervals, chosen_noises, two_state_fit),
+        outliers=int(np.count_nonzero(is_outlier)),
+        held_out=_check_held_out(name, intervals, chosen_noises, kf_fit),
         noises=best_fit.noises,
         biases_fitted=motion_fit is not None,
-        make_map=partial(
-            _make_map, intervals, two_state_fit.weight, two_state_sigma_a, sigma_z, after
-        ),
+        make_map=partial(_make_map, intervals, kf_fit.weight, kf_sigma_a, sigma_z, final_noises),
     )
 
 
 def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
-    """Estimate SIGMA_A (0) or SIGMA_Z (1) with a 95 % interval, the other maximised out."""
+    """Estimate SIGMA_A (0) or SIGMA_Z (1) with its 95 % profile-likelihood interval."""
     values = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
         pair = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
         sigma_a, sigma_z = np.exp(pair).tolist()
-        return fit.score(Noises(sigma_a, sigma_z, fit.noises.walk_m))
+        return fit.score(Noises(sigma_a, sigma_z, fit.noises.random_walk_m))
 
-    search = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[noise_index]
-    widening = (1.0, fit.widening)[noise_index]
+    search_range = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[noise_index]
+    variance_factor = (1.0, fit.sigma_z_variance_factor)[noise_index]
     return _noise_with_interval(
-        score, (np.log(values[noise_index]), np.log(values[1 - noise_index])), search, widening
+        score,
+        (np.log(values[noise_index]), np.log(values[1 - noise_index])),
+        search_range,
+        variance_factor,
     )
 
 
-def _two_state_sigma_a(fit: NoiseFit, sigma_z: float) -> Noise:
+def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z: float) -> Noise:
     """Estimate KF's SIGMA_A for a given SIGMA_Z, with a 95 % interval."""
 
     def score(log_a: float, _: float = 0.0) -> float:
@@ -373,13 +375,15 @@ def _two_state_sigma_a(fit: NoiseFit, sigma_z: float) -> Noise:
 def _noise_with_interval(
     score: Callable[[float, float], float],
     best_logs: tuple[float, float],
-    search: tuple[float, float],
-    widening: float = 1.0,
+    search_range: tuple[float, float],
+    variance_factor: float = 1.0,
 ) -> Noise:
-    """Return a noise with its interval; without a value if the maximum is at an end."""
+    """Return a noise with its interval; the value is None if the maximum is at an end."""
     value = float(np.exp(best_logs[0]))
-    low, high = profile_ends(score, best_logs, search, widening)
-    is_inside = search[0] * SEARCH_END_RATIO < value < search[1] / SEARCH_END_RATIO
+    low, high = profile_ends(score, best_logs, search_range, variance_factor)
+    is_inside = (
+        search_range[0] * MAX_SEARCH_END_RATIO < value < search_range[1] / MAX_SEARCH_END_RATIO
+    )
     is_closed = low is not None and high is not None
     return Noise(value if is_inside and is_closed else None, low, high)
 
@@ -397,43 +401,48 @@ def _make_map(
         (sigma_a, best_noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
         (sigma_z, best_noises.sigma_z_m, SIGMA_Z_SEARCH_M),
     ):
-        lower, upper = noise.low or low, noise.high or high
+        interval_low, interval_high = noise.low or low, noise.high or high
         width_factor = MAP_SIGMAS / 1.96
         ends = (
-            best_value * (lower / best_value) ** width_factor,
-            best_value * (upper / best_value) ** width_factor,
+            best_value * (interval_low / best_value) ** width_factor,
+            best_value * (interval_high / best_value) ** width_factor,
         )
         grids.append(np.geomspace(max(ends[0], low), min(ends[1], high), GRID_SIZE))
     sigma_a_grid, sigma_z_grid = grids
-    total = score_grid(intervals, sigma_a_grid[:, None], sigma_z_grid[None, :], weight)
-    return LikelihoodMap(sigma_a_grid, sigma_z_grid, total - total.min())
+    scores = score_grid(intervals, sigma_a_grid[:, None], sigma_z_grid[None, :], weight)
+    return LikelihoodMap(sigma_a_grid, sigma_z_grid, scores - scores.min())
 
 
 def _assess_innovations(
-    intervals: Preintegrated, noises: Noises, skip: BoolArray
+    intervals: Preintegrated, noises: Noises, is_outlier: BoolArray
 ) -> Consistency | Unavailable:
-    nu, s = innovations(intervals, noises.sigma_a_m_s2, noises.sigma_z_m, skip)
-    return assess(nu[~skip], s[~skip])
+    nu, s = innovations(intervals, noises.sigma_a_m_s2, noises.sigma_z_m, is_outlier)
+    return assess(nu[~is_outlier], s[~is_outlier])
 
 
-def _hold_out(
+def _check_held_out(
     name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
     """Estimate the noises on the first half and evaluate them on the second."""
-    half = len(fit.weight) // 2
-    if half < MIN_MEASUREMENTS:
+    half_count = len(fit.weight) // 2
+    if half_count < MIN_MEASUREMENTS:
         return Unavailable(
             f"held-out check, {name}",
-            f"half of the segment contains only {half} measurements (at least "
+            f"half of the segment contains only {half_count} measurements (at least "
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
-    first_half = [filter_positions(interval_input.first(half)) for interval_input in intervals]
-    first = maximise_likelihood(first_half, fit.noises, fit.weight[:half], outliers=False)
-    tuned_noises = first.noises
-    # likelihood of the second half given the first
-    scores = [fit.score(noises) - first.score(noises) for noises in (chosen_noises, tuned_noises)]
-    count = len(fit.weight) - half
+    first_half = [
+        filter_positions(interval_input.first_measurements(half_count))
+        for interval_input in intervals
+    ]
+    first_fit = maximise_likelihood(first_half, fit.noises, fit.weight[:half_count], outliers=False)
+    tuned_noises = first_fit.noises
+    # -ln p of the second half given the first
+    scores = [
+        fit.score(noises) - first_fit.score(noises) for noises in (chosen_noises, tuned_noises)
+    ]
+    count = len(fit.weight) - half_count
     return HeldOutCheck(
         tuned_noises.sigma_a_m_s2, tuned_noises.sigma_z_m, count, (scores[0] - scores[1]) / count
     )

@@ -1,1 +1,1 @@
-"""Loops of odometry: segment, loop closure, and correction of the path."""
+"""Loops of odometry: segment, loop closures, and corrections of the path."""

@@ -8,24 +8,30 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop import loop_segment
-from px4fuse.loop.closure import key_frame_spacing_m, key_frames, to_z_down
-from px4fuse.loop.corrections import correct_paths_by_distance, gate_closures, score_all, solve_all
+from px4fuse.loop.closure import choose_key_frames, default_key_frame_spacing_m, to_z_down
+from px4fuse.loop.corrections import (
+    correct_paths_by_distance,
+    gate_closures,
+    score_paths,
+    solve_pose_graphs,
+)
 from px4fuse.loop.model import LANDING, Loop, OdometryNoise, TrueEnd
-from px4fuse.loop.odometry import ClosureClaim, pose_graph
-from px4fuse.loop.tracks import LoopSource, odometry_of, trajectory_of
+from px4fuse.loop.odometry import ClosureWithEnd, build_pose_graph
+from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.model import Trajectory, by_axis, cumulative_distance
+from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# s; with UNIX timestamps, smaller times count from the first pose
-SMALLEST_STAMP_S = 1e6
+# s; if the timestamps are UNIX time, smaller times of options count from the first pose
+MIN_UNIX_TIME_S = 1e6
 # m; shortest path of a loop
 MIN_PATH_M = 2.0
-# loops in compare: shortest path (m), and largest end distance as fraction of the path
-LOOP_MIN_PATH_M = 10.0
-LOOP_MAX_GAP_SHARE = 0.10
-# m or degrees; limit of options
-MAX_VALUE = 100.0
+# in ``px4fuse compare`` the loop is only analysed if its path (m) is longer, and the distance
+# between its ends is a smaller fraction of the path
+MIN_FLIGHT_LOOP_PATH_M = 10.0
+MAX_END_DISTANCE_FRACTION = 0.10
+# m or degrees; upper limit of options
+MAX_OPTION_VALUE = 100.0
 
 
 def analyse(
@@ -39,18 +45,18 @@ def analyse(
     Parameters
     ----------
     source : LoopSource
-        Trajectory, and its flight.
+        Trajectory, and the flight that contains it.
     request : LoopRequest, optional
         Options. Times are on the clock of the trajectory; with UNIX timestamps, small times count
-        from the first pose. The landing place is by default that of the ground truth in the log,
-        else the take-off place.
+        from the first pose. The default landing place is from the ground truth in the log, else the
+        take-off place.
     reference : Trajectory, optional
-        Reference for the scores, besides the ground truth in the log.
+        Reference for the scores, in addition to the ground truth in the log.
 
     Raises
     ------
     TrajectoryError, SettingsError
-        The segment is too short, a closure is outside of it, or a number is out of range.
+        The segment is too short, a closure is outside of the segment, or a number is out of range.
     """
     request = request or LoopRequest(source=source.trajectory.name)
     noise = OdometryNoise(request.position_drift_m, request.heading_drift_deg)
@@ -59,58 +65,65 @@ def analyse(
     trajectory, flight = source.trajectory, source.flight
     zero_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
-    def stamp(time_s: float) -> float:
-        return time_s + zero_s if abs(time_s) < SMALLEST_STAMP_S else time_s
+    def to_track_time(time_s: float) -> float:
+        return time_s + zero_s if abs(time_s) < MIN_UNIX_TIME_S else time_s
 
     request_times = (request.start_s, request.end_s)
-    start, end = (None if time_s is None else stamp(time_s) for time_s in request_times)
-    segment, at_rest = loop_segment.choose_loop_segment(flight, trajectory, start, end)
+    start_s, end_s = (None if time_s is None else to_track_time(time_s) for time_s in request_times)
+    segment, rests_at_ends = loop_segment.choose_loop_segment(flight, trajectory, start_s, end_s)
     truth = None if flight is None or trajectory.kind == "truth" else truth_of(flight)
     z_down_trajectory = to_z_down(trajectory)
-    path = loop_segment.cut_trajectory(z_down_trajectory, segment, at_rest)
-    truth_used = truth if request.closed_loop and request.landed_at is None else None
-    by_truth = (
-        None if truth_used is None else loop_segment.true_end(path, truth_used, segment, at_rest)
+    path = loop_segment.cut_trajectory(z_down_trajectory, segment, rests_at_ends)
+    end_truth = truth if request.closed_loop and request.landed_at is None else None
+    truth_end = (
+        None
+        if end_truth is None
+        else loop_segment.read_end_from_truth(path, end_truth, segment, rests_at_ends)
     )
-    true_end_found = _find_true_end(path, request, by_truth)
+    true_end = _find_true_end(path, request, truth_end)
     given_closures = [
-        GivenClosure(stamp(c.time_1_s), stamp(c.time_2_s), c.sigma_m) for c in request.closures
+        GivenClosure(to_track_time(c.time_1_s), to_track_time(c.time_2_s), c.sigma_m)
+        for c in request.closures
     ]
     for closure in given_closures:
         _require_valid_closure(closure, path)
-    claims: list[ClosureClaim] = [(closure, None) for closure in given_closures]
-    if not isinstance(true_end_found, Unavailable):
-        claims.insert(
+    closures_with_end: list[ClosureWithEnd] = [(closure, None) for closure in given_closures]
+    if not isinstance(true_end, Unavailable):
+        closures_with_end.insert(
             0,
             (
-                GivenClosure(segment.start_s, segment.end_s, true_end_found.sigma_m),
-                true_end_found,
+                GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m),
+                true_end,
             ),
         )
-    spacing = request.key_frames_m
-    spacing = key_frame_spacing_m(path.position_m) if spacing is None else spacing
-    frames, distance = _key_frames(path, spacing)
-    graph, nodes, statement = pose_graph(path, frames, claims, noise)
-    notes = [*z_down_trajectory.notes, statement]
-    if isinstance(by_truth, str):
-        notes.append(f"the landing place is not in the ground truth: {by_truth}")
-    gated_closures = gate_closures(graph, claims)
-    graph_corrections, gated_closures = solve_all(path, nodes, graph, gated_closures, progress)
-    end_m, heading = path.position_m[-1] - path.position_m[0], loop_segment.heading_change_deg(path)
-    misclosure_m = (
-        true_end_found
-        if isinstance(true_end_found, Unavailable)
-        else end_m - true_end_found.displacement
+    spacing_m = request.key_frames_m
+    spacing_m = default_key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
+    frame_indices, distance_m = _choose_key_frames(path, spacing_m)
+    graph, nodes, variance_note = build_pose_graph(path, frame_indices, closures_with_end, noise)
+    notes = [*z_down_trajectory.notes, variance_note]
+    if isinstance(truth_end, str):
+        notes.append(f"the landing place is not in the ground truth: {truth_end}")
+    gated_closures = gate_closures(graph, closures_with_end)
+    graph_corrections, gated_closures = solve_pose_graphs(
+        path, nodes, graph, gated_closures, progress
     )
-    heading_error = _heading_error(true_end_found, heading)
+    end_m, heading_deg = (
+        path.position_m[-1] - path.position_m[0],
+        loop_segment.heading_change_deg(path),
+    )
+    misclosure_m = true_end if isinstance(true_end, Unavailable) else end_m - true_end.displacement
+    heading_error_deg = _compute_heading_error(true_end, heading_deg)
     landing = gated_closures[0] if gated_closures and gated_closures[0].source == LANDING else None
-    corrected_by_distance = correct_paths_by_distance(
-        path, distance, misclosure_m, heading_error, landing
+    distance_corrections = correct_paths_by_distance(
+        path, distance_m, misclosure_m, heading_error_deg, landing
     )
     references = tuple(track for track in (truth, reference) if track is not None)
-    error = error_axes = None
+    error_m = error_axes_m = None
     if not isinstance(misclosure_m, Unavailable):
-        error, error_axes = float(np.linalg.norm(misclosure_m)), by_axis(path.frame, misclosure_m)
+        error_m, error_axes_m = (
+            float(np.linalg.norm(misclosure_m)),
+            components_by_axis(path.frame, misclosure_m),
+        )
     return Loop(
         track=path.name,
         kind=path.kind,
@@ -119,23 +132,23 @@ def analyse(
         end_s=segment.end_s,
         part_reason=segment.reason,
         poses=len(path),
-        key_frames=len(frames),
-        key_frame_spacing_m=spacing,
-        path_length_m=float(distance[-1]),
-        end_from_start_m=by_axis(path.frame, end_m),
-        heading_change_deg=heading,
-        true_end=true_end_found,
-        closure_error_m=error,
-        closure_percent=None if error is None else 100.0 * error / float(distance[-1]),
-        closure_error_axes_m=error_axes,
-        heading_error_deg=heading_error,
+        key_frames=len(frame_indices),
+        key_frame_spacing_m=spacing_m,
+        path_length_m=float(distance_m[-1]),
+        end_from_start_m=components_by_axis(path.frame, end_m),
+        heading_change_deg=heading_deg,
+        true_end=true_end,
+        closure_error_m=error_m,
+        closure_percent=None if error_m is None else 100.0 * error_m / float(distance_m[-1]),
+        closure_error_axes_m=error_axes_m,
+        heading_error_deg=heading_error_deg,
         is_absolute_track=flight is not None and _is_absolute(trajectory, flight),
         odometry_noise=noise,
         closures=gated_closures,
-        corrections=score_all(path, corrected_by_distance | graph_corrections, references),
+        corrections=score_paths(path, distance_corrections | graph_corrections, references),
         notes=tuple(note for note in notes if note),
-        nodes=frames,
-        distance_m=distance,
+        nodes=frame_indices,
+        distance_m=distance_m,
         graph=graph,
         references=references,
         original_frame=trajectory.frame,
@@ -143,74 +156,78 @@ def analyse(
 
 
 def _find_true_end(
-    path: Trajectory, request: LoopRequest, by_truth: TrueEnd | str | None
+    path: Trajectory, request: LoopRequest, truth_end: TrueEnd | str | None
 ) -> TrueEnd | Unavailable:
-    """Return the landing place: measured, by ground truth, or the take-off place."""
+    """Return the landing place: measured, from ground truth, or the take-off place."""
     if request.landed_at is not None:
         if not request.closed_loop:
             raise SettingsError(
                 "`landed_at` and `closed_loop` exclude each other.", "Omit one of them."
             )
-        return loop_segment.measured_end(path, request.landed_at)
+        return loop_segment.convert_measured_end(path, request.landed_at)
     if not request.closed_loop:
         return Unavailable("closure error", "the loop is declared open (--open)", "Remove --open.")
-    return by_truth if isinstance(by_truth, TrueEnd) else loop_segment.assumed_end(path)
+    return truth_end if isinstance(truth_end, TrueEnd) else loop_segment.assume_end_at_takeoff(path)
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
     """Return True if the track follows an external position source without odometry."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
-    no_odometry = isinstance(odometry_of(flight), Unavailable)
+    no_odometry = isinstance(find_odometry(flight), Unavailable)
     return trajectory.kind in ("ekf2", "kf") and has_vision and no_odometry
 
 
-def _key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
+def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     """Return the indices of the key frames, and the distance along them at each pose."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
-    frames = key_frames(path.position_m, spacing_m)
-    along = cumulative_distance(path.position_m[frames])
-    if not along[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
+    frame_indices = choose_key_frames(path.position_m, spacing_m)
+    distance_m = cumulative_distance(path.position_m[frame_indices])
+    if not distance_m[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
         raise TrajectoryError(
-            f"{path.name}: the path is only {along[-1]:.2f} m long (key frame spacing "
+            f"{path.name}: the path is only {distance_m[-1]:.2f} m long (key frame spacing "
             f"{spacing_m:g} m), too short for a loop.",
             "Choose a longer part (--from, --to) or a smaller --key-frames.",
         )
-    return frames, np.interp(path.time_s, path.time_s[frames], along)
+    return frame_indices, np.interp(path.time_s, path.time_s[frame_indices], distance_m)
 
 
-def _require_in_range(name: str, value: float, least: float) -> None:
-    if not least <= value <= MAX_VALUE:
-        raise SettingsError(f"`{name}` {value:g} is out of range ({least:g} to {MAX_VALUE:g}).")
+def _require_in_range(name: str, value: float, min_value: float) -> None:
+    if not min_value <= value <= MAX_OPTION_VALUE:
+        raise SettingsError(
+            f"`{name}` {value:g} is out of range ({min_value:g} to {MAX_OPTION_VALUE:g})."
+        )
 
 
 def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
     """Raise TrajectoryError if times or σ of a closure are out of range."""
-    (low, high), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
+    (start_s, end_s), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
     label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
-    if not low <= times[0] < times[1] <= high:
+    if not start_s <= times[0] < times[1] <= end_s:
         raise TrajectoryError(
             f"{label}: the times must be in ascending order and on the path "
-            f"({low:.2f} s to {high:.2f} s)."
+            f"({start_s:.2f} s to {end_s:.2f} s)."
         )
-    if not 1e-4 <= closure.sigma_m <= MAX_VALUE:
+    if not 1e-4 <= closure.sigma_m <= MAX_OPTION_VALUE:
         raise TrajectoryError(
             f"{label}: SIGMA {closure.sigma_m:g} is out of range (0.0001 to 100 m)."
         )
 
 
-def _heading_error(end: TrueEnd | Unavailable, heading_deg: float | None) -> float | Unavailable:
+def _compute_heading_error(
+    end: TrueEnd | Unavailable, heading_deg: float | None
+) -> float | Unavailable:
     """Return the heading error at the end (°), or Unavailable."""
-    what = "heading error of the loop"
+    name = "heading error of the loop"
     if isinstance(end, Unavailable):
         return end
     if heading_deg is None:
-        return Unavailable(what, "the trajectory has no orientations", "No action needed.")
+        return Unavailable(name, "the trajectory has no orientations", "No action needed.")
     if end.heading_change_deg is None:
         return Unavailable(
-            what,
-            f"the final heading differs by {heading_deg:+.0f}° from the initial one, and "
+            name,
+            f"the final heading differs by {heading_deg:+.0f}° from the initial heading, and "
             "the true rotation is not known",
-            "Give it as the third number of --landed-at FORWARD,RIGHT,DEG.",
+            "Give the true rotation as third number of --landed-at FORWARD,RIGHT,DEG.",
         )
     return float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
 
@@ -230,25 +247,28 @@ def analyse_flight_loop(
 
     Unavailable without odometry, or if the odometry does not return near its start.
     """
-    odometry = odometry_of(flight)
+    odometry = find_odometry(flight)
     try:
         trajectory = trajectory_of(flight, "vio")
-    except MissingDataError as error:  # too few poses, or none
+    except MissingDataError as error:  # there are too few poses, or none
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         return Unavailable(
             "loop closure", reason, "A loop needs visual-inertial odometry, sent as ODOMETRY."
         )
     segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
     time = trajectory.time_s
-    inside = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
-    extent = gap = 0.0
-    if len(inside):
-        extent = float(np.linalg.norm(np.ptp(inside, axis=0)))
-        gap = float(np.linalg.norm(inside[-1] - inside[0]))
-    if 2.0 * extent < LOOP_MIN_PATH_M or gap > LOOP_MAX_GAP_SHARE * 2.0 * extent:
+    inside_m = trajectory.position_m[(time >= segment.start_s) & (time <= segment.end_s)]
+    extent_m = gap_m = 0.0
+    if len(inside_m):
+        extent_m = float(np.linalg.norm(np.ptp(inside_m, axis=0)))
+        gap_m = float(np.linalg.norm(inside_m[-1] - inside_m[0]))
+    if (
+        2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
+        or gap_m > MAX_END_DISTANCE_FRACTION * 2.0 * extent_m
+    ):
         return Unavailable(
             "loop closure",
-            f"the odometry ends {gap:.1f} m from its start and spans {extent:.1f} m, so "
+            f"the odometry ends {gap_m:.1f} m from its start and spans {extent_m:.1f} m, so "
             "it is not a loop",
             "Fly back to the take-off place, or use px4fuse loop with --closure.",
         )

@@ -13,7 +13,7 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
-# by frame: indices of forward (north), right (east), down in x, y, z; signs; new frame; note
+# by frame: indices of forward (or north), right (east), down in x, y, z; signs; new frame; note
 _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
     "ENU": (
         [1, 0, 2],
@@ -34,16 +34,16 @@ _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
         "the frame is unknown; z is assumed to be up",
     ),
 }
-# key frame spacing as fraction of the extent, and its bounds (m): the curvature of a path scales
-# with its size, for a camera above a desk as for a flight in a hall
-SPACING_SHARE = 0.02
+# key frame spacing as fraction of the extent, and limits of the spacing (m). The curvature of a
+# path scales with its extent, so the spacing scales, too
+SPACING_FRACTION = 0.02
 MIN_SPACING_M, MAX_SPACING_M = 0.02, 0.5
 
 
 def to_z_down(trajectory: Trajectory) -> Trajectory:
     """Convert a trajectory to a frame with z down.
 
-    The orientation of a camera becomes that of a vehicle with its nose in the direction of view.
+    The camera axes are converted to body axes with the nose in the direction of view.
     """
     if trajectory.frame not in _TO_Z_DOWN:
         return trajectory
@@ -66,35 +66,37 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
-    """Rotate poses to another frame; camera axes rotate with the frame."""
-    turn = Rotation.from_matrix(matrix)
-    rotated = replace(trajectory.moved(trajectory.position_m @ matrix.T, turn), frame=frame)
+    """Rotate poses to another frame; camera axes are converted to body axes or back."""
+    rotation = Rotation.from_matrix(matrix)
+    rotated = replace(
+        trajectory.with_positions(trajectory.position_m @ matrix.T, rotation), frame=frame
+    )
     if rotated.rotation is None or "camera" not in (trajectory.frame, frame):
         return rotated
-    return replace(rotated, rotation=rotated.rotation * turn.inv())
+    return replace(rotated, rotation=rotated.rotation * rotation.inv())
 
 
-def key_frame_spacing_m(position_m: Array) -> float:
+def default_key_frame_spacing_m(position_m: Array) -> float:
     """Return the default key frame spacing (m) of a path, shape (n, d)."""
     extent = float(np.linalg.norm(np.ptp(position_m, axis=0)))
-    return float(np.clip(SPACING_SHARE * extent, MIN_SPACING_M, MAX_SPACING_M))
+    return float(np.clip(SPACING_FRACTION * extent, MIN_SPACING_M, MAX_SPACING_M))
 
 
-def key_frames(position_m: Array, spacing_m: float) -> IntArray:
+def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
     """Return indices of poses with a distance of at least ``spacing_m``, including both ends.
 
-    The length along every sample of a noisy track is too large: at 30 Hz each step adds the noise
-    of two positions. Steps that are long compared with the noise avoid this.
+    The length along all samples of a noisy track is too large: at 30 Hz each step adds the noise of
+    two positions. Steps that are long compared with the noise avoid this error.
     """
     frame_indices = [0]
-    last = position_m[0]
+    last_frame_m = position_m[0]
     for index, position in enumerate(position_m[1:-1], start=1):
-        step = position - last
+        step = position - last_frame_m
         if step @ step >= spacing_m * spacing_m:
             frame_indices.append(index)
-            last = position
-    if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last) < spacing_m / 2.0:
-        frame_indices.pop()  # so that the last step is not only noise
+            last_frame_m = position
+    if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last_frame_m) < spacing_m / 2.0:
+        frame_indices.pop()  # otherwise the last step would be mostly noise
     return np.array([*frame_indices, len(position_m) - 1])
 
 
@@ -125,8 +127,8 @@ def distribute_by_distance(
     Bowditch (1808); UAT 366 module 2, Example 2.
     """
     cumulative = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
-    share = cumulative / cumulative[-1]
-    return np.asarray(position_m - share[:, np.newaxis] * misclosure_m)
+    fraction = cumulative / cumulative[-1]
+    return np.asarray(position_m - fraction[:, np.newaxis] * misclosure_m)
 
 
 def heading_change_rad(rotation: Rotation) -> float:
@@ -143,9 +145,9 @@ def correct_by_distance(
 ) -> Trajectory:
     """Distribute the closure errors of position and heading by distance.
 
-    Each orientation is corrected by its share of the heading error (slerp about the vertical). The
-    steps between poses are rotated with them, because the shape would shear otherwise. The
-    remaining position error is distributed by the compass rule.
+    Each orientation is corrected by its fraction of the heading error (slerp about the vertical).
+    The steps between poses are rotated by the same correction, which keeps the shape of the path.
+    The remaining position error is distributed by the compass rule.
 
     Parameters
     ----------
@@ -156,16 +158,18 @@ def correct_by_distance(
     misclosure_m : ndarray, shape (3,)
         Measured end minus true end.
     misclosure_heading_rad : float
-        Measured final heading minus true one; 0 if unknown.
+        Measured minus true final heading; 0 if unknown.
     """
-    position = trajectory.position_m
-    share = cumulative_m / cumulative_m[-1]
-    turn = Rotation.from_rotvec(np.outer(-share * misclosure_heading_rad, DOWN))
-    middle_share = (share[1:] + share[:-1]) / 2.0
-    middle_rotation = Rotation.from_rotvec(np.outer(-middle_share * misclosure_heading_rad, DOWN))
-    steps = middle_rotation.apply(np.diff(position, axis=0))
-    rotated_position = position[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    remaining_m = rotated_position[-1] - (position[-1] - misclosure_m)
-    return trajectory.moved(
-        distribute_by_distance(rotated_position, remaining_m, cumulative_m), turn
+    position_m = trajectory.position_m
+    fraction = cumulative_m / cumulative_m[-1]
+    rotation = Rotation.from_rotvec(np.outer(-fraction * misclosure_heading_rad, DOWN))
+    middle_fraction = (fraction[1:] + fraction[:-1]) / 2.0
+    middle_rotation = Rotation.from_rotvec(
+        np.outer(-middle_fraction * misclosure_heading_rad, DOWN)
+    )
+    steps_m = middle_rotation.apply(np.diff(position_m, axis=0))
+    rotated_m = position_m[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps_m, axis=0)])
+    remaining_m = rotated_m[-1] - (position_m[-1] - misclosure_m)
+    return trajectory.with_positions(
+        distribute_by_distance(rotated_m, remaining_m, cumulative_m), rotation
     )

@@ -1,4 +1,4 @@
-"""Corrections of a loop: test of its closures, corrected paths, and scores of each path."""
+"""Corrections of a loop: tests of the closures, corrected paths, and scores of each path."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,12 +11,12 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
-from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Way
-from px4fuse.loop.odometry import ClosureClaim
+from px4fuse.loop.model import LANDING, Closure, CorrectedPath, CorrectionName
+from px4fuse.loop.odometry import ClosureWithEnd
 from px4fuse.record import to_serializable
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
-from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
-from px4fuse.trajectory.graph.covariance import gate
+from px4fuse.trajectory.graph.analysis import ROBUST_METHODS, SOLUTIONS
+from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution, solve
 from px4fuse.trajectory.model import Trajectory
@@ -24,45 +24,46 @@ from px4fuse.trajectory.model import Trajectory
 UNCORRECTED = "uncorrected"
 POSITIONS_ONLY = "by distance, positions only"
 BY_DISTANCE = "by distance, headings too"
-# names of the corrections
-NAMES: Mapping[str, str] = {
+# labels of the corrections
+CORRECTION_LABELS: Mapping[str, str] = {
     "uncorrected": UNCORRECTED,
     "by_distance_plain": POSITIONS_ONLY,
     "by_distance": BY_DISTANCE,
     **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
 }
-SINGLE_LOOP = (
+SINGLE_LOOP_REASON = (
     "A single loop has no redundancy: only the gate can reject it, robust optimisation cannot."
 )
-# corrected path with the solution of the pose graph, if it is of one; or the reason why it is
-# missing
+# corrected path, with the solution if it is from a pose graph; or reason why the path is missing
 Corrected = tuple[Trajectory, Solution | None] | Unavailable
 
 
 def correct_paths_by_distance(
     path: Trajectory,
-    distance: Array,
+    distance_m: Array,
     misclosure_m: Array | Unavailable,
-    heading: float | Unavailable,
+    heading_error_deg: float | Unavailable,
     landing: Closure | None,
-) -> dict[Way, Corrected]:
-    """Correct the path by distance: positions only (as in the lesson), and with headings."""
+) -> dict[CorrectionName, Corrected]:
+    """Correct the path by distance: positions only (as in the lesson), and also headings."""
     if landing is not None and not landing.accepted:
-        misclosure_m = _rejected_closure("correction by distance", landing)
+        misclosure_m = _unavailable_by_gate("correction by distance", landing)
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
-    positions_only = distribute_by_distance(path.position_m, misclosure_m, distance)
-    heading_rad = 0.0 if isinstance(heading, Unavailable) else float(np.radians(heading))
-    with_headings = correct_by_distance(path, distance, misclosure_m, heading_rad)
+    positions_only = distribute_by_distance(path.position_m, misclosure_m, distance_m)
+    heading_rad = (
+        0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
+    )
+    with_headings = correct_by_distance(path, distance_m, misclosure_m, heading_rad)
     return {
-        "by_distance_plain": (path.moved(positions_only), None),
+        "by_distance_plain": (path.with_positions(positions_only), None),
         "by_distance": (with_headings, None),
     }
 
 
-def _rejected_closure(what: str, closure: Closure) -> Unavailable:
+def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
     return Unavailable(
-        what,
+        correction_name,
         f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g}); "
         "enforcing it would deform the whole path",
         "Measure the landing place (--landed-at), leave the landing out (--open), "
@@ -71,107 +72,122 @@ def _rejected_closure(what: str, closure: Closure) -> Unavailable:
 
 
 def gate_closures(
-    graph: PoseGraph | Unavailable, claims: Sequence[ClosureClaim]
+    graph: PoseGraph | Unavailable, closures_with_end: Sequence[ClosureWithEnd]
 ) -> tuple[Closure, ...]:
-    """Test each closure (last edges of the graph) against odometry; empty without graph."""
+    """Test each closure (last edges of the graph) against odometry; empty without a graph."""
     if isinstance(graph, Unavailable):
         return ()
-    edges = np.arange(len(graph.first) - len(claims), len(graph.first))
+    edges = np.arange(len(graph.first) - len(closures_with_end), len(graph.first))
     closures = []
-    for result, (closure, end) in zip(gate(graph, edges), claims, strict=True):
+    for result, (closure, end) in zip(gate_edges(graph, edges), closures_with_end, strict=True):
         odometry_m = graph.poses[result.second, :3] - graph.poses[result.first, :3]
-        facts = structs.asdict(closure) | structs.asdict(result)
-        del facts["first"], facts["second"]
-        facts["source"] = "given" if end is None else LANDING
+        closure_fields = structs.asdict(closure) | structs.asdict(result)
+        del closure_fields["first"], closure_fields["second"]
+        closure_fields["source"] = "given" if end is None else LANDING
         true_m = np.zeros(3) if end is None else end.displacement
-        closures.append(Closure(distance_m=float(np.linalg.norm(odometry_m - true_m)), **facts))
+        closures.append(
+            Closure(distance_m=float(np.linalg.norm(odometry_m - true_m)), **closure_fields)
+        )
     return tuple(closures)
 
 
-def solve_all(
+def solve_pose_graphs(
     path: Trajectory,
     nodes: IntArray,
     graph: PoseGraph | Unavailable,
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
-) -> tuple[dict[Way, Corrected], tuple[Closure, ...]]:
-    """Optimise the graph with all closures, with the accepted ones, and robustly."""
-    found: dict[Any, Corrected] = {}
+) -> tuple[dict[CorrectionName, Corrected], tuple[Closure, ...]]:
+    """Optimise the graph with all closures, with the accepted closures, and robustly.
+
+    Return the corrected paths, and the closures with their robust weights.
+    """
+    corrections: dict[Any, Corrected] = {}
     if isinstance(graph, Unavailable) or not closures:
-        none = Unavailable("pose graph", "no loop closure", "Give one with --closure.")
-        why = graph if isinstance(graph, Unavailable) else none
-        found |= {f"pose_graph_{name}": why for name in SOLUTIONS}
-        return found, ()
+        no_closure = Unavailable("pose graph", "no loop closure", "Give one with --closure.")
+        unavailable = graph if isinstance(graph, Unavailable) else no_closure
+        corrections |= {f"pose_graph_{solution_name}": unavailable for solution_name in SOLUTIONS}
+        return corrections, ()
     edges = np.arange(len(graph.first))
-    loops = edges >= len(edges) - len(closures)
-    rejected = np.zeros(len(edges), dtype=np.bool_)
-    rejected[loops] = [not closure.accepted for closure in closures]
-    for name, label in SOLUTIONS.items():
-        way, robust = f"pose_graph_{name}", ROBUST.get(name, "none")
+    is_closure = edges >= len(edges) - len(closures)
+    is_rejected = np.zeros(len(edges), dtype=np.bool_)
+    is_rejected[is_closure] = [not closure.accepted for closure in closures]
+    for solution_name, label in SOLUTIONS.items():
+        name, robust = f"pose_graph_{solution_name}", ROBUST_METHODS.get(solution_name, "none")
+        is_gated = solution_name == "gated"
         progress(f"optimising: {label}")
         if robust != "none" and len(closures) < 2:
-            more = "Give further closures with --closure."
-            found[way] = Unavailable(label, SINGLE_LOOP, more)
-        elif name == "gated" and rejected[loops].all():
-            found[way] = _rejected_closure("pose graph", closures[0])
-        elif name == "gated" and not rejected.any():
-            found[way] = found["pose_graph_all"]
+            action = "Give further closures with --closure."
+            corrections[name] = Unavailable(label, SINGLE_LOOP_REASON, action)
+        elif is_gated and is_rejected[is_closure].all():
+            corrections[name] = _unavailable_by_gate("pose graph", closures[0])
+        elif is_gated and not is_rejected.any():
+            corrections[name] = corrections["pose_graph_all"]
         else:
-            used = ~rejected if name == "gated" else np.ones_like(rejected)
-            solution = solve(graph.select_edges(used), robust=robust, loops=loops[used])
-            found[way] = (
-                _interpolate_corrections(path, nodes, graph.poses, solution.poses),
-                solution,
+            is_used = ~is_rejected if is_gated else np.ones_like(is_rejected)
+            solution = solve(
+                graph.select_edges(is_used), robust=robust, is_closure=is_closure[is_used]
             )
+            corrected_path = _interpolate_corrections(path, nodes, graph.poses, solution.poses)
+            corrections[name] = corrected_path, solution
             if robust != "none":
-                each = zip(closures, solution.weights[loops].tolist(), strict=True)
-                closures = tuple(structs.replace(one, **{f"weight_{name}": w}) for one, w in each)
-    return found, closures
+                weights = solution.weights[is_closure].tolist()
+                closures = tuple(
+                    structs.replace(closure, **{f"weight_{solution_name}": weight})
+                    for closure, weight in zip(closures, weights, strict=True)
+                )
+    return corrections, closures
 
 
 def _interpolate_corrections(
-    path: Trajectory, nodes: IntArray, before: Array, after: Array
+    path: Trajectory, nodes: IntArray, graph_poses: Array, solved_poses: Array
 ) -> Trajectory:
     """Correct all poses by interpolating the corrections of the neighbouring nodes."""
-    turn = Rotation.from_quat(after[:, 3:]) * Rotation.from_quat(before[:, 3:]).inv()
-    left = np.searchsorted(nodes, np.arange(len(path)), side="right") - 1
-    left = np.clip(left, 0, len(nodes) - 2)
+    rotation = (
+        Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
+    )
+    previous_node = np.searchsorted(nodes, np.arange(len(path)), side="right") - 1
+    previous_node = np.clip(previous_node, 0, len(nodes) - 2)
     time = path.time_s
-    share = (time - time[nodes[left]]) / (time[nodes[left + 1]] - time[nodes[left]])
-    moved = [
-        after[node, :3] + turn[node].apply(path.position_m - before[node, :3])
-        for node in (left, left + 1)
+    fraction = (time - time[nodes[previous_node]]) / (
+        time[nodes[previous_node + 1]] - time[nodes[previous_node]]
+    )
+    corrected = [
+        solved_poses[node, :3] + rotation[node].apply(path.position_m - graph_poses[node, :3])
+        for node in (previous_node, previous_node + 1)
     ]
-    weight = np.clip(share, 0.0, 1.0)[:, np.newaxis]
-    position = (1.0 - weight) * moved[0] + weight * moved[1]
-    return path.moved(position, Slerp(time[nodes], turn)(time))
+    weight = np.clip(fraction, 0.0, 1.0)[:, np.newaxis]
+    position = (1.0 - weight) * corrected[0] + weight * corrected[1]
+    return path.with_positions(position, Slerp(time[nodes], rotation)(time))
 
 
-def score_all(
+def score_paths(
     odometry: Trajectory,
-    corrected_paths: Mapping[Way, Corrected],
+    corrected_paths: Mapping[CorrectionName, Corrected],
     references: tuple[Trajectory, ...],
-) -> dict[Way, CorrectedPath | Unavailable]:
-    """Score odometry and corrected paths; time offsets are estimated once, on the odometry."""
+) -> dict[CorrectionName, CorrectedPath | Unavailable]:
+    """Score odometry and corrected paths, with the time offset of the odometry for all."""
     offsets: dict[str, float] = {}
 
     def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
         same_clock = 0.0 if reference.sha256 == path.sha256 else None
-        known = offsets.get(reference.name, same_clock)
+        offset_s = offsets.get(reference.name, same_clock)
         try:
-            return evaluate(path, reference, time_offset_s=known)
+            return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
-            what = f"score against {reference.name}"
-            return Unavailable(what, str(error), "Give another --reference.")
+            analysis_name = f"score against {reference.name}"
+            return Unavailable(analysis_name, str(error), "Give another --reference.")
 
-    def scored(way: Way, path: Trajectory, solution: Solution | None) -> CorrectedPath:
+    def score_path(
+        name: CorrectionName, path: Trajectory, solution: Solution | None
+    ) -> CorrectedPath:
         displacement_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
         costs: dict[str, Any] = (
             {} if solution is None else structs.asdict(to_serializable(solution))
         )
         costs.pop("dropped", None)
         return CorrectedPath(
-            name=NAMES[way],
+            name=CORRECTION_LABELS[name],
             trajectory=path,
             moved_m=displacement_m,
             correction_max_m=float(displacement_m.max()),
@@ -181,17 +197,20 @@ def score_all(
             **costs,
         )
 
-    raw = scored("uncorrected", odometry, None)
-    for name, path_scored in raw.scores.items():
-        if isinstance(path_scored, Evaluation) and path_scored.time_offset.offset_s is not None:
-            offsets[name] = path_scored.time_offset.offset_s
-    found: dict[Way, CorrectedPath | Unavailable] = {"uncorrected": raw}
-    for way, corrected in corrected_paths.items():
-        same = found.get("pose_graph_all")
+    uncorrected = score_path("uncorrected", odometry, None)
+    for name, evaluation in uncorrected.scores.items():
+        if isinstance(evaluation, Evaluation) and evaluation.time_offset.offset_s is not None:
+            offsets[name] = evaluation.time_offset.offset_s
+    scored_paths: dict[CorrectionName, CorrectedPath | Unavailable] = {"uncorrected": uncorrected}
+    for name, corrected in corrected_paths.items():
+        all_closures_path = scored_paths.get("pose_graph_all")
         if isinstance(corrected, Unavailable):
-            found[way] = corrected
-        elif isinstance(same, CorrectedPath) and corrected[1] is same.solution:
-            found[way] = structs.replace(same, name=NAMES[way])
+            scored_paths[name] = corrected
+        elif (
+            isinstance(all_closures_path, CorrectedPath)
+            and corrected[1] is all_closures_path.solution
+        ):
+            scored_paths[name] = structs.replace(all_closures_path, name=CORRECTION_LABELS[name])
         else:
-            found[way] = scored(way, *corrected)
-    return found
+            scored_paths[name] = score_path(name, *corrected)
+    return scored_paths

@@ -13,10 +13,10 @@ from px4fuse.record import Count, NotNegative, OrUnavailable, Record, Share, Una
 from px4fuse.trajectory.evaluation import Evaluation, Score
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
-from px4fuse.trajectory.model import AxisLengths, Frame, Kind, Trajectory
+from px4fuse.trajectory.model import AxisComponents, Frame, Kind, Trajectory
 
-# correction of a path; after "pose_graph_" a key of trajectory.graph.analysis.SOLUTIONS
-Way = Literal[
+# name of a correction; after "pose_graph_" a key of trajectory.graph.analysis.SOLUTIONS
+CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
     "by_distance",
@@ -37,14 +37,14 @@ class TrueEnd(Record, frozen=True, kw_only=True):
     heading_change_deg : float or None
         Final heading minus initial heading, clockwise; None if unknown.
     sigma_m, sigma_heading_deg : float
-        Standard deviations; the latter None if the heading is unknown.
+        Standard deviations of position and heading; None for an unknown heading.
     source : str
         Origin of the landing place.
     assumed : bool
-        True if the take-off place is assumed.
+        True if landing at the take-off place is only assumed.
     """
 
-    displacement_m: AxisLengths
+    displacement_m: AxisComponents
     heading_change_deg: float | None = None
     sigma_m: NotNegative
     sigma_heading_deg: NotNegative | None = None
@@ -63,13 +63,14 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
     Attributes
     ----------
     position_m : float
-        Standard deviation of the position per axis after 100 m, by errors of translation only.
+        Standard deviation of the position per axis after 100 m, without the effect of heading
+        errors.
     heading_deg : float
         Standard deviation of the heading after 100 m.
     position_m_per_root_s, heading_deg_per_root_s : float
         Drift over time, also while hovering (m/√s, °/√s).
     tilt_share : float
-        Drift of roll and pitch relative to that of heading; gravity limits it.
+        Drift of roll and pitch over drift of heading; small, because gravity is measured.
 
     Notes
     -----
@@ -92,7 +93,7 @@ class Closure(Record, frozen=True, kw_only=True):
     time_1_s, time_2_s : float
         On the clock of the trajectory.
     sigma_m : float
-        Standard deviation of the displacement, each axis.
+        Standard deviation of the displacement between the two times, each axis.
     source : str
         "landing", or "given".
     distance_m : float
@@ -122,7 +123,7 @@ class Closure(Record, frozen=True, kw_only=True):
 
 
 class Correction(Record, frozen=True, kw_only=True):
-    """Size of a correction, cost of the pose graph, and scores by reference."""
+    """Size of a correction, cost of the pose graph, and scores against each reference."""
 
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
@@ -134,7 +135,7 @@ class Correction(Record, frozen=True, kw_only=True):
 
 
 class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
-    """Corrected path, or the odometry.
+    """Corrected path, or uncorrected odometry.
 
     Attributes
     ----------
@@ -161,10 +162,10 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
 class LoopResult(Record, frozen=True, kw_only=True):
     """Loop: path, landing place, closure errors and corrections, for the results.
 
-    ``closure_error_m``: distance between measured and true end; ``closure_percent``: the same in
-    per cent of the path length; ``is_absolute_track``: the track follows a positioning system and
-    does not drift. Correction ``by_distance_plain`` changes positions only (Example 2 of the
-    lesson); ``by_distance`` also headings, if their error is known.
+    ``closure_error_m`` is the distance between measured and true end, and ``closure_percent`` this
+    distance in per cent of the path length. ``is_absolute_track`` is True if the track follows a
+    positioning system and does not drift. Correction ``by_distance_plain`` changes positions only
+    (Example 2 of the lesson); ``by_distance`` also changes headings, if the heading error is known.
     """
 
     track: str
@@ -177,17 +178,17 @@ class LoopResult(Record, frozen=True, kw_only=True):
     key_frames: Count
     key_frame_spacing_m: NotNegative
     path_length_m: NotNegative
-    end_from_start_m: AxisLengths
+    end_from_start_m: AxisComponents
     heading_change_deg: float | None = None
     true_end: OrUnavailable[TrueEnd]
     closure_error_m: NotNegative | None = None
     closure_percent: NotNegative | None = None
-    closure_error_axes_m: AxisLengths | None = None
+    closure_error_axes_m: AxisComponents | None = None
     heading_error_deg: float | Unavailable
     is_absolute_track: bool
     odometry_noise: OdometryNoise
     closures: tuple[Closure, ...]
-    corrections: Mapping[Way, OrUnavailable[Correction]]
+    corrections: Mapping[CorrectionName, OrUnavailable[Correction]]
     notes: tuple[str, ...]
 
 
@@ -196,20 +197,20 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     Attributes
     ----------
-    corrections : mapping from way to CorrectedPath or Unavailable
+    corrections : mapping from name of a correction to CorrectedPath or Unavailable
     nodes : ndarray of int, shape (k,)
         Key frames, as indices of poses.
     distance_m : ndarray, shape (n,)
         Distance along the key frames at each pose.
     graph : PoseGraph or Unavailable
-        With all closures, before optimisation.
+        Pose graph with all closures, before optimisation.
     references : tuple of Trajectory
     original_frame : Frame
         Frame of the trajectory as given.
     """
 
     schema_type = LoopResult
-    corrections: Mapping[Way, CorrectedPath | Unavailable]
+    corrections: Mapping[CorrectionName, CorrectedPath | Unavailable]
     nodes: IntArray
     distance_m: Array
     graph: PoseGraph | Unavailable
@@ -224,26 +225,26 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
         return self.paths["uncorrected"]
 
     @property
-    def paths(self) -> dict[Way, CorrectedPath]:
-        """Available paths, the odometry first."""
+    def paths(self) -> dict[CorrectionName, CorrectedPath]:
+        """Available paths, first the odometry."""
         every = self.corrections.items()
-        return {way: path for way, path in every if isinstance(path, CorrectedPath)}
+        return {name: path for name, path in every if isinstance(path, CorrectedPath)}
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
         """Paths for reports, without duplicates."""
-        same: set[Way] = set()
+        duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
-            same.add("pose_graph_all")
+            duplicates.add("pose_graph_all")
         if isinstance(self.heading_error_deg, Unavailable):
-            same.add("by_distance")
-        return tuple(path for way, path in self.paths.items() if way not in same)
+            duplicates.add("by_distance")
+        return tuple(path for name, path in self.paths.items() if name not in duplicates)
 
     @property
     def best(self) -> CorrectedPath:
         """Gated solution of the pose graph, else correction by distance, else odometry."""
-        ways: tuple[Way, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
-        return next(self.paths[way] for way in ways if way in self.paths)
+        names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
+        return next(self.paths[name] for name in names if name in self.paths)
 
     @property
     def is_end_assumed(self) -> bool:
@@ -262,5 +263,5 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
         gated, plain = self.paths.get("pose_graph_gated"), self.paths.get("pose_graph_all")
         solved = gated or plain
-        found = None if solved is None else solved.solution
-        return self.graph if found is None else replace(self.graph, poses=found.poses)
+        solution = None if solved is None else solved.solution
+        return self.graph if solution is None else replace(self.graph, poses=solution.poses)

@@ -14,19 +14,19 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# ratio of late to early reported variances above which they are used as drift
+# reported variances are used as drift if the ratio of late to early variances is larger
 MIN_VARIANCE_GROWTH = 2.0
-# lower limit of reported variances, as fraction of the default drift: edges need a variance
-FLOOR_SHARE = 1e-2
-END_SHARE = 0.1  # fraction of the path whose variances count as early, and as late
-# closure, and its landing place if it is that of the landing
-ClosureClaim = tuple[GivenClosure, TrueEnd | None]
+# lower limit of reported variances, as fraction of the default drift: a variance must not be zero
+MIN_VARIANCE_FRACTION = 1e-2
+END_FRACTION = 0.1  # fraction of the path whose variances count as early, and as late
+# closure; for the closure by landing also the landing place
+ClosureWithEnd = tuple[GivenClosure, TrueEnd | None]
 
 
 def odometry_variances(
     path: Trajectory, nodes: IntArray, noise: OdometryNoise
 ) -> tuple[Array, Array, str]:
-    """Compute the variances of the steps between nodes of a path.
+    """Compute the variances of the odometry between the nodes of a path.
 
     Parameters
     ----------
@@ -44,45 +44,50 @@ def odometry_variances(
     statement : str
         Origin of the variances.
     """
-    length = np.diff(cumulative_distance(path.position_m[nodes]))
-    duration = np.diff(path.time_s[nodes])
-    translation = noise.position_m**2 / 100.0 * length + noise.position_m_per_root_s**2 * duration
-    heading = np.radians(noise.heading_deg) ** 2 / 100.0 * length
-    heading = heading + np.radians(noise.heading_deg_per_root_s) ** 2 * duration
+    length_m = np.diff(cumulative_distance(path.position_m[nodes]))
+    duration_s = np.diff(path.time_s[nodes])
+    translation = (
+        noise.position_m**2 / 100.0 * length_m + noise.position_m_per_root_s**2 * duration_s
+    )
+    heading = np.radians(noise.heading_deg) ** 2 / 100.0 * length_m
+    heading = heading + np.radians(noise.heading_deg_per_root_s) ** 2 * duration_s
     tilt = noise.tilt_share**2 * heading
     rotation = np.column_stack([tilt, tilt, heading])
-    noise_origin = "default" if noise == OdometryNoise() else "as given"
-    noise_text = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
-    statements = [f"odometry drift: {noise_text} (1 σ, {noise_origin})"]
-    reported = _variance_growth(path.position_variance_m2, nodes)
-    if reported is not None:
-        translation = np.maximum(reported.mean(axis=1), FLOOR_SHARE * translation)
-        statements.append("translation: growth of the logged position variances")
+    drift_origin = "default" if noise == OdometryNoise() else "as given"
+    drift_text = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
+    origin_texts = [f"odometry drift: {drift_text} (1 σ, {drift_origin})"]
+    position_growth = _variance_growth(path.position_variance_m2, nodes)
+    if position_growth is not None:
+        translation = np.maximum(position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation)
+        origin_texts.append("translation: growth of the logged position variances")
     elif path.position_variance_m2 is not None:
-        statements.append("the logged position variances do not grow and are not used as drift")
+        origin_texts.append("the logged position variances do not grow and are not used as drift")
     rotation_growth = _variance_growth(path.rotation_variance_rad2, nodes)
     if rotation_growth is not None:
-        rotation = np.maximum(rotation_growth, FLOOR_SHARE * rotation)
-        statements.append("rotation: growth of the logged orientation variances")
-    return translation, rotation, "; ".join(statements)
+        rotation = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation)
+        origin_texts.append("rotation: growth of the logged orientation variances")
+    return translation, rotation, "; ".join(origin_texts)
 
 
 def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
-    """Return the growth of variances between nodes, shape (k - 1, 3); None if small."""
+    """Return the growth of variances between nodes, shape (k - 1, 3); None if they hardly grow."""
     if variance is None:
         return None
-    tenth = max(1, int(END_SHARE * len(variance)))
-    early = float(np.median(variance[:tenth].sum(axis=1)))
-    late = float(np.median(variance[-tenth:].sum(axis=1)))
-    if not late > MIN_VARIANCE_GROWTH * early:
+    end_count = max(1, int(END_FRACTION * len(variance)))
+    start_variance = float(np.median(variance[:end_count].sum(axis=1)))
+    end_variance = float(np.median(variance[-end_count:].sum(axis=1)))
+    if not end_variance > MIN_VARIANCE_GROWTH * start_variance:
         return None
     return np.maximum(np.diff(variance[nodes], axis=0), 0.0)
 
 
-def pose_graph(
-    path: Trajectory, frames: IntArray, claims: Sequence[ClosureClaim], noise: OdometryNoise
+def build_pose_graph(
+    path: Trajectory,
+    frames: IntArray,
+    closures_with_end: Sequence[ClosureWithEnd],
+    noise: OdometryNoise,
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
-    """Build the pose graph of a path: edges between successive nodes, and per closure.
+    """Build the pose graph of a path: odometry edges between successive nodes, and closures.
 
     Parameters
     ----------
@@ -90,15 +95,15 @@ def pose_graph(
         In a frame with z down; with orientations.
     frames : ndarray of int, shape (f,)
         Key frames, as indices of poses.
-    claims : sequence of ClosureClaim
-        Closures, with the landing place for that of the landing.
+    closures_with_end : sequence of ClosureWithEnd
+        Closures; the closure by landing has the landing place.
 
     Returns
     -------
     graph : PoseGraph or Unavailable
         Odometry edges first, then closures in order.
     nodes : ndarray of int, shape (k,)
-        Poses that are nodes: key frames, and those nearest to the times of closures.
+        Poses that are nodes: key frames, and the poses nearest to the times of closures.
     statement : str
         Origin of the variances.
     """
@@ -106,28 +111,34 @@ def pose_graph(
         reason = "the trajectory has no orientations"
         remedy = "Use a trajectory with orientations."
         return Unavailable("pose graph", reason, remedy), frames, ""
-    times = np.array([(closure.time_1_s, closure.time_2_s) for closure, _ in claims]).reshape(-1, 2)
-    at = np.abs(path.time_s - times[..., None]).argmin(axis=-1)
-    nodes = np.union1d(frames, at).astype(np.intp)
-    ends = np.searchsorted(nodes, at)
+    closure_times_s = np.array(
+        [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_with_end]
+    ).reshape(-1, 2)
+    pose_indices = np.abs(path.time_s - closure_times_s[..., None]).argmin(axis=-1)
+    nodes = np.union1d(frames, pose_indices).astype(np.intp)
+    end_nodes = np.searchsorted(nodes, pose_indices)
     position, rotation = path.position_m[nodes], path.rotation[nodes]
-    translation, turn, statement = odometry_variances(path, nodes, noise)
+    translation_m2, rotation_rad2, statement = odometry_variances(path, nodes, noise)
     steps = np.arange(len(nodes) - 1)
-    first, second = np.append(steps, ends[:, 0]), np.append(steps + 1, ends[:, 1])
+    first, second = np.append(steps, end_nodes[:, 0]), np.append(steps + 1, end_nodes[:, 1])
     information = np.zeros((len(first), 6, 6))
-    diagonal = np.column_stack([np.repeat(1.0 / translation[:, None], 3, axis=1), 1.0 / turn])
+    diagonal = np.column_stack(
+        [np.repeat(1.0 / translation_m2[:, None], 3, axis=1), 1.0 / rotation_rad2]
+    )
     information[steps[:, None], range(6), range(6)] = diagonal
     first_inverse, second_rotation = rotation[first].inv(), rotation[second]
     translation_measured = first_inverse.apply(position[second] - position[first])
-    for row, (closure, end) in enumerate(claims, start=len(steps)):
+    for row, (closure, end) in enumerate(closures_with_end, start=len(steps)):
         translation_measured[row] = (
             0.0 if end is None else first_inverse[row].apply(end.displacement)
         )
         information[row, range(3), range(3)] = closure.sigma_m**-2
         if end is not None and end.heading_change_deg is not None:
-            by_odometry = heading_change_rad(second_rotation[row] * rotation[first[row]].inv())
-            error = float(lie.wrap(np.radians(end.heading_change_deg) - by_odometry))
-            second_rotation[row] = Rotation.from_rotvec(error * DOWN) * second_rotation[row]
+            odometry_change_rad = heading_change_rad(
+                second_rotation[row] * rotation[first[row]].inv()
+            )
+            error_rad = float(lie.wrap(np.radians(end.heading_change_deg) - odometry_change_rad))
+            second_rotation[row] = Rotation.from_rotvec(error_rad * DOWN) * second_rotation[row]
             vertical = second_rotation[row].inv().apply(DOWN)
             sigma = np.radians(end.sigma_heading_deg or 0.0)
             information[row, 3:, 3:] = np.outer(vertical, vertical) / sigma**2

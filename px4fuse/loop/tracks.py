@@ -21,13 +21,13 @@ from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.reading import display_name, read_head
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
-FlightPart = Literal["vio", "ekf2", "kf", "truth"]
-FLIGHT_PARTS: tuple[FlightPart, ...] = get_args(FlightPart)
+TrackName = Literal["vio", "ekf2", "kf", "truth"]
+TRACK_NAMES: tuple[TrackName, ...] = get_args(TrackName)
 _HEAD_BYTES = 4096
-_G2O = (b"VERTEX_", b"EDGE_", b"FIX")
+_G2O_TAGS = (b"VERTEX_", b"EDGE_", b"FIX")
 
 
-def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
+def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
     """Return the odometry of a flight: external vision with a varying orientation.
 
     Positioning systems such as UWB send no orientation, or a constant one.
@@ -35,62 +35,70 @@ def odometry_of(flight: Flight) -> PositionTrack | Unavailable:
     for track in flight.positions:
         if track.origin.is_vision and track.orientation is not None:
             return track
-    have = ", ".join(track.name for track in flight.positions) or "none"
+    track_names = ", ".join(track.name for track in flight.positions) or "none"
     return Unavailable(
         "visual-inertial odometry",
-        f"the log has no external vision with orientation (position sources: {have})",
+        f"the log has no external vision with orientation (position sources: {track_names})",
         "Send the odometry to PX4 as ODOMETRY, and set SDLOG_PROFILE to 129 to log it.",
     )
 
 
-def trajectory_of(flight: Flight, part: FlightPart) -> Trajectory:
+def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     """Return a track of a flight as trajectory.
 
     Parameters
     ----------
     flight : Flight
-    part : {"vio", "ekf2", "kf", "truth"}
+    track_name : {"vio", "ekf2", "kf", "truth"}
         "kf": KF along north, east and down, with the attitude of the autopilot.
 
     Raises
     ------
     MissingDataError
-        The log lacks the track; the message states how to log it.
+        The log does not contain the track; the message has an action to log it.
     """
-    if part == "kf":
-        return _kf_trajectory(flight)
-    found = {"vio": odometry_of(flight), "truth": flight.truth, "ekf2": flight.ekf2}[part]
-    if isinstance(found, PositionTrack):
-        # without a frame in the log, x is assumed to be forward at the start
-        frame: Frame = "NED" if found.frame == "NED" else "FRD"
-        note = f"{found.name}: {found.description}"
-        return _trajectory(flight, part, found.samples, found.orientation, (note,), frame)
-    if isinstance(found, Truth):
-        return _trajectory(flight, part, found.samples, found.attitude, (found.name,))
-    if not isinstance(found, Ekf2):
-        raise MissingDataError(f"{flight.log.name}:{part}: {found.reason}", f"{found.remedy}")
-    state, notes = found.state, ["EKF2 position as published"]
+    if track_name == "kf":
+        return _make_kf_trajectory(flight)
+    track_data = {"vio": find_odometry(flight), "truth": flight.truth, "ekf2": flight.ekf2}[
+        track_name
+    ]
+    if isinstance(track_data, PositionTrack):
+        # if the log does not name the frame, x is assumed to be forward at the start
+        frame: Frame = "NED" if track_data.frame == "NED" else "FRD"
+        note = f"{track_data.name}: {track_data.description}"
+        return _make_trajectory(
+            flight, track_name, track_data.samples, track_data.orientation, (note,), frame
+        )
+    if isinstance(track_data, Truth):
+        return _make_trajectory(
+            flight, track_name, track_data.samples, track_data.attitude, (track_data.name,)
+        )
+    if not isinstance(track_data, Ekf2):
+        raise MissingDataError(
+            f"{flight.log.name}:{track_name}: {track_data.reason}", f"{track_data.remedy}"
+        )
+    state, notes = track_data.state, ["EKF2 position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
         log_segment = Segment(0.0, flight.log.duration_s, "the whole log")
-        state, resets = continuous_state(found, source, log_segment)
+        state, resets = continuous_state(track_data, source, log_segment)
         notes += [resets] if resets else []
-    return _trajectory(flight, part, state, flight.attitude, tuple(notes))
+    return _make_trajectory(flight, track_name, state, flight.attitude, tuple(notes))
 
 
-def _kf_trajectory(flight: Flight) -> Trajectory:
+def _make_kf_trajectory(flight: Flight) -> Trajectory:
     kf_comparison = compare(flight, axes=AXIS_NAMES)
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position = pd.DataFrame({name: axis.replay.steps["position_m"] for name, axis in columns})
-    used = kf_comparison.settings
-    noises = f"SIGMA_A {used.sigma_a_m_s2:g} m/s², SIGMA_Z {used.sigma_z_m:g} m"
+    settings = kf_comparison.settings
+    noises = f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m"
     note = f"KF with the positions {kf_comparison.source.name}, {noises}"
-    return _trajectory(flight, "kf", position, flight.attitude, (note,))
+    return _make_trajectory(flight, "kf", position, flight.attitude, (note,))
 
 
-def _trajectory(
+def _make_trajectory(
     flight: Flight,
-    part: Kind,
+    track_name: Kind,
     samples: pd.DataFrame,
     orientation: pd.DataFrame | Unavailable | None,
     notes: tuple[str, ...],
@@ -100,24 +108,30 @@ def _trajectory(
     samples = finite_rows(samples, Columns.POSITION)
     rotation, rotation_variance = None, None
     if isinstance(orientation, pd.DataFrame):
-        known = orientation.index.to_numpy()
-        inside = samples[(samples.index >= known[0]) & (samples.index <= known[-1])]
-        if len(inside) >= MIN_POSES:
-            samples = inside
+        orientation_s = orientation.index.to_numpy()
+        covered_samples = samples[
+            (samples.index >= orientation_s[0]) & (samples.index <= orientation_s[-1])
+        ]
+        if len(covered_samples) >= MIN_POSES:
+            samples = covered_samples
             quaternions = orientation[Columns.QUATERNION].to_numpy(copy=True)
-            turns = Rotation.from_quat(quaternions, scalar_first=True)
-            rotation = Slerp(known, turns)(samples.index.to_numpy())
-            reported = _complete_variances(orientation, Columns.ROTATION_VARIANCE)
-            if reported is not None:
-                columns = [np.interp(samples.index, known, column) for column in reported.T]
+            rotations = Rotation.from_quat(quaternions, scalar_first=True)
+            rotation = Slerp(orientation_s, rotations)(samples.index.to_numpy())
+            reported_variance = _complete_variances(orientation, Columns.ROTATION_VARIANCE)
+            if reported_variance is not None:
+                columns = [
+                    np.interp(samples.index, orientation_s, column)
+                    for column in reported_variance.T
+                ]
                 rotation_variance = np.column_stack(columns)
     if len(samples) < MIN_POSES:
         raise MissingDataError(
-            f"{flight.log.name}:{part}: only {len(samples)} poses (at least {MIN_POSES} needed)."
+            f"{flight.log.name}:{track_name}: only {len(samples)} poses (at least {MIN_POSES} are "
+            "needed)."
         )
     return Trajectory(
-        name=f"{flight.log.name}:{part}",
-        kind=part,
+        name=f"{flight.log.name}:{track_name}",
+        kind=track_name,
         time_s=samples.index.to_numpy(np.float64),
         position_m=samples[Columns.POSITION].to_numpy(np.float64),
         rotation=rotation,
@@ -132,7 +146,7 @@ def _trajectory(
 
 
 def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
-    """Return reported variances, shape (n, 3); None if any is missing."""
+    """Return the reported variances, shape (n, 3); None if any value is missing."""
     if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
     return samples[columns].to_numpy(np.float64)
@@ -147,12 +161,12 @@ class LoopSource:
 
 
 def file_name(source: Path) -> str:
-    """Return the stem of output file names: ``flight_vio`` for ``flight.ulg:vio``."""
-    path, part = split_part(str(source))
-    return path.stem if part is None else f"{path.stem}_{part}"
+    """Return the stem for names of output files: ``flight_vio`` for ``flight.ulg:vio``."""
+    path, track_name = split_part(str(source))
+    return path.stem if track_name is None else f"{path.stem}_{track_name}"
 
 
-def split_part(argument: str) -> tuple[Path, FlightPart | None]:
+def split_part(argument: str) -> tuple[Path, TrackName | None]:
     """Split ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth`` into file and track.
 
     Raises
@@ -161,15 +175,15 @@ def split_part(argument: str) -> tuple[Path, FlightPart | None]:
         The text after the colon is not a track.
     """
     full_path = Path(argument)
-    path, colon, part = argument.rpartition(":")
+    path, colon, track_name = argument.rpartition(":")
     if full_path.exists() or not colon:
         return full_path, None
-    if part in FLIGHT_PARTS:
-        return Path(path), part
+    if track_name in TRACK_NAMES:
+        return Path(path), track_name
     if Path(path).is_file():
         raise TrajectoryError(
-            f"{display_name(Path(path))}:{part}: {part!r} is not a track of a flight.",
-            f"Use one of {', '.join(FLIGHT_PARTS)}.",
+            f"{display_name(Path(path))}:{track_name}: {track_name!r} is not a track of a flight.",
+            f"Use one of {', '.join(TRACK_NAMES)}.",
         )
     return full_path, None
 
@@ -184,14 +198,14 @@ def is_g2o(path: Path) -> bool:
     """
     head = read_head(path, _HEAD_BYTES, TrajectoryError)
     return decode_text(head) is not None and any(
-        line.strip().startswith(_G2O) for line in head.splitlines()
+        line.strip().startswith(_G2O_TAGS) for line in head.splitlines()
     )
 
 
 def read_source(
     argument: str,
     *,
-    default: FlightPart | None = None,
+    default: TrackName | None = None,
     frame: Frame | None = None,
     system: int | None = None,
 ) -> LoopSource:
@@ -202,7 +216,7 @@ def read_source(
     argument : str
         See :func:`split_part`.
     default : FlightPart, optional
-        Track of a log if none is named; by default its odometry, else EKF2's track.
+        Track of a log if ``argument`` names none; by default odometry, else EKF2's track.
     frame : Frame, optional
         Frame of a trajectory file; by default detected.
     system : int, optional
@@ -211,11 +225,11 @@ def read_source(
     Raises
     ------
     TrajectoryError, LogError, MissingDataError
-        The source cannot be read, or lacks the track.
+        The source cannot be read, or does not contain the track.
     SettingsError
         ``frame`` is given for a flight log.
     """
-    path, part = split_part(argument)
+    path, track_name = split_part(argument)
     head = read_head(path, _HEAD_BYTES, TrajectoryError)
     if not head:
         raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")
@@ -224,10 +238,11 @@ def read_source(
             f"{display_name(path)} is a pose graph, not a trajectory.",
             f"Optimise it with px4fuse loop {display_name(path)}.",
         )
-    if decode_text(head) is not None:  # text, so not a flight log
-        if part is not None:
+    if decode_text(head) is not None:  # flight logs are binary
+        if track_name is not None:
             raise TrajectoryError(
-                f"{display_name(path)} is a trajectory file and has no track {part!r}.", "Omit it."
+                f"{display_name(path)} is a trajectory file and has no track {track_name!r}.",
+                "Omit it.",
             )
         trajectory = read_trajectory(path)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
@@ -238,9 +253,9 @@ def read_source(
             "Omit --frame.",
         )
     flight = read_log(path, system=system)
-    chosen = part or default
+    chosen = track_name or default
     if chosen is None:
-        odometry, chosen = odometry_of(flight), "vio"
+        odometry, chosen = find_odometry(flight), "vio"
         if isinstance(odometry, Unavailable):
             chosen = "ekf2"
             if isinstance(flight.ekf2, Unavailable):

@@ -1,4 +1,4 @@
-"""Functions for readers of all formats: valid rows, time intervals, missing parts."""
+"""Common functions of all readers: valid rows, time intervals, missing parts."""
 
 from typing import Any
 
@@ -8,15 +8,15 @@ import pandas as pd
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.flight import Columns, Ekf2, FlightMode, Unavailable
 
-# SI units; larger positions, velocities, accelerations and angles are damaged data
-DAMAGED = 1e9
+# SI units; larger positions, velocities, accelerations and angles are damaged
+MAX_VALID_VALUE = 1e9
 # m/s² and rad/s; above the range of accelerometers (400 g) and gyros (4000 °/s)
-BEYOND_IMU = 1e4
-MIN_NORM = 0.5  # quaternions with a smaller norm mean "no attitude"
+MAX_IMU_VALUE = 1e4
+MIN_QUATERNION_NORM = 0.5  # quaternions with a smaller norm mean "no attitude"
 
 
 def collect_unavailable(*flight_parts: object) -> tuple[Unavailable, ...]:
-    """Return the unavailable ones of some parts of a flight, including the parts of EKF2."""
+    """Return the unavailable parts of a flight, including the unavailable parts of EKF2."""
     for flight_part in flight_parts:
         if isinstance(flight_part, Ekf2):
             flight_parts += (
@@ -29,9 +29,9 @@ def collect_unavailable(*flight_parts: object) -> tuple[Unavailable, ...]:
     )
 
 
-def constant_spans(steps: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
+def constant_spans(values: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
     """Return start (s), end (s) and value of each interval with a constant value."""
-    changes = steps[steps.ne(steps.shift())]
+    changes = values[values.ne(values.shift())]
     starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
     spans = zip(starts, [*starts[1:], end_s], changes, strict=False)
     return [(start, end, value) for start, end, value in spans if end > start]
@@ -39,21 +39,25 @@ def constant_spans(steps: pd.Series, end_s: float) -> list[tuple[float, float, A
 
 def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
     """Return the intervals (s) in which ``landed`` is 0 or False."""
-    return tuple((start, end) for start, end, on in constant_spans(landed, duration_s) if not on)
+    return tuple(
+        (start, end)
+        for start, end, is_landed in constant_spans(landed, duration_s)
+        if not is_landed
+    )
 
 
 def ends_in_flight(
     airborne: tuple[tuple[float, float], ...] | Unavailable, duration_s: float
 ) -> bool:
-    """Return True if the last flight interval lasts until the end of the data."""
+    """Return True if the last interval in flight (s) lasts until the end of the data."""
     last_span = () if isinstance(airborne, Unavailable) else airborne[-1:]
-    return any(end >= duration_s for _, end in last_span)
+    return any(span_end_s >= duration_s for _, span_end_s in last_span)
 
 
-def format_truncation(part: str, duration_s: float, in_flight: bool) -> str:
-    """Format the sentence on a file that ends within a frame or message (``part``)."""
+def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
+    """Format the sentence on a file that ends within a ``unit``: a frame or a message."""
     flying = ", in flight" if in_flight else ""
-    return f"the file ends within a {part} after {duration_s:.1f} s{flying}; later data are missing"
+    return f"the file ends within a {unit} after {duration_s:.1f} s{flying}; later data are missing"
 
 
 def mode_spans(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
@@ -61,32 +65,34 @@ def mode_spans(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
     return tuple(FlightMode(*span) for span in constant_spans(names, end_s))
 
 
-def finite_rows(samples: pd.DataFrame, columns: list[str], limit: float = DAMAGED) -> pd.DataFrame:
+def finite_rows(
+    samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_VALUE
+) -> pd.DataFrame:
     """Return the rows whose absolute values in ``columns`` are all below ``limit`` (not NaN)."""
     is_valid: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
     return samples[is_valid]
 
 
-def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, within_s: float) -> pd.DataFrame:
-    """Join each row with the nearest row of ``others`` in time; NaN beyond ``within_s`` (s)."""
+def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, tolerance_s: float) -> pd.DataFrame:
+    """Join each row with the row of ``others`` that is nearest in time; NaN if too far away."""
     return pd.merge_asof(
         samples,
         others,
         left_index=True,
         right_index=True,
         direction="nearest",
-        tolerance=within_s,  # type: ignore[arg-type]
+        tolerance=tolerance_s,  # type: ignore[arg-type]
     )
 
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with a valid quaternion ``w, x, y, z``; norm 0 means "not sent"."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
-    return samples[(norm > MIN_NORM) & (norm < DAMAGED)]
+    return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_VALUE)]
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Extract the orientations of samples; None if there are none or all are equal.
+    """Extract the orientations of samples; None without two different ones.
 
     Parameters
     ----------
@@ -94,15 +100,17 @@ def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
         Columns ``w, x, y, z`` and optionally the variances ``forward_rad2, right_rad2,
         down_rad2``, in which 0 means "not sent" (``EKF2.cpp``).
     """
-    found = with_attitude(samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE))
-    quaternions = found[Columns.QUATERNION]
-    if len(found) < 2 or (quaternions == quaternions.iloc[0]).to_numpy().all():
+    orientation = with_attitude(
+        samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE)
+    )
+    quaternions = orientation[Columns.QUATERNION]
+    if len(orientation) < 2 or (quaternions == quaternions.iloc[0]).to_numpy().all():
         return None
-    variances = found[Columns.ROTATION_VARIANCE]
-    return found.assign(**variances.where(variances > 0))
+    variances = orientation[Columns.ROTATION_VARIANCE]
+    return orientation.assign(**variances.where(variances > 0))
 
 
 def read_attitude(samples: pd.DataFrame | None) -> pd.DataFrame | None:
     """Return the quaternions of :func:`read_orientation` without variances."""
-    found = None if samples is None else read_orientation(samples)
-    return None if found is None else found[Columns.QUATERNION]
+    orientation = None if samples is None else read_orientation(samples)
+    return None if orientation is None else orientation[Columns.QUATERNION]

@@ -11,14 +11,14 @@ import msgspec
 
 from px4fuse.flight import Columns
 
-# Values of this size are damage: the largest valid fields are UNIX times in µs (1.8e15)
-IMPOSSIBLE = 1e17
+# Larger values are damaged: the largest valid fields are UNIX times in µs (1.8e15)
+MAX_FIELD_VALUE = 1e17
 GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Fields of one topic or message that contain a quantity.
+    """Fields of one topic or message with the columns that they become.
 
     Attributes
     ----------
@@ -70,16 +70,18 @@ def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
     """
     columns: dict[str, Any] = {}
     for column_names, field_names in fields.items():
-        names: list[str] = (
+        column_list: list[str] = (
             getattr(Columns, column_names) if column_names.isupper() else column_names.split()
         )
         if isinstance(field_names, float):
-            columns |= dict.fromkeys(names, field_names)
+            columns |= dict.fromkeys(column_list, field_names)
             continue
-        name, is_array, elements = field_names.removesuffix("]").partition("[")
-        element_numbers = elements.split() or range(len(names))
+        array_name, is_array, element_text = field_names.removesuffix("]").partition("[")
+        element_numbers = element_text.split() or range(len(column_list))
         column_fields = (
-            [f"{name}[{place}]" for place in element_numbers] if is_array else field_names.split()
+            [f"{array_name}[{element}]" for element in element_numbers]
+            if is_array
+            else field_names.split()
         )
-        columns |= zip(names, column_fields, strict=True)
+        columns |= zip(column_list, column_fields, strict=True)
     return columns

@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import Rows, decode_text, format_line_error, quote
-from px4fuse.readers.trajectory import MAX_VALUE
+from px4fuse.readers.trajectory import MAX_COORDINATE_M
 from px4fuse.reading import display_name, read_bytes_limited
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
@@ -23,17 +23,17 @@ _TAGS = {
     "EDGE_SE3:QUAT": (2, 7 + 21),
 }
 # Beginnings of tags that are skipped: laser scans and parameters contain no poses or edges
-_IGNORED = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
+_SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _REMEDY = (
     "Supported are poses (VERTEX_SE2 or VERTEX_SE3:QUAT) and edges between them (EDGE_SE2 or "
     "EDGE_SE3:QUAT). Remove other lines; convert TORO files to g2o."
 )
-_VERTEX = re.compile("[+-]?[0-9]{1,18}")
-# Ratio; negative over largest eigenvalue that rounding of printed digits can cause
-_ROUNDING = 1e-9
-# Deviation from norm 1 that is left unchanged: it is the rounding error of float64
+_VERTEX_ID = re.compile("[+-]?[0-9]{1,18}")
+# Ratio of a negative to the largest eigenvalue that rounding of the printed digits can cause
+_EIGENVALUE_TOLERANCE = 1e-9
+# Deviation from norm 1 that is not corrected, because it is the rounding error of float64
 _UNIT_NORM_TOLERANCE = 1e-15
-# 1/m² or 1/rad²; outside the values of real measurements, inside those whose squares overflow
+# 1/m² or 1/rad²; real measurements are inside these limits, and squares inside do not overflow
 _MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
@@ -52,11 +52,11 @@ def read_g2o(path: str | Path) -> PoseGraph:
         vertex, a repeated vertex, an invalid information matrix, or both SE2 and SE3 poses. The
         message names the file and the line.
     """
-    file = Path(path)
-    text = decode_text(read_bytes_limited(file, TrajectoryError, MAX_FILE_BYTES))
+    path_object = Path(path)
+    text = decode_text(read_bytes_limited(path_object, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
-        raise TrajectoryError(f"{display_name(file)}: not a text file", _REMEDY)
-    return parse_g2o(text, display_name(file))
+        raise TrajectoryError(f"{display_name(path_object)}: not a text file", _REMEDY)
+    return parse_g2o(text, display_name(path_object))
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
@@ -74,40 +74,42 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     """
     rows_by_tag = _rows_by_tag(text, name)
     in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
-    dimension, kind, width = (2, "SE2", 3) if in_plane else (3, "SE3:QUAT", 7)
+    dimension, tag_kind, pose_width = (2, "SE2", 3) if in_plane else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
-        if rows.lines and not tag.endswith(kind):
-            what = "the file contains both SE2 and SE3 poses"
-            raise rows.row_error(0, what, "Use one kind per file.")
-    vertices, edges = rows_by_tag[f"VERTEX_{kind}"], rows_by_tag[f"EDGE_{kind}"]
+        if rows.lines and not tag.endswith(tag_kind):
+            fault = "the file contains both SE2 and SE3 poses or edges"
+            raise rows.row_error(0, fault, "Use one kind per file.")
+    vertices, edges = rows_by_tag[f"VERTEX_{tag_kind}"], rows_by_tag[f"EDGE_{tag_kind}"]
     if not edges.lines:
         raise TrajectoryError(f"{name}: the file contains no edges", _REMEDY)
-    end_ids, numbers = _parse(edges, f"EDGE_{kind}")
-    ids = np.unique(end_ids)
-    poses = np.zeros((len(ids), width))
+    edge_vertex_ids, edge_values = _parse(edges, f"EDGE_{tag_kind}")
+    ids = np.unique(edge_vertex_ids)
+    poses = np.zeros((len(ids), pose_width))
     poses[:, 6:] = 1.0  # w of the quaternion
     if vertices.lines:
-        vertex_ids, poses = _parse(vertices, f"VERTEX_{kind}")
+        vertex_ids, poses = _parse(vertices, f"VERTEX_{tag_kind}")
         order = np.argsort(vertex_ids[:, 0], kind="stable")
         ids, poses = vertex_ids[order, 0], _normalise_quaternions(vertices, poses)[order]
         is_repeated = np.zeros(len(ids), dtype=np.bool_)
         is_repeated[order[1:]] = ids[1:] == ids[:-1]
         vertices.raise_where(is_repeated, "this vertex id is repeated", "Remove one of the lines.")
-    index = np.minimum(np.searchsorted(ids, end_ids), len(ids) - 1)
-    what = "an edge to a vertex that is not in the file"
+    vertex_index = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
+    fault = "an edge to a vertex that is not in the file"
     remedy = "Add the VERTEX line, or remove all VERTEX lines."
-    edges.raise_where(ids[index] != end_ids, what, remedy)
+    edges.raise_where(ids[vertex_index] != edge_vertex_ids, fault, remedy)
     edges.raise_where(
-        end_ids[:, 0] == end_ids[:, 1], "an edge from a vertex to itself", "Remove the line."
+        edge_vertex_ids[:, 0] == edge_vertex_ids[:, 1],
+        "an edge from a vertex to itself",
+        "Remove the line.",
     )
     graph = PoseGraph(
         dimension=dimension,
         ids=ids,
         poses=poses,
-        first=index[:, 0],
-        second=index[:, 1],
-        measurements=_normalise_quaternions(edges, numbers[:, :width]),
-        information=_information(edges, numbers[:, width:], 3 if dimension == 2 else 6),
+        first=vertex_index[:, 0],
+        second=vertex_index[:, 1],
+        measurements=_normalise_quaternions(edges, edge_values[:, :pose_width]),
+        information=_information(edges, edge_values[:, pose_width:], 3 if dimension == 2 else 6),
         initialised=FROM_FILE,
     )
     try:
@@ -117,60 +119,66 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
 
 
 def g2o_text(graph: PoseGraph) -> str:
-    """Return the pose graph as the text of a g2o file, from which :func:`read_g2o` reads it.
+    """Return the pose graph as the text of a g2o file, with all digits.
 
-    The text contains the vertices, a FIX of the first vertex, and the edges, with all digits.
+    The text contains the vertices, a FIX of the first vertex, and the edges.
     """
     kind = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
-    upper = np.triu_indices(graph.freedom)
+    upper_triangle = np.triu_indices(graph.degrees_of_freedom)
     poses = zip(ids, graph.poses.tolist(), strict=True)
-    lines = [f"VERTEX_{kind} {number} {' '.join(map(repr, pose))}" for number, pose in poses]
+    lines = [f"VERTEX_{kind} {vertex_id} {' '.join(map(repr, pose))}" for vertex_id, pose in poses]
     lines.append(f"FIX {ids[0]}")
-    numbers = np.hstack([graph.measurements, graph.information[:, upper[0], upper[1]]]).tolist()
-    edges = zip(graph.first.tolist(), graph.second.tolist(), numbers, strict=True)
-    lines += [f"EDGE_{kind} {ids[i]} {ids[j]} {' '.join(map(repr, row))}" for i, j, row in edges]
+    edge_values = np.hstack(
+        [graph.measurements, graph.information[:, upper_triangle[0], upper_triangle[1]]]
+    ).tolist()
+    edges = zip(graph.first.tolist(), graph.second.tolist(), edge_values, strict=True)
+    lines += [
+        f"EDGE_{kind} {ids[i]} {ids[j]} {' '.join(map(repr, values))}" for i, j, values in edges
+    ]
     return "\n".join(lines) + "\n"
 
 
 def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
     """Return the vertex and edge lines, grouped by tag."""
     rows_by_tag = {tag: Rows(name) for tag in _TAGS}
-    fixed: set[str] = set()
-    for number, raw in enumerate(text.split("\n"), start=1):
-        line = raw.partition("#")[0].strip()
+    fixed_ids: set[str] = set()
+    for line_number, raw_line in enumerate(text.split("\n"), start=1):
+        line = raw_line.partition("#")[0].strip()
         if not line:
             continue
-        tag, *rest = line.split(maxsplit=1)
+        tag, *values = line.split(maxsplit=1)
         if tag in rows_by_tag:
-            rows_by_tag[tag].lines.append((number, line))
+            rows_by_tag[tag].lines.append((line_number, line))
         elif tag == "FIX":
-            fixed.update(" ".join(rest).split())
-            if len(fixed) > 1:
+            fixed_ids.update(" ".join(values).split())
+            if len(fixed_ids) > 1:
                 remedy = "Only one pose can be fixed: remove the line, or connect both by an edge."
                 raise TrajectoryError(
-                    format_line_error(name, number, "FIX of a second vertex", remedy)
+                    format_line_error(name, line_number, "FIX of a second vertex", remedy)
                 )
-        elif not tag.startswith(_IGNORED):
+        elif not tag.startswith(_SKIPPED_TAGS):
             raise TrajectoryError(
-                format_line_error(name, number, f"{quote(tag)} lines are not supported", _REMEDY)
+                format_line_error(
+                    name, line_number, f"{quote(tag)} lines are not supported", _REMEDY
+                )
             )
     return rows_by_tag
 
 
 def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Array]:
     """Return the vertex ids (n, 1 or 2) and the numbers of all lines of one tag."""
-    vertex_count, count = _TAGS[tag]
-    words, numbers = rows.parse(1 + vertex_count, count)
-    is_no_number = np.array([_VERTEX.fullmatch(word) is None for word in words[:, 1:].flat])
-    what = "the vertex number is not an integer of at most 18 digits"
-    rows.raise_where(is_no_number.reshape(-1, vertex_count), what, "Give an integer.")
+    vertex_count, value_count = _TAGS[tag]
+    cells, numbers = rows.parse(1 + vertex_count, value_count)
+    is_invalid_id = np.array([_VERTEX_ID.fullmatch(word) is None for word in cells[:, 1:].flat])
+    fault = "the vertex number is not an integer of at most 18 digits"
+    rows.raise_where(is_invalid_id.reshape(-1, vertex_count), fault, "Give an integer.")
     remedy = "Correct or remove the line."
     rows.raise_where(~np.isfinite(numbers), "a number is not finite", remedy)
     # The first three numbers are the position (m) or, in SE2, x, y (m) and the angle (rad)
-    far = np.abs(numbers[:, :3]) >= MAX_VALUE
-    rows.raise_where(far, f"a value is outside ±{MAX_VALUE:.0e}", remedy)
-    return words[:, 1:].astype(np.int64), numbers
+    is_too_large = np.abs(numbers[:, :3]) >= MAX_COORDINATE_M
+    rows.raise_where(is_too_large, f"a value is outside ±{MAX_COORDINATE_M:.0e}", remedy)
+    return cells[:, 1:].astype(np.int64), numbers
 
 
 def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
@@ -179,10 +187,10 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
         return poses
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(poses[:, 3:], axis=1)
-    what = "the quaternion does not have unit length"
+    fault = "the quaternion does not have unit length"
     remedy = "Give the unit quaternion qx qy qz qw after the position."
-    rows.raise_where((norm < 1e-6) | ~(norm < 1e6), what, remedy)
-    # Unit quaternions stay unchanged, so that a written file is read back identically
+    rows.raise_where((norm < 1e-6) | ~(norm < 1e6), fault, remedy)
+    # Unit quaternions stay unchanged, so that a file is read exactly as it was written
     norm[np.abs(norm - 1.0) <= _UNIT_NORM_TOLERANCE] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
 
@@ -192,14 +200,18 @@ def _information(rows: Rows, numbers: Array, size: int) -> Array:
     row, column = np.triu_indices(size)
     matrices = np.empty((len(numbers), size, size))
     matrices[:, row, column] = matrices[:, column, row] = numbers
-    entry = np.abs(numbers)
-    tiny = (row == column) & (entry > 0.0) & (entry < _MIN_INFORMATION)
-    what = "the information matrix has an invalid entry"
+    magnitude = np.abs(numbers)
+    is_too_small = (row == column) & (magnitude > 0.0) & (magnitude < _MIN_INFORMATION)
+    fault = "the information matrix has an invalid entry"
     usual_range = f"{_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}"
     remedy = f"Give 0 for directions without information, else {usual_range}."
-    rows.raise_where(tiny | (entry > _MAX_INFORMATION), what, remedy)
-    values = np.linalg.eigvalsh(matrices)
-    what = "the information matrix has a negative eigenvalue"
+    rows.raise_where(is_too_small | (magnitude > _MAX_INFORMATION), fault, remedy)
+    eigenvalues = np.linalg.eigvalsh(matrices)
+    fault = "the information matrix has a negative eigenvalue"
     remedy = "Give the upper triangle of an inverse covariance, row by row."
-    rows.raise_where(values[:, 0] < -_ROUNDING * np.maximum(values[:, -1], 0.0), what, remedy)
+    rows.raise_where(
+        eigenvalues[:, 0] < -_EIGENVALUE_TOLERANCE * np.maximum(eigenvalues[:, -1], 0.0),
+        fault,
+        remedy,
+    )
     return matrices

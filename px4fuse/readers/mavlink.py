@@ -10,22 +10,33 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force, valid_parameters
+from px4fuse.ekf2_parameters import (
+    EV_POS,
+    GNSS_POS,
+    REPORTED,
+    effective_settings,
+    replace_invalid_parameters,
+)
 from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
-from px4fuse.log import LogInfo, Unused
+from px4fuse.log import LogInfo, UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
-from px4fuse.readers.mavlink_clocks import UNIX_FROM_S
+from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S
 from px4fuse.readers.mavlink_frames import MESSAGE_IDS, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
-from px4fuse.readers.mavlink_recording import RECEIPT_CLOCK, Recording, read_recording, unix_of_boot
+from px4fuse.readers.mavlink_recording import (
+    RECEIPT_CLOCK,
+    Recording,
+    map_boot_to_unix,
+    read_recording,
+)
 from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 # MAV_PARAM_TYPE_REAL32; smaller values of MAV_PARAM_TYPE are integer types
-PARAMETER_REAL = 9
+REAL32_PARAMETER_TYPE = 9
 
 
 # No warnings for damaged values: they become NaN or infinite, and such samples are dropped
@@ -57,37 +68,41 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system)
     recording = read_recording(frames, address)
-    mapped = senders.map_senders(recording)
-    parameters, faults = valid_parameters(_read_parameters(recording, autopilot))
+    clock_mappings = senders.map_senders(recording)
+    parameters, parameter_faults = replace_invalid_parameters(
+        _read_parameters(recording, autopilot)
+    )
     remedies, _ = messages.remedies_of_autopilot(autopilot)
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
     ekf2 = _read_ekf2(recording, parameters, autopilot)
     # Only PX4 has a parameter for the delay between a GNSS fix and its timestamp
-    known = settings_in_force(parameters, GNSS_POS) if autopilot == "PX4" else {}
-    delay_s = 1e-3 * known.get(GNSS_POS.delay, 0.0)
-    positions, missing_positions = read_positions(recording, mapped, remedies["position"], delay_s)
+    delay_parameters = effective_settings(parameters, GNSS_POS) if autopilot == "PX4" else {}
+    delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
+    positions, missing_positions = read_positions(
+        recording, clock_mappings, remedies["position"], delay_s
+    )
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
     in_flight = common.ends_in_flight(airborne, recording.duration_s)
-    pressure = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
+    pressure_hpa = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
     modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
         # Must come after all reads, because it lists the dropped samples
-        log=_describe(recording, parameters, faults, autopilot, in_flight),
+        log=_describe_log(recording, parameters, parameter_faults, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
         positions=positions,
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        barometer=barometer(pressure_altitude(pressure)),
+        barometer=barometer(pressure_altitude(pressure_hpa)),
         modes=modes,
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=MappingProxyType(recording.streams),
-        clocks=senders.clock_maps(recording, mapped),
+        clocks=senders.clock_maps(recording, clock_mappings),
         unused=tuple(
-            Unused(name, count, reason)
+            UnusedData(name, count, reason)
             for name, reason in messages.UNUSED.items()
             if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
         ),
@@ -95,35 +110,45 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
 
 
 def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
-    found = [(layout, recording.rows(layout.topic)) for layout in messages.IMU]
+    candidates = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
     # HIGHRES_IMU is preferred (SI units, µs timestamps); otherwise the message with most samples
-    layout, rows = found[0] if len(found[0][1]) > 1 else max(found, key=lambda pair: len(pair[1]))
+    layout, rows = (
+        candidates[0]
+        if len(candidates[0][1]) > 1
+        else max(candidates, key=lambda pair: len(pair[1]))
+    )
     if len(rows) < 2:
-        raw = len(recording.rows("RAW_IMU"))
-        ignored = f"; {raw} RAW_IMU messages were not used: raw counts have no unit" if raw else ""
-        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{ignored}", remedy)
+        raw_count = len(recording.rows("RAW_IMU"))
+        ignored_note = (
+            f"; {raw_count} RAW_IMU messages were not used: raw counts have no unit"
+            if raw_count
+            else ""
+        )
+        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{ignored_note}", remedy)
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
     del table
     imu = recording.read(layout, rows)
-    imu = common.finite_rows(imu, imu.columns.tolist(), common.BEYOND_IMU)
+    imu = common.finite_rows(imu, imu.columns.tolist(), common.MAX_IMU_VALUE)
     if len(imu) < 2:
         return Unavailable(
             "IMU",
             f"{layout.topic} contains only {len(imu)} usable samples",
-            "Check that the sensors were running while the link was recorded.",
+            "Check that the IMU was running while the link was recorded.",
         )
     recording.record_stream("imu", layout.topic)
     return imu
 
 
 def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
-    layout = max(messages.ATTITUDE, key=lambda layout: len(recording.rows(layout.topic)))
+    layout = max(messages.ATTITUDE_LAYOUTS, key=lambda layout: len(recording.rows(layout.topic)))
     attitude = common.with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
-        *other_topics, last = (layout.topic for layout in messages.ATTITUDE)
-        return Unavailable("attitude", f"no usable {', '.join(other_topics)} or {last}", remedy)
+        *other_topics, last_topic = (layout.topic for layout in messages.ATTITUDE_LAYOUTS)
+        return Unavailable(
+            "attitude", f"no usable {', '.join(other_topics)} or {last_topic}", remedy
+        )
     recording.record_stream("attitude", layout.topic)
     return attitude
 
@@ -132,15 +157,15 @@ def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     """Read EKF2's position, velocity and variances as sent by the autopilot."""
-    remedies, replay = messages.remedies_of_autopilot(autopilot)
-    counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATES}
-    # ODOMETRY, which has variances, unless its rate is below half of LOCAL_POSITION_NED's
-    dense = (
-        layout_candidate
-        for layout_candidate in messages.STATES
-        if 2 * counts[layout_candidate.topic] >= max(counts.values())
+    remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
+    counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS}
+    # ODOMETRY has variances, so it is preferred unless its rate is below half of the highest rate
+    frequent_layouts = (
+        candidate
+        for candidate in messages.STATE_LAYOUTS
+        if 2 * counts[candidate.topic] >= max(counts.values())
     )
-    layout = next(dense)
+    layout = next(frequent_layouts)
     message = layout.topic
     if counts[message] < 2:
         return Unavailable(
@@ -159,21 +184,26 @@ def _read_ekf2(
     if autopilot != "PX4":
         notes.append(f"autopilot {autopilot}: 'EKF2' means the estimator of this autopilot")
     if "reset_counter" in samples and (
-        count := np.count_nonzero(samples["reset_counter"].diff()[1:])
+        reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):
-        reset = f"EKF2 reset its state {count} times in the recording"
-        notes.append(f"{reset}; ODOMETRY does not contain their size, so they were not removed")
-    found = samples.reindex(columns=VARIANCE_COLUMNS)
-    found = found[(found > 0.0).all(axis=1)]
-    if found.empty:
-        message, found = messages.LAYOUTS["accuracy"].topic, _variance_by_accuracy(recording)
-        if len(found):
+        reset_text = f"EKF2 reset its state {reset_count} times in the recording"
+        notes.append(
+            f"{reset_text}; ODOMETRY does not contain their size, so they were not removed"
+        )
+    variance_rows = samples.reindex(columns=VARIANCE_COLUMNS)
+    variance_rows = variance_rows[(variance_rows > 0.0).all(axis=1)]
+    if variance_rows.empty:
+        message, variance_rows = (
+            messages.LAYOUTS["accuracy"].topic,
+            _variance_from_accuracy(recording),
+        )
+        if len(variance_rows):
             notes.append(
                 "EKF2 position variances from ESTIMATOR_STATUS: half of the squared horizontal "
                 "accuracy on each horizontal axis; velocity variances are not sent"
             )
-    variance: pd.DataFrame | Unavailable = found
-    if found.empty:
+    variance: pd.DataFrame | Unavailable = variance_rows
+    if variance_rows.empty:
         variance = Unavailable(
             "EKF2 variances",
             "the autopilot sent no ODOMETRY with covariance and no ESTIMATOR_STATUS",
@@ -200,13 +230,13 @@ def _read_ekf2(
         ),
         resets=(),
         instances=NO_SELECTOR,
-        gate=settings_in_force(parameters)[EV_POS.gate],
+        gate=effective_settings(parameters)[EV_POS.gate],
         notes=tuple(notes),
-        record=replay,
+        record=replay_unavailable,
     )
 
 
-def _variance_by_accuracy(recording: Recording) -> pd.DataFrame:
+def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
 
     PX4's horizontal accuracy is the root of the sum over both axes (``get_ekf_lpos_accuracy``).
@@ -223,13 +253,13 @@ def _read_airborne(
 ) -> tuple[tuple[float, float], ...] | Unavailable:
     """Read the intervals (s) from take-off to touch-down, as the land detector reports them."""
     rows = recording.rows("EXTENDED_SYS_STATE")
-    table = recording.frames.table("EXTENDED_SYS_STATE", rows)
-    known = table["landed_state"] > 0
-    if not np.any(known):
+    states = recording.frames.table("EXTENDED_SYS_STATE", rows)
+    is_known = states["landed_state"] > 0
+    if not np.any(is_known):
         return Unavailable("land detector", "EXTENDED_SYS_STATE is missing or not usable", remedy)
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
-    time_s = recording.receipt_boot_s(rows[known]) - recording.zero_s
-    landed = pd.Series(table["landed_state"][known] == messages.LANDED, index=time_s)
+    time_s = recording.receipt_boot_s(rows[is_known]) - recording.zero_s
+    landed = pd.Series(states["landed_state"][is_known] == messages.ON_GROUND_STATE, index=time_s)
     return common.flight_spans(landed, recording.duration_s)
 
 
@@ -237,12 +267,12 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
     rows = recording.rows("HEARTBEAT")
     if not len(rows):
         return messages.NO_MODES
-    modes = recording.frames.table("HEARTBEAT", rows)["custom_mode"].astype(np.int64)
+    custom_modes = recording.frames.table("HEARTBEAT", rows)["custom_mode"].astype(np.int64)
     names = [
-        messages.AUTO_MODES.get(mode >> 24 & 0xFF, "Auto")
-        if (main := mode >> 16 & 0xFF) == messages.AUTO_MODE
-        else messages.MAIN_MODES.get(main, f"mode {main}")
-        for mode in modes.tolist()
+        messages.AUTO_MODES.get(custom_mode >> 24 & 0xFF, "Auto")
+        if (main_mode := custom_mode >> 16 & 0xFF) == messages.AUTO_MAIN_MODE
+        else messages.MAIN_MODES.get(main_mode, f"mode {main_mode}")
+        for custom_mode in custom_modes.tolist()
     ]
     time_s = recording.receipt_boot_s(rows) - recording.zero_s
     return common.mode_spans(pd.Series(names, index=time_s), recording.duration_s)
@@ -251,28 +281,28 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
     """Read the first value of each parameter; PX4 sends integers as bytes in the float field."""
     table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
-    by_bytes = (autopilot == "PX4") & (table["param_type"] < PARAMETER_REAL)
-    raw = np.ascontiguousarray(table["param_value"])
-    values = np.where(by_bytes, raw.view(np.int32), raw)
-    found: dict[str, float] = {}
-    for name, value in zip(table["param_id"].tolist(), values.tolist(), strict=True):
-        text = name.decode(errors="replace")
-        if text in REPORTED:
-            found.setdefault(text, float(value))
-    return found
+    is_sent_as_bytes = (autopilot == "PX4") & (table["param_type"] < REAL32_PARAMETER_TYPE)
+    raw_values = np.ascontiguousarray(table["param_value"])
+    values = np.where(is_sent_as_bytes, raw_values.view(np.int32), raw_values)
+    value_by_name: dict[str, float] = {}
+    for raw_name, value in zip(table["param_id"].tolist(), values.tolist(), strict=True):
+        name = raw_name.decode(errors="replace")
+        if name in REPORTED:
+            value_by_name.setdefault(name, float(value))
+    return value_by_name
 
 
-def _describe(
+def _describe_log(
     recording: Recording,
     parameters: Mapping[str, float],
-    faults: tuple[str, ...],
+    parameter_faults: tuple[str, ...],
     autopilot: str,
     in_flight: bool,
 ) -> LogInfo:
     frames = recording.frames
-    end = (
+    truncation = (
         (common.format_truncation("frame", recording.duration_s, in_flight),)
-        if frames.in_frame
+        if frames.ends_in_frame
         else ()
     )
     firmware, firmware_hash = f"{autopilot} (version not in the recording)", "unknown"
@@ -283,15 +313,18 @@ def _describe(
         major, minor, patch, _ = int(version["flight_sw_version"]).to_bytes(4, "big")
         if major or minor or patch:
             firmware = f"{autopilot} v{major}.{minor}.{patch}"
-        text = bytes(version["flight_custom_version"][::-1]).hex()
-        firmware_hash = text if text.strip("0") else "unknown"
+        hash_hex = bytes(version["flight_custom_version"][::-1]).hex()
+        firmware_hash = hash_hex if hash_hex.strip("0") else "unknown"
         uid = bytes(version["uid2"]).hex()
         vehicle = uid if uid.strip("0") else ""
-    beats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
-    first = next(iter(beats["type"].tolist()), -1)
-    kind = messages.VEHICLE_TYPES.get(first, "vehicle")
-    why = "zero, go back, or are outside the recording"
-    dropped = [dropped_note(n, message, why) for message, n in sorted(recording.dropped.items())]
+    heartbeats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
+    vehicle_type = next(iter(heartbeats["type"].tolist()), -1)
+    vehicle_name = messages.VEHICLE_TYPES.get(vehicle_type, "vehicle")
+    timestamp_fault = "zero, go back, or are outside the recording"
+    dropped_notes = [
+        dropped_note(n, message, timestamp_fault)
+        for message, n in sorted(recording.dropped.items())
+    ]
     return LogInfo(
         name=frames.name,
         sha256=frames.sha256,
@@ -299,11 +332,11 @@ def _describe(
         format="MAVLink stream" if frames.received_us is None else "MAVLink tlog",
         firmware=firmware,
         firmware_hash=firmware_hash,
-        hardware=f"{kind} (MAVLink system {recording.address[0]})",
+        hardware=f"{vehicle_name} (MAVLink system {recording.address[0]})",
         boot_time_s=recording.zero_s,
         duration_s=recording.duration_s,
         parameters=MappingProxyType(parameters),
-        notes=(*recording.notes, *faults, *dropped),
+        notes=(*recording.notes, *parameter_faults, *dropped_notes),
         restarts=recording.restarts,
         receive_time_reversals=recording.receive_time_reversals,
         dropped=dict(sorted(recording.dropped.items())),
@@ -311,7 +344,7 @@ def _describe(
         start_unix_s=_start_unix_s(recording),
         senders=senders.describe_senders(recording),
         vehicle=vehicle,
-        damage=(*end, *recording.damage),
+        damage=(*truncation, *recording.damage),
         ends_in_flight=in_flight,
         bytes_read=len(frames.content) - frames.bad_bytes,
     )
@@ -319,11 +352,11 @@ def _describe(
 
 def _start_unix_s(recording: Recording) -> float | None:
     """Return the UNIX time (s) of time zero, by the autopilot or else the recording computer."""
-    if recording.zero_s >= UNIX_FROM_S:
+    if recording.zero_s >= MIN_UNIX_TIME_S:
         return recording.zero_s
-    unix = unix_of_boot(recording)
-    if unix is not None:
-        return float(unix.at(recording.zero_s))
+    unix_line = map_boot_to_unix(recording)
+    if unix_line is not None:
+        return float(unix_line.at(recording.zero_s))
     received_us = recording.frames.received_us
     if received_us is None or not recording.boot_of_receipt.pairs:
         return None

@@ -1,9 +1,9 @@
 """Clock mapping of a MAVLink recording: boot clock, sender clocks and receive time.
 
 A message is received after its timestamp, with a delay that is never negative and often large.
-Two clocks are therefore mapped by the lower envelope of their difference, that is by the messages
-with the smallest delay. TIMESYNC pairs (MAVLink "Time Synchronization Protocol v2") are mapped in
-the same way.
+Two clocks are therefore mapped by the messages with the smallest delay: the lower envelope of
+receive time minus timestamp. TIMESYNC pairs (MAVLink "Time Synchronization Protocol v2") are mapped
+in the same way.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from scipy.stats import theilslopes
 from px4fuse.arrays import Array
 from px4fuse.log import ClockMap
 
-# s; timestamps this close to the boot clock at receipt are assumed to be boot times
-SAME_CLOCK_S = 10.0
-# s; reduction of the distance to receipt by TIMESYNC above which the sender has a separate clock
-MIN_GAIN_S = 0.1
-# s; 2001-09-09. Smaller times count from boot, larger ones from 1970
-UNIX_FROM_S = 1e9
+# s; timestamps within this median distance from the boot time of receipt are boot times
+MAX_BOOT_CLOCK_DISTANCE_S = 10.0
+# s; if TIMESYNC reduces the distance to the receive time by more, the sender has its own clock
+MIN_TIMESYNC_IMPROVEMENT_S = 0.1
+# s; 2001-09-09. Smaller times count from boot, larger times from 1970
+MIN_UNIX_TIME_S = 1e9
 # s; the envelope uses the message with the smallest delay in each interval of this length
-ENVELOPE_S = 2.0
-MAX_INTERVALS = 200
+ENVELOPE_INTERVAL_S = 2.0
+MAX_ENVELOPE_INTERVALS = 200
 # s; drift is estimated from this time span on; below, both clocks are assumed to run equally fast
 MIN_DRIFT_SPAN_S = 30.0
-# Ratio; a larger speed difference, from a recording replayed at another speed, is always estimated
-MAX_SPEED_DIFFERENCE = 0.01
-# Ratio; larger than any replay speed or wrong unit of time (s for ns: 1e9)
-MAX_SPEED = 1e12
-MIN_PAIRS = 3
-# Fraction of messages with distinct timestamps, below which the timestamps are not a clock
-MIN_DISTINCT_SHARE = 0.1
+# Ratio of clock rates minus 1; a larger difference is from a replayed link and always estimated
+MAX_RATE_DIFFERENCE = 0.01
+# Ratio of clock rates; larger than any replay speed or wrong unit of time (s for ns: 1e9)
+MAX_RATE_RATIO = 1e12
+MIN_TIMESYNC_PAIRS = 3
+# Fraction of distinct values; timestamps with a smaller fraction are not a clock
+MIN_DISTINCT_FRACTION = 0.1
 # s; a longer interval between positions is a gap
-MAX_INTERVAL_S = 1.0
+MAX_REGULAR_INTERVAL_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -77,29 +77,29 @@ def fit_least_delay(x: Array, y: Array) -> Line:
     order = np.argsort(x, kind="stable")
     x, y = x[order], y[order]
     x0 = float(x[len(x) // 2])
-    span = float(x[-1] - x[0])
-    count = int(np.clip(span / ENVELOPE_S, 1, MAX_INTERVALS))
-    edges = np.searchsorted(x, np.linspace(x[0], x[-1], count + 1)[1:-1])
-    interval_rows = [rows for rows in np.split(np.arange(len(x)), edges) if len(rows)]
+    span_s = float(x[-1] - x[0])
+    interval_count = int(np.clip(span_s / ENVELOPE_INTERVAL_S, 1, MAX_ENVELOPE_INTERVALS))
+    interval_starts = np.searchsorted(x, np.linspace(x[0], x[-1], interval_count + 1)[1:-1])
+    interval_rows = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
     slope = 1.0
-    middles = [rows[len(rows) // 2] for rows in interval_rows]
-    if len(middles) > 1 and x[middles[-1]] > x[middles[0]]:
-        rough_slope = _median_slope(x[middles], y[middles])
+    middle_rows = [rows[len(rows) // 2] for rows in interval_rows]
+    if len(middle_rows) > 1 and x[middle_rows[-1]] > x[middle_rows[0]]:
+        initial_slope = _median_slope(x[middle_rows], y[middle_rows])
         slope = (
-            rough_slope
-            if abs(rough_slope - 1.0) > MAX_SPEED_DIFFERENCE and _is_speed(rough_slope)
+            initial_slope
+            if abs(initial_slope - 1.0) > MAX_RATE_DIFFERENCE and _is_rate_ratio(initial_slope)
             else 1.0
         )
     residual = y - slope * (x - x0)
-    lowest = [rows[np.argmin(residual[rows])] for rows in interval_rows]
-    if span >= MIN_DRIFT_SPAN_S and len(lowest) > 1:
+    envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
+    if span_s >= MIN_DRIFT_SPAN_S and len(envelope_rows) > 1:
         # Repeated, because a better slope changes which messages have the smallest delay
         for _ in range(2):
-            corrected = slope + _median_slope(x[lowest], residual[lowest])
-            slope = corrected if _is_speed(corrected) else 1.0
+            corrected_slope = slope + _median_slope(x[envelope_rows], residual[envelope_rows])
+            slope = corrected_slope if _is_rate_ratio(corrected_slope) else 1.0
             residual = y - slope * (x - x0)
-            lowest = [rows[np.argmin(residual[rows])] for rows in interval_rows]
-    y0 = float(np.median(residual[lowest]))
+            envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
+    y0 = float(np.median(residual[envelope_rows]))
     return Line(x0, y0, slope, robust_std(residual), len(x))
 
 
@@ -109,14 +109,14 @@ def _median_slope(x: Array, y: Array) -> float:
         return float(theilslopes(y, x)[0])
 
 
-def _is_speed(slope: float) -> bool:
-    """Return True if the slope is a possible ratio of clock rates; no clock runs backwards."""
-    return 1.0 / MAX_SPEED < slope < MAX_SPEED
+def _is_rate_ratio(slope: float) -> bool:
+    """Return True if the slope is a possible ratio of two clock rates: positive and finite."""
+    return 1.0 / MAX_RATE_RATIO < slope < MAX_RATE_RATIO
 
 
 def is_running_clock(stamp_s: Array) -> bool:
-    """Return True if enough timestamps are distinct (see MIN_DISTINCT_SHARE)."""
-    return len(np.unique(stamp_s)) >= max(MIN_DISTINCT_SHARE * len(stamp_s), 2)
+    """Return True if enough timestamps are distinct (see MIN_DISTINCT_FRACTION)."""
+    return len(np.unique(stamp_s)) >= max(MIN_DISTINCT_FRACTION * len(stamp_s), 2)
 
 
 def robust_std(values: Array) -> float:
@@ -142,7 +142,7 @@ def map_clock(
     boot_of_receipt: Line,
     replies: tuple[Array, Array],
     answers: tuple[Array, Array],
-    unix_of_boot: Line | None,
+    map_boot_to_unix: Line | None,
     *,
     has_receipt: bool,
 ) -> ClockMapping:
@@ -160,63 +160,74 @@ def map_clock(
         TIMESYNC requests of the autopilot: its clock at the request, the sender's at the reply.
     answers : tuple of ndarray, shape (m,), s
         TIMESYNC requests of the sender: its clock at the request, the autopilot's at the reply.
-    unix_of_boot : Line or None
+    map_boot_to_unix : Line or None
         Map from boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool
         True if the recording has receive times, False if it has only the order of messages.
     """
-    receipt = "receive time" if has_receipt else "position in the stream"
+    time_source = "receive time" if has_receipt else "position in the stream"
     boot_at_receipt = boot_of_receipt.at(received_s)
     if not is_running_clock(stamp_s):
-        distinct = len(np.unique(stamp_s))
-        few_values = f"its {len(stamp_s)} timestamps have only {distinct} distinct values"
-        note = f"{few_values}; the {receipt} is used instead"
+        distinct_count = len(np.unique(stamp_s))
+        few_values = f"its {len(stamp_s)} timestamps have only {distinct_count} distinct values"
+        note = f"{few_values}; the {time_source} is used instead"
         # Jitter of the receive time, assuming evenly sent samples; gaps are excluded
-        intervals = np.diff(received_s)
-        regular = intervals[intervals < MAX_INTERVAL_S]
-        jitter = float(np.std(regular) / np.sqrt(2.0)) if len(regular) > 1 else 0.0
-        return ClockMapping(
-            None, ClockMap(name, receipt, len(stamp_s), 0.0, 0.0, jitter, note, distinct)
+        intervals_s = np.diff(received_s)
+        regular_intervals_s = intervals_s[intervals_s < MAX_REGULAR_INTERVAL_S]
+        jitter_s = (
+            float(np.std(regular_intervals_s) / np.sqrt(2.0))
+            if len(regular_intervals_s) > 1
+            else 0.0
         )
-    synchronised = _line_of_exchange(replies, answers)
+        return ClockMapping(
+            None,
+            ClockMap(name, time_source, len(stamp_s), 0.0, 0.0, jitter_s, note, distinct_count),
+        )
+    timesync_line = _fit_timesync(replies, answers)
     unmapped_distance_s = abs(float(np.median(boot_at_receipt - stamp_s)))
     # A separate clock may have started only seconds after the autopilot's
     improvement_s = 0.0
-    if synchronised is not None:
+    if timesync_line is not None:
         improvement_s = unmapped_distance_s - abs(
-            float(np.median(boot_at_receipt - synchronised.at(stamp_s)))
+            float(np.median(boot_at_receipt - timesync_line.at(stamp_s)))
         )
-    if unmapped_distance_s <= SAME_CLOCK_S and improvement_s < MIN_GAIN_S:
+    if (
+        unmapped_distance_s <= MAX_BOOT_CLOCK_DISTANCE_S
+        and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
+    ):
         line = Line(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
         note = "its timestamps already use the boot clock"
         return ClockMapping(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
-    kind = "UNIX time" if float(np.median(stamp_s)) > UNIX_FROM_S else "own clock"
-    clock = f"{kind} of {name}"
-    known = [] if synchronised is None else [("TIMESYNC", synchronised, "")]
-    if kind == "UNIX time" and unix_of_boot is not None:
-        assumed = "assumes the same UNIX time at sender and autopilot"
-        known.append(("SYSTEM_TIME", unix_of_boot.inverse(), assumed))
-    for method, line, note in known:
-        # A map that places messages far from their receive time belongs to another clock
-        if abs(float(np.median(line.at(stamp_s) - boot_at_receipt))) <= SAME_CLOCK_S:
-            return ClockMapping(line, _clock_map(clock, method, line, stamp_s, note))
+    clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "own clock"
+    clock_name = f"{clock_kind} of {name}"
+    candidates = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
+    if clock_kind == "UNIX time" and map_boot_to_unix is not None:
+        unix_note = "assumes the same UNIX time at sender and autopilot"
+        candidates.append(("SYSTEM_TIME", map_boot_to_unix.inverse(), unix_note))
+    for method, line, note in candidates:
+        # If messages are mapped far from their receive time, the map belongs to another clock
+        if abs(float(np.median(line.at(stamp_s) - boot_at_receipt))) <= MAX_BOOT_CLOCK_DISTANCE_S:
+            return ClockMapping(line, _clock_map(clock_name, method, line, stamp_s, note))
     receipt_line = fit_least_delay(stamp_s, received_s)
-    boot_y0, slope = (
+    boot_y0_s, slope = (
         float(boot_of_receipt.at(receipt_line.y0)),
         receipt_line.slope * boot_of_receipt.slope,
     )
-    boot_line = replace(receipt_line, y0=boot_y0, slope=slope)
+    boot_line = replace(receipt_line, y0=boot_y0_s, slope=slope)
     note = "no usable TIMESYNC or SYSTEM_TIME; late by the minimum link delay"
-    return ClockMapping(boot_line, _clock_map(clock, receipt, boot_line, stamp_s, note))
+    return ClockMapping(boot_line, _clock_map(clock_name, time_source, boot_line, stamp_s, note))
 
 
-def _line_of_exchange(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
-    """Map the sender's clock to the boot clock by TIMESYNC; the mean of both directions."""
+def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
+    """Map the sender's clock to the boot clock by TIMESYNC: mean of the maps by both directions.
+
+    ``replies`` and ``answers`` are those of :func:`map_clock`; None if both have too few pairs.
+    """
     lines = []
-    if len(replies[0]) >= MIN_PAIRS:
-        # The sender's reply is read after the autopilot's request
+    if len(replies[0]) >= MIN_TIMESYNC_PAIRS:
+        # The sender reads its clock after the autopilot, so the delay is in the reply
         lines.append(fit_least_delay(*replies).inverse())
-    if len(answers[0]) >= MIN_PAIRS:
+    if len(answers[0]) >= MIN_TIMESYNC_PAIRS:
         lines.append(fit_least_delay(*answers))
     if not lines:
         return None
@@ -227,6 +238,6 @@ def _line_of_exchange(replies: tuple[Array, Array], answers: tuple[Array, Array]
 
 
 def _clock_map(clock: str, method: str, line: Line, stamp_s: Array, note: str) -> ClockMap:
-    middle = float(0.5 * (stamp_s.min() + stamp_s.max()))
-    offset_s, drift_ppm = float(line.at(middle)) - middle, (line.slope - 1.0) * 1e6
+    middle_s = float(0.5 * (stamp_s.min() + stamp_s.max()))
+    offset_s, drift_ppm = float(line.at(middle_s)) - middle_s, (line.slope - 1.0) * 1e6
     return ClockMap(clock, method, line.pairs, offset_s, drift_ppm, line.jitter, note)

@@ -1,4 +1,4 @@
-"""MAVLink wire format: bytes to frames, and frames to columns.
+"""Decoder of the MAVLink wire format: bytes to frames, and frames to columns.
 
 Every byte position at which a frame of a known message could begin is verified by the checksum.
 Invalid bytes and incomplete frames are skipped and counted, without loss of valid frames. All
@@ -25,34 +25,38 @@ Integers = NDArray[np.int64]
 # (MAVLink system id, MAVLink component id)
 Address = tuple[int, int]
 
-MAGIC_1, MAGIC_2 = 0xFE, 0xFD
-HEADER_1, HEADER_2 = 6, 10
-CHECKSUM = 2
-SIGNATURE = 13
-SIGNED = 0x01
-LONGEST_FRAME = HEADER_2 + 255 + CHECKSUM + SIGNATURE
+MAGIC_BYTE_1, MAGIC_BYTE_2 = 0xFE, 0xFD
+HEADER_BYTES_1, HEADER_BYTES_2 = 6, 10
+CHECKSUM_BYTES = 2
+SIGNATURE_BYTES = 13
+SIGNED_FLAG = 0x01
+MAX_FRAME_BYTES = HEADER_BYTES_2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 # Receive time that QGroundControl and MAVProxy write before each frame: µs, big-endian
-STAMP_BYTES = 8
+RECEIVE_TIME_BYTES = 8
 # Bytes scanned at once; limits the memory for malicious files
 BLOCK_BYTES = 1 << 16
-# Frames decoded at once; limits the memory
-FRAMES_PER_PIECE = 1 << 12
-# Fraction of bytes in valid frames, below which a file is not a MAVLink recording. Random bytes
-# contain one valid frame in about eight million.
-MIN_GOOD_SHARE = 0.01
+# Frames per batch; limits the memory
+DECODE_BATCH_SIZE = 1 << 12
+# Fraction of the file's bytes in valid frames; a file with less is not a MAVLink recording. Random
+# data contain one valid frame in about eight million bytes.
+MIN_VALID_FRACTION = 0.01
 # µs; a receive time further than this from the median is damaged (limit of pymavlink)
-MAX_STAMP_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
-MESSAGE_IDS: Mapping[str, int] = {one.msgname: at for at, one in dialect.mavlink_map.items()}
+MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
+MESSAGE_IDS: Mapping[str, int] = {
+    message.msgname: at for at, message in dialect.mavlink_map.items()
+}
 # CRC_EXTRA byte by message id, the last input of the checksum; -1 for unknown messages
-_SEEDS = np.full(max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16)
-_SEEDS[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
+_CRC_EXTRA = np.full(
+    max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16
+)
+_CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
 # Checksum of each single byte, for the last step of the checksum with CRC_EXTRA
-_LAST = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
+_BYTE_CHECKSUMS = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of one recording with valid checksums, in file order.
+    """MAVLink frames of one recording with valid checksums, in file order.
 
     Attributes
     ----------
@@ -72,10 +76,10 @@ class Frames:
         Complete frames of messages that are not in the dialect.
     bad_bytes : int
         Bytes that are not part of a frame.
-    in_frame : bool
+    ends_in_frame : bool
         True if the file ends within a frame.
-    bad_stamps : int
-        Damaged receive times.
+    damaged_receive_times : int
+        Number of damaged receive times.
     """
 
     name: str
@@ -91,8 +95,8 @@ class Frames:
     received_us: Integers | None
     unknown_frame_count: int
     bad_bytes: int
-    in_frame: bool
-    bad_stamps: int
+    ends_in_frame: bool
+    damaged_receive_times: int
 
     def __len__(self) -> int:
         return len(self.start)
@@ -127,35 +131,35 @@ class Frames:
         source = np.frombuffer(self.content, dtype=np.uint8)
         starts, lengths = self.payload_start[rows], self.payload_length[rows]
         for length in np.unique(lengths).tolist():
-            size = min(length, layout.itemsize)
-            if size:
+            byte_count = min(length, layout.itemsize)
+            if byte_count:
                 rows_of_length = np.flatnonzero(lengths == length)
-                windows = np.lib.stride_tricks.sliding_window_view(source, size)
+                windows = np.lib.stride_tricks.sliding_window_view(source, byte_count)
                 # Indexing copies the payloads, so the number of frames per step is limited
-                for at in range(0, len(rows_of_length), FRAMES_PER_PIECE):
-                    piece_rows = rows_of_length[at : at + FRAMES_PER_PIECE]
-                    payload[piece_rows, :size] = windows[starts[piece_rows]]
+                for batch_start in range(0, len(rows_of_length), DECODE_BATCH_SIZE):
+                    batch_rows = rows_of_length[batch_start : batch_start + DECODE_BATCH_SIZE]
+                    payload[batch_rows, :byte_count] = windows[starts[batch_rows]]
         return payload.view(layout)[:, 0]
 
 
-def message_name(number: int) -> str:
+def message_name(message_id: int) -> str:
     """Return the MAVLink name of a message id."""
-    return str(dialect.mavlink_map[number].msgname)
+    return str(dialect.mavlink_map[message_id].msgname)
 
 
 @cache
-def wire_layout(number: int) -> np.dtype[Any]:
+def wire_layout(message_id: int) -> np.dtype[Any]:
     """Return the payload layout of a message id as a packed structured dtype."""
-    message = dialect.mavlink_map[number]
-    kinds = message.native_format.decode().removeprefix("<")  # struct codes, same as in numpy
+    message = dialect.mavlink_map[message_id]
+    type_codes = message.native_format.decode().removeprefix("<")  # struct codes, same as in numpy
     fields: list[Any] = []
-    for name, kind, length in zip(
-        message.ordered_fieldnames, kinds, message.array_lengths, strict=True
+    for name, type_code, length in zip(
+        message.ordered_fieldnames, type_codes, message.array_lengths, strict=True
     ):
-        if kind == "c":
+        if type_code == "c":
             fields.append((name, f"S{length or 1}"))
         else:
-            fields.append((name, f"<{kind}", (length,)) if length else (name, f"<{kind}"))
+            fields.append((name, f"<{type_code}", (length,)) if length else (name, f"<{type_code}"))
     return np.dtype(fields)
 
 
@@ -174,112 +178,123 @@ def read_frames(name: str, content: bytes) -> Frames:
     LogError
         The content is not MAVLink.
     """
-    start, end, number = _remove_overlapping(_scan(content)).T
-    stamp = STAMP_BYTES if len(start) and _has_receive_stamps(start, end) else 0
-    good_bytes = int(np.sum(end - start))
-    if good_bytes < MIN_GOOD_SHARE * len(content) or not len(start):
+    start, end, message_id = _remove_overlapping(_find_valid_frames(content)).T
+    time_bytes = RECEIVE_TIME_BYTES if len(start) and _has_receive_times(start, end) else 0
+    valid_bytes = int(np.sum(end - start))
+    if valid_bytes < MIN_VALID_FRACTION * len(content) or not len(start):
         raise LogError(
             f"{name}: neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
             f"with a valid checksum in {len(content)} bytes).",
             "Give the .ulg from the vehicle, or a .tlog or raw MAVLink stream.",
         )
     source = np.frombuffer(content, dtype=np.uint8)
-    is_version_2 = source[start] == MAGIC_2
+    is_version_2 = source[start] == MAGIC_BYTE_2
     # Header order: sequence, system, component
-    at = start + np.where(is_version_2, 4, 2)
-    unknown_frame_count, bad_bytes, in_frame = _count_other_bytes(
-        content, start - stamp, end, stamp
+    sequence_offset = start + np.where(is_version_2, 4, 2)
+    unknown_frame_count, bad_bytes, ends_in_frame = _count_other_bytes(
+        content, start - time_bytes, end, time_bytes
     )
-    received, bad_stamps = _stamps(source, start, end) if stamp else (None, 0)
+    received_us, damaged_receive_times = (
+        _read_receive_times(source, start, end) if time_bytes else (None, 0)
+    )
     return Frames(
         name=name,
         content=content,
         sha256=hashlib.sha256(content).hexdigest(),
         start=start,
-        message_id=number.astype(np.int32),
-        system=source[at + 1],
-        component=source[at + 2],
-        sequence=source[at],
-        payload_start=start + np.where(is_version_2, HEADER_2, HEADER_1),
+        message_id=message_id.astype(np.int32),
+        system=source[sequence_offset + 1],
+        component=source[sequence_offset + 2],
+        sequence=source[sequence_offset],
+        payload_start=start + np.where(is_version_2, HEADER_BYTES_2, HEADER_BYTES_1),
         payload_length=source[start + 1],
-        received_us=received,
+        received_us=received_us,
         unknown_frame_count=unknown_frame_count,
         bad_bytes=bad_bytes,
-        in_frame=in_frame,
-        bad_stamps=bad_stamps,
+        ends_in_frame=ends_in_frame,
+        damaged_receive_times=damaged_receive_times,
     )
 
 
-def _scan(content: bytes) -> Integers:
+def _find_valid_frames(content: bytes) -> Integers:
     """Return start, end and message id, shape (n, 3), of all valid frames; they may overlap."""
     source, view = np.frombuffer(content, dtype=np.uint8), memoryview(content)
-    found = [np.zeros((0, 3), dtype=np.int64)]
-    for low in range(0, len(source), BLOCK_BYTES):
-        frames, crc_end = _candidates(source, low)
-        bodies = zip((frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
-        crc = np.array([mcrf4xx(view[a:b]) for a, b in bodies], dtype=np.uint16)
-        crc = (crc >> 8) ^ _LAST[(crc ^ _SEEDS[frames[:, 2]].astype(np.uint16)) & 0xFF]
-        stored = source[crc_end] | source[crc_end + 1].astype(np.uint16) << 8
-        found.append(frames[stored == crc])
-    return np.concatenate(found)
+    valid_frames = [np.zeros((0, 3), dtype=np.int64)]
+    for block_start in range(0, len(source), BLOCK_BYTES):
+        frames, crc_end = _find_candidates(source, block_start)
+        checked_ranges = zip((frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
+        crc = np.array([mcrf4xx(view[a:b]) for a, b in checked_ranges], dtype=np.uint16)
+        crc = (crc >> 8) ^ _BYTE_CHECKSUMS[
+            (crc ^ _CRC_EXTRA[frames[:, 2]].astype(np.uint16)) & 0xFF
+        ]
+        stored_crc = source[crc_end] | source[crc_end + 1].astype(np.uint16) << 8
+        valid_frames.append(frames[stored_crc == crc])
+    return np.concatenate(valid_frames)
 
 
 def _remove_overlapping(frames: Integers) -> Integers:
     """Remove frames that begin inside the previous frame.
 
     The payload of one frame may contain another frame (TUNNEL). A receive time can look like the
-    beginning of a frame; it must not hide the frame after it.
+    beginning of a frame; such a false frame must not remove the true frame after it.
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
     start, end = frames[:, 0].tolist(), frames[:, 1].tolist()
-    keep, end_reached, starts = [], 0, {*start}
-    for row, begin in enumerate(start):
-        next_starts = end_reached, end_reached + STAMP_BYTES
-        if begin >= end_reached and (begin in next_starts or starts.isdisjoint(next_starts)):
-            keep.append(row)
-            end_reached = end[row]
-    return frames[keep]
+    kept_rows, previous_end, starts = [], 0, {*start}
+    for row, frame_start in enumerate(start):
+        next_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
+        if frame_start >= previous_end and (
+            frame_start in next_starts or starts.isdisjoint(next_starts)
+        ):
+            kept_rows.append(row)
+            previous_end = end[row]
+    return frames[kept_rows]
 
 
-def _candidates(source: NDArray[np.uint8], low: int) -> tuple[Integers, Integers]:
-    """Return possible frames in one block (as in :func:`_scan`) and their checksum offsets."""
-    block = source[low : low + BLOCK_BYTES]
-    start = np.flatnonzero((block == MAGIC_1) | (block == MAGIC_2)).astype(np.int64) + low
-    header = np.where(source[start] == MAGIC_2, HEADER_2, HEADER_1)
-    has_whole_header = start + header + CHECKSUM <= len(source)
-    start, header = start[has_whole_header], header[has_whole_header]
-    is_version_2 = header == HEADER_2
-    at = start[is_version_2]
-    number = source[start + 5].astype(np.int64)
-    number[is_version_2] = source[at + 7] | source[at + 8].astype(np.int64) << 8
-    is_known = _SEEDS[number] >= 0
-    is_known[is_version_2] &= (source[at + 9] == 0) & (source[at + 2] <= SIGNED)
-    crc_end = start + source[start + 1] + header
-    end = crc_end + CHECKSUM
-    end[is_version_2] += SIGNATURE * (source[at + 2] & SIGNED).astype(np.int64)
-    is_known &= end <= len(source)
-    return np.stack([start, end, number], axis=1)[is_known], crc_end[is_known]
+def _find_candidates(source: NDArray[np.uint8], block_start: int) -> tuple[Integers, Integers]:
+    """Return start, end and message id of possible frames in one block, and checksum offsets."""
+    block = source[block_start : block_start + BLOCK_BYTES]
+    start = (
+        np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2)).astype(np.int64)
+        + block_start
+    )
+    header_bytes = np.where(source[start] == MAGIC_BYTE_2, HEADER_BYTES_2, HEADER_BYTES_1)
+    has_whole_header = start + header_bytes + CHECKSUM_BYTES <= len(source)
+    start, header_bytes = start[has_whole_header], header_bytes[has_whole_header]
+    is_version_2 = header_bytes == HEADER_BYTES_2
+    start_2 = start[is_version_2]
+    message_id = source[start + 5].astype(np.int64)
+    message_id[is_version_2] = source[start_2 + 7] | source[start_2 + 8].astype(np.int64) << 8
+    is_candidate = _CRC_EXTRA[message_id] >= 0
+    is_candidate[is_version_2] &= (source[start_2 + 9] == 0) & (source[start_2 + 2] <= SIGNED_FLAG)
+    crc_end = start + source[start + 1] + header_bytes
+    end = crc_end + CHECKSUM_BYTES
+    end[is_version_2] += SIGNATURE_BYTES * (source[start_2 + 2] & SIGNED_FLAG).astype(np.int64)
+    is_candidate &= end <= len(source)
+    return np.stack([start, end, message_id], axis=1)[is_candidate], crc_end[is_candidate]
 
 
-def _has_receive_stamps(start: Integers, end: Integers) -> bool:
+def _has_receive_times(start: Integers, end: Integers) -> bool:
     """Return True if most frames are separated by the eight bytes of a receive time."""
     gap_bytes = start[1:] - end[:-1]
     stamped_count, bare_count = (
-        np.count_nonzero(gap_bytes == STAMP_BYTES),
+        np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES),
         np.count_nonzero(gap_bytes == 0),
     )
     return (
         bool(stamped_count > bare_count)
         if stamped_count + bare_count
-        else bool(start[0] == STAMP_BYTES)
+        else bool(start[0] == RECEIVE_TIME_BYTES)
     )
 
 
 def _count_other_bytes(
-    content: bytes, start: Integers, end: Integers, stamp: int
+    content: bytes, start: Integers, end: Integers, time_bytes: int
 ) -> tuple[int, int, bool]:
-    """Count the content between valid frames; ``start`` includes the receive time.
+    """Count frames and bytes between the valid frames.
+
+    ``start`` is the offset of each frame's receive time, which has ``time_bytes`` bytes or none.
 
     Returns
     -------
@@ -290,48 +305,68 @@ def _count_other_bytes(
     bool
         True if the last of these bytes are the beginning of a frame.
     """
-    unknown_frame_count, bad, rest = 0, 0, b""
-    lows, highs = np.append(0, end), np.append(start, len(content))
-    for low, high in np.column_stack([lows, highs])[lows < highs].tolist():
-        at = low
-        for size in _unknown_frames(content, low, high, stamp):
+    unknown_frame_count, bad_bytes, last_bytes = 0, 0, b""
+    gap_starts, gap_ends = np.append(0, end), np.append(start, len(content))
+    for gap_start, gap_end in np.column_stack([gap_starts, gap_ends])[
+        gap_starts < gap_ends
+    ].tolist():
+        offset = gap_start
+        for size in _unknown_frames(content, gap_start, gap_end, time_bytes):
             unknown_frame_count += 1
-            at += size
-        bad += high - at
-        rest = content[at:high] if high == len(content) else b""
-    begins_frame = rest[stamp : stamp + 1] in (b"", bytes([MAGIC_1]), bytes([MAGIC_2]))
-    return unknown_frame_count, bad, 0 < len(rest) < stamp + LONGEST_FRAME and begins_frame
+            offset += size
+        bad_bytes += gap_end - offset
+        last_bytes = content[offset:gap_end] if gap_end == len(content) else b""
+    begins_frame = last_bytes[time_bytes : time_bytes + 1] in (
+        b"",
+        bytes([MAGIC_BYTE_1]),
+        bytes([MAGIC_BYTE_2]),
+    )
+    return (
+        unknown_frame_count,
+        bad_bytes,
+        0 < len(last_bytes) < time_bytes + MAX_FRAME_BYTES and begins_frame,
+    )
 
 
-def _unknown_frames(content: bytes, at: int, high: int, stamp: int) -> Iterator[int]:
+def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) -> Iterator[int]:
     """Yield the sizes (bytes) of consecutive frames of unknown messages, from their headers."""
-    while at + stamp + HEADER_1 + CHECKSUM <= high:
-        head = content[at + stamp : at + stamp + HEADER_2]
-        number, size = head[5], stamp + head[1] + HEADER_1 + CHECKSUM
-        if head[0] == MAGIC_2:
-            number = int.from_bytes(head[7:10], "little")
-            size += HEADER_2 - HEADER_1 + SIGNATURE * (head[2] & SIGNED)
-        at += size
-        if head[0] not in (MAGIC_1, MAGIC_2) or number in dialect.mavlink_map or at > high:
+    while offset + time_bytes + HEADER_BYTES_1 + CHECKSUM_BYTES <= gap_end:
+        header = content[offset + time_bytes : offset + time_bytes + HEADER_BYTES_2]
+        message_id, size = header[5], time_bytes + header[1] + HEADER_BYTES_1 + CHECKSUM_BYTES
+        if header[0] == MAGIC_BYTE_2:
+            message_id = int.from_bytes(header[7:10], "little")
+            size += HEADER_BYTES_2 - HEADER_BYTES_1 + SIGNATURE_BYTES * (header[2] & SIGNED_FLAG)
+        offset += size
+        if (
+            header[0] not in (MAGIC_BYTE_1, MAGIC_BYTE_2)
+            or message_id in dialect.mavlink_map
+            or offset > gap_end
+        ):
             return
         yield size
 
 
-def _stamps(source: NDArray[np.uint8], start: Integers, end: Integers) -> tuple[Integers, int]:
+def _read_receive_times(
+    source: NDArray[np.uint8], start: Integers, end: Integers
+) -> tuple[Integers, int]:
     """Return the receive times (UNIX, µs) and the number of damaged ones."""
-    usable = start >= STAMP_BYTES
-    usable[1:] &= start[1:] - end[:-1] >= STAMP_BYTES
-    windows = np.lib.stride_tricks.sliding_window_view(source, STAMP_BYTES)
-    # The first frame may have no receive time before it
-    stamp = np.ascontiguousarray(windows[np.maximum(start - STAMP_BYTES, 0)]).view(">u8")[:, 0]
-    received = stamp.astype(np.int64)  # values above 1 << 63 become negative
-    usable &= (received >= 0) & (received < 1 << 62)
-    middle = int(np.median(received[usable])) if np.any(usable) else 0
-    usable &= np.abs(received - middle) <= MAX_STAMP_DISTANCE_US
-    received = np.where(usable, received, 0)
-    if np.any(usable):
-        rows = np.flatnonzero(usable)
+    is_usable = start >= RECEIVE_TIME_BYTES
+    is_usable[1:] &= start[1:] - end[:-1] >= RECEIVE_TIME_BYTES
+    windows = np.lib.stride_tricks.sliding_window_view(source, RECEIVE_TIME_BYTES)
+    # There may be no receive time before the first frame
+    raw_us = np.ascontiguousarray(windows[np.maximum(start - RECEIVE_TIME_BYTES, 0)]).view(">u8")[
+        :, 0
+    ]
+    received_us = raw_us.astype(np.int64)  # values above 1 << 63 become negative
+    is_usable &= (received_us >= 0) & (received_us < 1 << 62)
+    median_us = int(np.median(received_us[is_usable])) if np.any(is_usable) else 0
+    is_usable &= np.abs(received_us - median_us) <= MAX_RECEIVE_TIME_DISTANCE_US
+    received_us = np.where(is_usable, received_us, 0)
+    if np.any(is_usable):
+        rows = np.flatnonzero(is_usable)
         # Relative to the first receive time, so that float64 resolves microseconds
-        steps = np.interp(np.arange(len(start)), rows, received[rows] - received[rows[0]])
-        received = received[rows[0]] + np.rint(steps).astype(np.int64)
-    return received, int(np.count_nonzero(~usable))
+        since_first_us = np.interp(
+            np.arange(len(start)), rows, received_us[rows] - received_us[rows[0]]
+        )
+        received_us = received_us[rows[0]] + np.rint(since_first_us).astype(np.int64)
+    return received_us, int(np.count_nonzero(~is_usable))

@@ -14,11 +14,11 @@ from px4fuse.position_source import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
 from px4fuse.record import table
 
-AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
-NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
-GROUND_STATION = 6  # MAV_TYPE_GCS
-LANDED = 1  # MAV_LANDED_STATE_ON_GROUND
-AUTO_MODE = 4  # PX4_CUSTOM_MAIN_MODE_AUTO
+AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
+INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
+GROUND_STATION_TYPE = 6  # MAV_TYPE_GCS
+ON_GROUND_STATE = 1  # MAV_LANDED_STATE_ON_GROUND
+AUTO_MAIN_MODE = 4  # PX4_CUSTOM_MAIN_MODE_AUTO
 NO_MODES = Unavailable(
     "flight modes",
     "the recording has no HEARTBEAT of a PX4 autopilot",
@@ -31,8 +31,8 @@ ARDUPILOT_REPLAY = Unavailable(
 )
 # Messages whose time_usec is the boot clock; in other messages it may be another clock
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
-# Messages that only an autopilot sends; they identify it
-OWN_MESSAGES = (
+# Messages that only an autopilot sends; they identify the autopilot among the senders
+AUTOPILOT_MESSAGES = (
     "HIGHRES_IMU",
     "SCALED_IMU",
     "SCALED_IMU2",
@@ -81,7 +81,7 @@ class PositionInput:
 
 @dataclass(frozen=True)
 class FrameOfReference:
-    """MAV_FRAME: order and signs of its components as north, east, down or forward, right, down."""
+    """MAV_FRAME: order and signs of the components along the axes of frame ``name`` (NED, FRD)."""
 
     name: str
     order: tuple[int, int, int] = (0, 1, 2)
@@ -89,32 +89,32 @@ class FrameOfReference:
     body: bool = False
 
 
-_ROWS = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
-LAYOUTS = expand_layouts(_ROWS["layouts"])
-_INPUTS = msgspec.convert(_ROWS["positions"], dict[str, PositionInput])
-FRAMES_OF_REFERENCE = msgspec.convert(_ROWS["frames"], dict[int, FrameOfReference], strict=False)
+_TABLE = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
+LAYOUTS = expand_layouts(_TABLE["layouts"])
+_INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
+FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
 AUTOPILOTS, VEHICLE_TYPES, MAIN_MODES, AUTO_MODES = (
-    msgspec.convert(_ROWS[name], dict[int, str], strict=False)
+    msgspec.convert(_TABLE[name], dict[int, str], strict=False)
     for name in ("autopilots", "vehicle_types", "main_modes", "auto_modes")
 )
-UNUSED: Mapping[str, str] = _ROWS["unused"]
+UNUSED: Mapping[str, str] = _TABLE["unused"]
 POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())
 _SCALED_IMU = (replace(LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3"))
-IMU = (LAYOUTS["highres_imu"], *_SCALED_IMU)
+IMU_LAYOUTS = (LAYOUTS["highres_imu"], *_SCALED_IMU)
 # In order of preference for equal message counts
-ATTITUDE = (LAYOUTS["quaternion"], LAYOUTS["angles"], LAYOUTS["attitude_of_odometry"])
-# EKF2's state; the message with variances first
-STATES = (LAYOUTS["odometry"], LAYOUTS["local_position"])
-# Simulation truth
-TRUTH = (LAYOUTS["truth"], LAYOUTS["sim_state"])
-GNSS_INPUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
+ATTITUDE_LAYOUTS = (LAYOUTS["quaternion"], LAYOUTS["angles"], LAYOUTS["attitude_of_odometry"])
+# EKF2's state; ODOMETRY is first because it has variances
+STATE_LAYOUTS = (LAYOUTS["odometry"], LAYOUTS["local_position"])
+# Ground truth of a simulation
+TRUTH_LAYOUTS = (LAYOUTS["truth"], LAYOUTS["sim_state"])
+GNSS_LAYOUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return how to record each missing part, and the reason for no EKF2 replay.
+    """Return the actions to record each missing part, and the reason for no EKF2 replay.
 
-    Autopilots other than ArduPilot get the texts for PX4.
+    The texts for PX4 are returned for all autopilots except ArduPilot.
     """
     if autopilot == "ArduPilot":
-        return _ROWS["remedies"][autopilot], ARDUPILOT_REPLAY
-    return _ROWS["remedies"]["PX4"], RECORD_NOT_LOGGED
+        return _TABLE["remedies"][autopilot], ARDUPILOT_REPLAY
+    return _TABLE["remedies"]["PX4"], RECORD_NOT_LOGGED

@@ -21,10 +21,10 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
-# s; larger median distance between timestamp and receipt: the timestamp is not boot time
-OWN_CLOCK_S = 5.0
-# s; time difference of global and local position for the origin: 5 cm error at 1 m/s
-SAME_STATE_S = 0.05
+# s; with a larger median distance to the boot time of receipt, a timestamp is not boot time
+MAX_BOOT_CLOCK_DISTANCE_S = 5.0
+# s; limit for joining global and local positions to the origin: 5 cm error at 1 m/s
+MAX_STATE_DISTANCE_S = 0.05
 
 
 def read_positions(
@@ -37,11 +37,11 @@ def read_positions(
     clocks : mapping from address to ClockMapping
         Clock of every sender.
     remedy : str
-        How to record missing positions.
+        Action to record missing positions.
     delay_s : float
         Delay between a GNSS fix and its timestamp that the autopilot assumes.
     """
-    found: list[PositionTrack | Unavailable] = []
+    tracks_and_missing: list[PositionTrack | Unavailable] = []
     for message in dict.fromkeys(source.message for source in messages.POSITION_INPUTS):
         senders = senders_of(recording, message)
         tracks = [
@@ -52,11 +52,13 @@ def read_positions(
             if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
         ]
         reason = f"no {message} to the autopilot in the recording"
-        found += tracks or [px4_positions.unavailable(message, reason, remedy)]
-    fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_INPUTS)
-    found += [track for track in fixes if track]
-    missing = tuple(part for part in found if isinstance(part, Unavailable))
-    return sort_by_preference(part for part in found if isinstance(part, PositionTrack)), missing
+        tracks_and_missing += tracks or [px4_positions.unavailable(message, reason, remedy)]
+    fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
+    tracks_and_missing += [track for track in fixes if track]
+    missing = tuple(item for item in tracks_and_missing if isinstance(item, Unavailable))
+    return sort_by_preference(
+        item for item in tracks_and_missing if isinstance(item, PositionTrack)
+    ), missing
 
 
 def _read_track(
@@ -67,7 +69,7 @@ def _read_track(
     remedy: str,
     senders: list[Address],
 ) -> PositionTrack | Unavailable | None:
-    """Read one kind of position from one sender; None if the sender did not send it."""
+    """Read the positions of one input from one sender; None if the sender did not send any."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
@@ -89,11 +91,9 @@ def _read_track(
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = read_orientation(samples)
-    clock_statement = clock.statement
-    mapped_words = (
-        ""
-        if clock_statement.method == "boot clock"
-        else f", mapped to boot time by {clock_statement.method}"
+    clock_map = clock.statement
+    mapping_text = (
+        "" if clock_map.method == "boot clock" else f", mapped to boot time by {clock_map.method}"
     )
     return px4_positions.make_track(
         name,
@@ -102,10 +102,10 @@ def _read_track(
         remedy=remedy,
         description=source.description,
         frame=frame,
-        clock=clock_statement.clock + mapped_words,
+        clock=clock_map.clock + mapping_text,
         topics=(source.message,),
         log=recording.frames.name,
-        clock_map=clock_statement,
+        clock_map=clock_map,
         orientation=orientation,
     )
 
@@ -113,17 +113,17 @@ def _read_track(
 def _read_gnss(
     recording: Recording, layout: Layout, delay_s: float
 ) -> PositionTrack | Unavailable | None:
-    """Read the fixes of a GNSS receiver as NED about the autopilot's origin; None if none.
+    """Read the fixes of a GNSS receiver as NED about the autopilot's origin; None without fixes.
 
     PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat it until the next
     fix. The track is chosen automatically if the autopilot sends a global position.
     """
     rows = recording.rows(layout.topic)
-    stamp_us = recording.frames.table(layout.topic, rows)["time_usec"]
-    rows = rows[np.diff(stamp_us, prepend=0) > 0]
+    timestamp_us = recording.frames.table(layout.topic, rows)["time_usec"]
+    rows = rows[np.diff(timestamp_us, prepend=0) > 0]
     boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
     receipt_s = recording.receipt_boot_s(rows)
-    if len(rows) and np.median(np.abs(receipt_s - boot_s)) > OWN_CLOCK_S:
+    if len(rows) and np.median(np.abs(receipt_s - boot_s)) > MAX_BOOT_CLOCK_DISTANCE_S:
         boot_s = receipt_s  # timestamps are UNIX time, or the recording has no boot clock
     fixes = recording.read(layout, rows, boot_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
@@ -159,16 +159,21 @@ def local_origin(recording: Recording) -> GeodeticPosition | None:
     sent_origin = recording.read(messages.LAYOUTS["origin"]).dropna()
     if len(sent_origin):
         return tuple(sent_origin[GLOBAL_COLUMNS].iloc[-1].tolist())
-    state = recording.read(messages.STATES[-1])[Columns.POSITION]
+    state = recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION]
     global_state = recording.read(messages.LAYOUTS["global_state"])
-    joined = join_nearest(global_state, state, SAME_STATE_S).dropna()
+    joined = join_nearest(global_state, state, MAX_STATE_DISTANCE_S).dropna()
     joined = joined[joined["latitude_deg"] != 0.0]
     if joined.empty:
         return None
-    geo, local = joined[GLOBAL_COLUMNS].to_numpy(), joined[Columns.POSITION].to_numpy()
-    pairs = zip(geo, local, strict=True)
-    places = [(*unproject(-n, -e, tuple(at[:2])), at[2] + d) for at, (n, e, d) in pairs]
-    return tuple(np.median(places, axis=0).tolist())
+    global_positions, local_positions = (
+        joined[GLOBAL_COLUMNS].to_numpy(),
+        joined[Columns.POSITION].to_numpy(),
+    )
+    pairs = zip(global_positions, local_positions, strict=True)
+    origins = [
+        (*unproject(-n, -e, tuple(position[:2])), position[2] + d) for position, (n, e, d) in pairs
+    ]
+    return tuple(np.median(origins, axis=0).tolist())
 
 
 def read_truth(
@@ -180,7 +185,7 @@ def read_truth(
     PX4), so receive times are used. Its geodetic positions are projected about the autopilot's
     origin for a GNSS source, otherwise about its first sample, the start of the simulated vehicle.
     """
-    for layout in messages.TRUTH:
+    for layout in messages.TRUTH_LAYOUTS:
         rows = recording.rows(layout.topic)
         if len(rows) < px4_positions.MIN_TRACK_SAMPLES:
             continue

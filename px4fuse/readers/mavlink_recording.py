@@ -11,27 +11,33 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Columns
 from px4fuse.log import Stream
-from px4fuse.readers.common import MIN_NORM
-from px4fuse.readers.field_maps import IMPOSSIBLE, Layout
-from px4fuse.readers.mavlink_clocks import UNIX_FROM_S, Line, fit_least_delay, is_running_clock
-from px4fuse.readers.mavlink_frames import LONGEST_FRAME, Address, Frames, message_name, wire_layout
+from px4fuse.readers.common import MIN_QUATERNION_NORM
+from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
+from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S, Line, fit_least_delay, is_running_clock
+from px4fuse.readers.mavlink_frames import (
+    MAX_FRAME_BYTES,
+    Address,
+    Frames,
+    message_name,
+    wire_layout,
+)
 from px4fuse.readers.mavlink_messages import FRAMES_OF_REFERENCE, STAMPED_BY_BOOT_CLOCK
 from px4fuse.readers.ulog_topics import longest_increasing_run
 
 BOOT_CLOCK = "autopilot boot clock"
 RECEIPT_CLOCK = "receive time minus minimum link delay"
 # s; a larger backward step of the boot clock is a restart, not a late packet
-RESTART_S = 5.0
-# Number of messages before and after a restart that are compared to confirm it
-RESTART_MESSAGES = 20
-# Fraction of the largest group of timestamps, below which a separate group is invalid
-STRAY_SHARE = 0.01
+MIN_RESTART_STEP_S = 5.0
+# Messages before and after a suspected restart whose boot times are compared to confirm it
+RESTART_CHECK_MESSAGES = 20
+# Fraction of the largest group of timestamps; a smaller separate group is invalid
+MIN_GROUP_FRACTION = 0.01
 # s; timestamps further than this from all others, or outside the session, are invalid
-OUTSIDE_S = 60.0
+MAX_OUTSIDE_S = 60.0
 # Fraction of bytes outside of frames, above which the file is damaged
-DAMAGED_SHARE = 0.002
-# Fewest boot timestamps of which constant values are recognised as "not a clock"
-MIN_STAMPS = 10
+MAX_LOST_FRACTION = 0.002
+# Number of boot timestamps from which constant values show that the field is not a clock
+MIN_CONSTANT_TIMESTAMPS = 10
 
 
 @dataclass(frozen=True)
@@ -44,14 +50,15 @@ class Recording:
     address : Address
         Address of the autopilot of this flight.
     session : slice
-        Frames between two restarts of the autopilot.
+        Frames between two restarts of the autopilot: the longest such part of the recording.
     received_s : ndarray, shape (n,)
-        Receive time (s) of every frame since the first; in a stream without receive times, the
-        boot time of the last earlier autopilot message.
+        Receive time (s) of every frame since the first frame. In a stream without receive times:
+        boot time of the last autopilot message before the frame.
     boot_of_receipt : Line
         Map from receive time (s) to boot clock (s).
     zero_s, duration_s : float
-        Boot time of time zero, and duration of the session.
+        Boot time (s) at which the session starts, and duration of the session. Times of the flight
+        count from ``zero_s``.
     damage : tuple of str
         Sentences on unreadable parts.
     notes : list of str
@@ -97,7 +104,7 @@ class Recording:
         boot_s: Array | None = None,
         name: str = "",
     ) -> pd.DataFrame:
-        """Read one message as a frame with strictly increasing times (s since time zero).
+        """Read one message as a DataFrame with strictly increasing times (s since ``zero_s``).
 
         Parameters
         ----------
@@ -118,12 +125,14 @@ class Recording:
             table = table[selected_rows]
         # One hour of IMU data has hundreds of megabytes, so copies are avoided
         values = np.empty((len(selected_rows), len(layout.columns)))
-        for at, (column, field_name) in enumerate(layout.columns.items()):
-            base, _, index = field_name.removesuffix("]").partition("[")
-            field_values = table[base][:, int(index)] if index else table[base]
-            values[:, at] = field_values.astype(np.float64) * layout.scale.get(column, 1.0)
+        for column_index, (column, field_name) in enumerate(layout.columns.items()):
+            array_name, _, index = field_name.removesuffix("]").partition("[")
+            field_values = table[array_name][:, int(index)] if index else table[array_name]
+            values[:, column_index] = field_values.astype(np.float64) * layout.scale.get(
+                column, 1.0
+            )
         del table
-        values[~(np.abs(values) < IMPOSSIBLE)] = np.nan
+        values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
         times = pd.Index(boot_s[selected_rows] - self.zero_s, name="time_s")
         samples = pd.DataFrame(values, times, list(layout.columns), copy=False)
         if "roll" in samples:
@@ -135,34 +144,38 @@ class Recording:
         """Return the indices of valid, strictly increasing boot times; count the others."""
         # Comparisons with NaN are False, so NaN is dropped
         time_s = boot_s - self.zero_s
-        inside = (time_s >= -OUTSIDE_S) & (time_s <= self.duration_s + OUTSIDE_S)
-        rows = np.flatnonzero(inside & (boot_s > 0.0))
+        is_inside = (time_s >= -MAX_OUTSIDE_S) & (time_s <= self.duration_s + MAX_OUTSIDE_S)
+        rows = np.flatnonzero(is_inside & (boot_s > 0.0))
         time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
         # The same message received over two links is one sample
-        first = np.sort(np.unique(time_us, return_index=True)[1])
-        selected_rows: IntArray = rows[first[longest_increasing_run(time_us[first])]]
-        dropped = len(boot_s) - len(rows) + len(first) - len(selected_rows)
-        if dropped:
-            self.dropped[name] = dropped
+        first_copies = np.sort(np.unique(time_us, return_index=True)[1])
+        selected_rows: IntArray = rows[first_copies[longest_increasing_run(time_us[first_copies])]]
+        dropped_count = len(boot_s) - len(rows) + len(first_copies) - len(selected_rows)
+        if dropped_count:
+            self.dropped[name] = dropped_count
         return selected_rows
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
-        """Return the boot time (s) of receipt of frames, minus the minimum link delay."""
+        """Return the boot time (s) at which frames were received, minus the minimum link delay."""
         return self.boot_of_receipt.at(self.received_s[rows])
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
-        """Return the boot time (s) of autopilot messages, from timestamps or else receipt."""
+        """Return the boot time (s) of autopilot messages from timestamps, else receive time."""
         if not self.boot_of_receipt.pairs:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3, dtype=np.float64)
-        stamp = table["time_usec"] * 1e-6
-        on_boot = (stamp > 0.0) & ((stamp < UNIX_FROM_S) == (self.zero_s < UNIX_FROM_S))
-        return np.asarray(np.where(on_boot, stamp, self.receipt_boot_s(rows)), dtype=np.float64)
+        timestamp_s = table["time_usec"] * 1e-6
+        is_boot_time = (timestamp_s > 0.0) & (
+            (timestamp_s < MIN_UNIX_TIME_S) == (self.zero_s < MIN_UNIX_TIME_S)
+        )
+        return np.asarray(
+            np.where(is_boot_time, timestamp_s, self.receipt_boot_s(rows)), dtype=np.float64
+        )
 
-    def record_stream(self, part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
+    def record_stream(self, flight_part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
         """Record the source of a part of the flight."""
-        self.streams[part] = Stream(messages, clock, self.frames.name)
+        self.streams[flight_part] = Stream(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
@@ -172,13 +185,15 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     (``streams/ODOMETRY.hpp``). Orientations in frames other than NED or FRD are dropped, because
     the sender's body axes are unknown.
     """
-    has_quaternion = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1) > MIN_NORM
+    has_quaternion = (
+        np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1) > MIN_QUATERNION_NORM
+    )
     orientation = Columns.QUATERNION + Columns.ROTATION_VARIANCE
     ned_samples = samples.copy()
     ned_samples[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
     ned_samples[Columns.VELOCITY_VARIANCE + orientation] = np.nan
-    used = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
-    for number in used & FRAMES_OF_REFERENCE.keys():
+    used_frames = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
+    for number in used_frames & FRAMES_OF_REFERENCE.keys():
         frame = FRAMES_OF_REFERENCE[number]
         order, signs, is_body = frame.order, frame.signs, frame.body
         frame_samples = samples[(samples["frame_id"] == number) & (not is_body)]
@@ -204,102 +219,113 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     return ned_samples
 
 
-def _boot_stamps(frames: Frames, address: Address) -> tuple[IntArray, Array]:
-    """Return the autopilot frames that contain its boot clock, and that time (s)."""
-    frame_samples = frames.sent_by(address)
-    all_rows, all_stamps = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
-    for number in np.unique(frames.message_id[frame_samples]).tolist():
-        name = message_name(number)
-        if "time_boot_ms" in (wire_layout(number).names or ()):
-            stamp, unit = "time_boot_ms", 1e-3
+def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]:
+    """Return the autopilot frames that contain the boot time, and the boot time (s) of each."""
+    is_from_autopilot = frames.sent_by(address)
+    all_rows, all_times_s = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
+    for message_id in np.unique(frames.message_id[is_from_autopilot]).tolist():
+        name = message_name(message_id)
+        if "time_boot_ms" in (wire_layout(message_id).names or ()):
+            field_name, unit = "time_boot_ms", 1e-3
         elif name in STAMPED_BY_BOOT_CLOCK:
-            stamp, unit = "time_usec", 1e-6
+            field_name, unit = "time_usec", 1e-6
         else:
             continue
         rows = frames.rows(name)
-        rows = rows[frame_samples[rows]]
+        rows = rows[is_from_autopilot[rows]]
         all_rows.append(rows)
-        all_stamps.append(frames.table(name, rows)[stamp] * unit)
-    rows, stamps = np.concatenate(all_rows), np.concatenate(all_stamps)
-    is_boot_time, is_unix_time = (stamps > 0.0) & (stamps < UNIX_FROM_S), stamps >= UNIX_FROM_S
+        all_times_s.append(frames.table(name, rows)[field_name] * unit)
+    rows, times_s = np.concatenate(all_rows), np.concatenate(all_times_s)
+    is_boot_time, is_unix_time = (
+        (times_s > 0.0) & (times_s < MIN_UNIX_TIME_S),
+        times_s >= MIN_UNIX_TIME_S,
+    )
     is_usable = is_boot_time if np.any(is_boot_time) else is_unix_time
-    if np.count_nonzero(is_usable) >= MIN_STAMPS and not is_running_clock(stamps[is_usable]):
+    if np.count_nonzero(is_usable) >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(
+        times_s[is_usable]
+    ):
         is_usable = np.zeros_like(is_usable)
-    rows, stamps = rows[is_usable], stamps[is_usable]
+    rows, times_s = rows[is_usable], times_s[is_usable]
     order = np.argsort(rows, kind="stable")
-    return rows[order], stamps[order]
+    return rows[order], times_s[order]
 
 
 def read_recording(frames: Frames, address: Address) -> Recording:
     """Choose the longest session and map the receive time to the boot clock."""
     notes: list[str] = []
-    rows, stamps = _boot_stamps(frames, address)
+    rows, boot_s = _read_boot_times(frames, address)
     session = slice(0, len(frames))
-    restarts = np.flatnonzero(np.diff(stamps) < -RESTART_S) + 1
+    restarts = np.flatnonzero(np.diff(boot_s) < -MIN_RESTART_STEP_S) + 1
     # A single late or early packet is not a restart, so its neighbours are compared too
-    stamps_before = stamps[np.maximum(restarts - 1 - RESTART_MESSAGES, 0)]
-    stamps_after = stamps[np.minimum(restarts + RESTART_MESSAGES, len(stamps) - 1)]
-    restarts = restarts[stamps_after < np.minimum(stamps_before, stamps[restarts - 1]) - RESTART_S]
+    boot_before_s = boot_s[np.maximum(restarts - 1 - RESTART_CHECK_MESSAGES, 0)]
+    boot_after_s = boot_s[np.minimum(restarts + RESTART_CHECK_MESSAGES, len(boot_s) - 1)]
+    restarts = restarts[
+        boot_after_s < np.minimum(boot_before_s, boot_s[restarts - 1]) - MIN_RESTART_STEP_S
+    ]
     if len(restarts):
         session_rows = np.split(np.arange(len(rows)), restarts)
         longest_index = max(
             range(len(session_rows)), key=lambda rows_of_session: len(session_rows[rows_of_session])
         )
         rows_of_session = session_rows[longest_index]
-        low = int(rows[rows_of_session[0]]) if longest_index else 0
-        high = (
+        first_frame = int(rows[rows_of_session[0]]) if longest_index else 0
+        end_frame = (
             len(frames)
             if longest_index == len(session_rows) - 1
             else int(rows[rows_of_session[-1]]) + 1
         )
-        session = slice(low, high)
+        session = slice(first_frame, end_frame)
         used_fraction = len(rows_of_session) / len(rows)
-        rows, stamps = rows[rows_of_session], stamps[rows_of_session]
+        rows, boot_s = rows[rows_of_session], boot_s[rows_of_session]
         notes.append(
-            f"the boot clock restarted {_times(len(restarts))}: only part {longest_index + 1} of "
-            f"{len(session_rows)} is used, {stamps[0]:.1f} s to {stamps[-1]:.1f} s after boot "
-            f"({used_fraction:.0%} of the data)"
+            f"the boot clock restarted {_format_times(len(restarts))}: only part "
+            f"{longest_index + 1} of {len(session_rows)} is used, {boot_s[0]:.1f} s to "
+            f"{boot_s[-1]:.1f} s after boot ({used_fraction:.0%} of the data)"
         )
-    increasing_rows = _remove_stray_stamps(
-        stamps, longest_increasing_run(np.rint(stamps * 1e6).astype(np.int64))
+    increasing_rows = _remove_stray_timestamps(
+        boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))
     )
-    rows, stamps = rows[increasing_rows], stamps[increasing_rows]
+    rows, boot_s = rows[increasing_rows], boot_s[increasing_rows]
     line = Line(0.0, 0.0, 1.0, 0.0, len(rows))
-    received = np.zeros(len(frames))
+    received_s = np.zeros(len(frames))
     if frames.received_us is not None:
-        received = (frames.received_us - frames.received_us[0]) * 1e-6
+        received_s = (frames.received_us - frames.received_us[0]) * 1e-6
         if len(rows):
-            line = fit_least_delay(stamps, received[rows]).inverse()
+            line = fit_least_delay(boot_s, received_s[rows]).inverse()
     elif len(rows):
         # A raw stream has no receive time; the last boot time before each frame replaces it
-        at = np.clip(np.searchsorted(rows, np.arange(len(frames)), side="right") - 1, 0, None)
-        received = stamps[at]
+        previous_row = np.clip(
+            np.searchsorted(rows, np.arange(len(frames)), side="right") - 1, 0, None
+        )
+        received_s = boot_s[previous_row]
     else:
         notes.append("no message in the stream contains a time, so the data have no time")
-    receipt_reversals = int(np.count_nonzero(np.diff(received) < 0.0))
-    unknown, damaged_times = frames.unknown_frame_count, frames.bad_stamps
-    if unknown:
-        notes.append(f"frames of unknown message types, ignored: {unknown}")
-    if damaged_times:
-        notes.append(f"damaged receive times, interpolated: {damaged_times}")
+    receipt_reversals = int(np.count_nonzero(np.diff(received_s) < 0.0))
+    unknown_count, damaged_count = frames.unknown_frame_count, frames.damaged_receive_times
+    if unknown_count:
+        notes.append(f"frames of unknown message types, ignored: {unknown_count}")
+    if damaged_count:
+        notes.append(f"damaged receive times, interpolated: {damaged_count}")
     if receipt_reversals:
-        notes.append(f"the receive time went back {_times(receipt_reversals)}")
-    share = frames.bad_bytes / len(frames.content)
-    lost = f"{frames.bad_bytes:,} bytes ({share:.2%}) are not part of a complete MAVLink frame"
+        notes.append(f"the receive time went back {_format_times(receipt_reversals)}")
+    lost_fraction = frames.bad_bytes / len(frames.content)
+    lost_text = (
+        f"{frames.bad_bytes:,} bytes ({lost_fraction:.2%}) are not part of a complete MAVLink frame"
+    )
     # An incomplete first and last frame are not damage
-    bytes_inside = frames.bad_bytes - 2 * LONGEST_FRAME
-    is_damaged = bytes_inside > DAMAGED_SHARE * len(frames.content)
-    damage = (f"the file is damaged: {lost}",) if is_damaged else ()
+    bytes_inside = frames.bad_bytes - 2 * MAX_FRAME_BYTES
+    is_damaged = bytes_inside > MAX_LOST_FRACTION * len(frames.content)
+    damage = (f"the file is damaged: {lost_text}",) if is_damaged else ()
     if frames.bad_bytes and not is_damaged:
-        notes.append(lost)
+        notes.append(lost_text)
     # Without a boot clock, time is receive time
-    span = stamps if len(stamps) else np.array([0.0, received.max()])
-    zero_s, end_s = float(span[0]), float(span[-1])
+    data_span_s = boot_s if len(boot_s) else np.array([0.0, received_s.max()])
+    zero_s, end_s = float(data_span_s[0]), float(data_span_s[-1])
     return Recording(
         frames,
         address,
         session,
-        received,
+        received_s,
         line,
         zero_s,
         end_s - zero_s,
@@ -310,23 +336,26 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     )
 
 
-def _times(count: int) -> str:
+def _format_times(count: int) -> str:
     return f"{count} time" if count == 1 else f"{count} times"
 
 
-def _remove_stray_stamps(stamps: Array, rows: IntArray) -> IntArray:
-    """Remove small groups at either end whose timestamps are far from all others."""
-    groups = np.split(rows, np.flatnonzero(np.diff(stamps[rows]) > OUTSIDE_S) + 1)
-    min_count = STRAY_SHARE * max(len(group) for group in groups)
-    large_groups = [number for number, group in enumerate(groups) if len(group) >= min_count]
+def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
+    """Remove small groups of timestamps at either end that are far from all others.
+
+    A group is small below MIN_GROUP_FRACTION of the largest group, and far beyond MAX_OUTSIDE_S.
+    """
+    groups = np.split(rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_OUTSIDE_S) + 1)
+    min_count = MIN_GROUP_FRACTION * max(len(group) for group in groups)
+    large_groups = [index for index, group in enumerate(groups) if len(group) >= min_count]
     return np.concatenate(groups[large_groups[0] : large_groups[-1] + 1])
 
 
-def unix_of_boot(recording: Recording) -> Line | None:
+def map_boot_to_unix(recording: Recording) -> Line | None:
     """Map the boot clock to UNIX time by SYSTEM_TIME; None if its UNIX time is not set."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
-    boot, unix = table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6
-    known = unix > UNIX_FROM_S
-    if not np.any(known):
+    boot_s, unix_s = table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6
+    is_known = unix_s > MIN_UNIX_TIME_S
+    if not np.any(is_known):
         return None
-    return fit_least_delay(boot[known], unix[known])
+    return fit_least_delay(boot_s[is_known], unix_s[is_known])

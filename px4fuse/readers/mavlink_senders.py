@@ -11,35 +11,35 @@ from px4fuse.errors import SettingsError
 from px4fuse.log import ClockMap, Sender
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import (
-    MAX_SPEED_DIFFERENCE,
+    MAX_RATE_DIFFERENCE,
     ClockMapping,
     Line,
     is_running_clock,
     map_clock,
 )
 from px4fuse.readers.mavlink_frames import Address, Frames
-from px4fuse.readers.mavlink_recording import RESTART_S, Recording, unix_of_boot
+from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
-# Only the senders with most messages are read and described
+# Number of senders that are read and described: those with most messages
 MAX_SENDERS = 32
-# Lost fraction above which the sequence numbers are not counted by the sender and are ignored
-MAX_LOST_SHARE = 0.9
-# Sequence numbers; a message this much late was received over a slower link, not lost
+# Lost fraction above which the sender does not count its messages; the numbers are then ignored
+MAX_LOST_FRACTION = 0.9
+# Sequence numbers; a message late by up to this number was received over a slower link, not lost
 MAX_LATE_MESSAGES = 16
-# s; timestamps of one sender that differ by more are from two clocks
-OTHER_CLOCK_S = 1e5
+# s; a larger difference between timestamps of one sender shows that they are from two clocks
+MAX_SAME_CLOCK_DISTANCE_S = 1e5
 
 
 def _vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
     """Return MAV_TYPE and MAV_AUTOPILOT from each sender's first heartbeat."""
     rows = frames.rows("HEARTBEAT")
-    beats = frames.table("HEARTBEAT", rows)
-    types = zip(beats["type"].tolist(), beats["autopilot"].tolist(), strict=True)
-    types_by_sender = [*zip(_addresses(frames, rows), types, strict=True)]
+    heartbeats = frames.table("HEARTBEAT", rows)
+    types = zip(heartbeats["type"].tolist(), heartbeats["autopilot"].tolist(), strict=True)
+    types_by_sender = [*zip(_read_addresses(frames, rows), types, strict=True)]
     return dict(types_by_sender[::-1])
 
 
-def _addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
+def _read_addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
     """Return the sender address of each frame."""
     return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
 
@@ -48,16 +48,18 @@ def _count_frames(
     frames: Frames, rows: IntArray | slice = slice(None)
 ) -> list[tuple[Address, int]]:
     """Count frames by sender, most frames first."""
-    counts = Counter(_addresses(frames, rows))
+    counts = Counter(_read_addresses(frames, rows))
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
 
-def _is_vehicle(kind: int, autopilot: int) -> bool:
-    return autopilot != messages.NO_AUTOPILOT and kind != messages.GROUND_STATION
+def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
+    return autopilot != messages.INVALID_AUTOPILOT and vehicle_type != messages.GROUND_STATION_TYPE
 
 
 def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
-    """Return address and name of the autopilot with most messages, or of a given system id.
+    """Return address and type of the autopilot with ``system`` as system id.
+
+    By default the autopilot with most messages is chosen.
 
     Raises
     ------
@@ -66,106 +68,124 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     """
     counts = dict(_count_frames(frames))
     vehicles = _vehicle_types(frames)
-    flying = [s for s in counts if s in vehicles and _is_vehicle(*vehicles[s])]
-    rows = np.concatenate([frames.rows(name) for name in messages.OWN_MESSAGES])
-    own = dict(_count_frames(frames, rows))
+    vehicle_addresses = [s for s in counts if s in vehicles and _is_vehicle(*vehicles[s])]
+    rows = np.concatenate([frames.rows(name) for name in messages.AUTOPILOT_MESSAGES])
+    autopilot_counts = dict(_count_frames(frames, rows))
     # Companion computers may have autopilot heartbeats, so messages that only autopilots send
     # count first. Without a heartbeat, these messages or the component id identify the autopilot
-    candidates = [s for s in flying if s in own] or [s for s in own if s not in vehicles] or flying
-    candidates = candidates or [s for s in counts if s[1] == messages.AUTOPILOT_COMPONENT]
+    candidates = (
+        [s for s in vehicle_addresses if s in autopilot_counts]
+        or [s for s in autopilot_counts if s not in vehicles]
+        or vehicle_addresses
+    )
+    candidates = candidates or [s for s in counts if s[1] == messages.AUTOPILOT_COMPONENT_ID]
     # The recording may contain no message from the autopilot itself
-    candidates = candidates or [(s[0], messages.AUTOPILOT_COMPONENT) for s in counts]
+    candidates = candidates or [(s[0], messages.AUTOPILOT_COMPONENT_ID) for s in counts]
     if system is not None:
-        candidates = [address for address in {*flying, *candidates} if address[0] == system]
+        candidates = [
+            address for address in {*vehicle_addresses, *candidates} if address[0] == system
+        ]
         if not candidates:
-            have = ", ".join(str(number) for number in sorted({s[0] for s in flying})) or "none"
+            system_ids = (
+                ", ".join(str(number) for number in sorted({s[0] for s in vehicle_addresses}))
+                or "none"
+            )
             raise SettingsError(
                 f"{frames.name}: no autopilot has MAVLink system id {system}. Autopilots in "
-                f"this file: {have}."
+                f"this file: {system_ids}."
             )
-    best = max(candidates, key=lambda address: counts.get(address, 0))
-    name = messages.AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
-    return best, name or "unknown autopilot"
+    best_address = max(candidates, key=lambda address: counts.get(address, 0))
+    name = messages.AUTOPILOTS.get(vehicles[best_address][1]) if best_address in vehicles else None
+    return best_address, name or "unknown autopilot"
 
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
-    """Return the senders of one message other than this vehicle's autopilot and other vehicles."""
-    frames, own = recording.frames, recording.address
-    others = {
+    """Return the senders of one message, without this vehicle's autopilot and other vehicles."""
+    frames, own_address = recording.frames, recording.address
+    other_vehicles = {
         s[0] for s, vehicle_type in _vehicle_types(frames).items() if _is_vehicle(*vehicle_type)
-    } - {own[0]}
+    } - {own_address[0]}
     counts = _count_frames(frames, recording.rows_of_all_senders(message))
-    return [s for s, _ in counts if s != own and s[0] not in others][:MAX_SENDERS]
+    return [s for s, _ in counts if s != own_address and s[0] not in other_vehicles][:MAX_SENDERS]
 
 
 def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
     """Map the clock of every sender of an external position to the boot clock."""
     message_names = {source.message for source in messages.POSITION_INPUTS}
     senders = {s for message in message_names for s in senders_of(recording, message)}
-    unix = unix_of_boot(recording)
-    return {sender: _map_sender(recording, sender, unix) for sender in sorted(senders)}
+    unix_line = map_boot_to_unix(recording)
+    return {sender: _map_sender_clock(recording, sender, unix_line) for sender in sorted(senders)}
 
 
-def _map_sender(recording: Recording, sender: Address, unix: Line | None) -> ClockMapping:
+def _map_sender_clock(
+    recording: Recording, sender: Address, unix_line: Line | None
+) -> ClockMapping:
     frames = recording.frames
-    stamps, received = [], []
+    timestamps_s, received_s = [], []
     for source in messages.POSITION_INPUTS:
         rows = recording.rows(source.message, sender)
-        stamps.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
-        received.append(recording.received_s[rows])
-    median_stamp_s = float(np.median(np.concatenate(stamps)))
-    clock_runs = is_running_clock(np.concatenate(stamps))
+        timestamps_s.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
+        received_s.append(recording.received_s[rows])
+    median_timestamp_s = float(np.median(np.concatenate(timestamps_s)))
+    has_running_clock = is_running_clock(np.concatenate(timestamps_s))
     rows = recording.rows("TIMESYNC", sender)
-    sync = frames.table("TIMESYNC", rows)
-    replied_s, sync_asked_s = sync["tc1"] * 1e-9, sync["ts1"] * 1e-9
+    timesync = frames.table("TIMESYNC", rows)
+    reply_s, request_s = timesync["tc1"] * 1e-9, timesync["ts1"] * 1e-9
     # Replies to another sender's request contain another clock
-    replies = (replied_s != 0.0) & (
-        np.abs(sync_asked_s - recording.receipt_boot_s(rows)) <= RESTART_S
+    is_reply = (reply_s != 0.0) & (
+        np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
     )
     # A TIMESYNC request gets its timestamp when it is sent, so it is hardly delayed
-    questions = (
-        clock_runs & (replied_s == 0.0) & (np.abs(sync_asked_s - median_stamp_s) < OTHER_CLOCK_S)
+    is_request = (
+        has_running_clock
+        & (reply_s == 0.0)
+        & (np.abs(request_s - median_timestamp_s) < MAX_SAME_CLOCK_DISTANCE_S)
     )
-    stamps.append(sync_asked_s[questions])
-    received.append(recording.received_s[rows][questions])
-    own = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
-    answered_s, question_s = own["tc1"] * 1e-9, own["ts1"] * 1e-9
-    answers = (answered_s != 0.0) & (np.abs(question_s - median_stamp_s) < OTHER_CLOCK_S)
-    answers &= ~np.isin(own["ts1"], _other_sync_questions(recording, sender))
+    timestamps_s.append(request_s[is_request])
+    received_s.append(recording.received_s[rows][is_request])
+    autopilot_timesync = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
+    answer_s, answered_request_s = (
+        autopilot_timesync["tc1"] * 1e-9,
+        autopilot_timesync["ts1"] * 1e-9,
+    )
+    is_answer = (answer_s != 0.0) & (
+        np.abs(answered_request_s - median_timestamp_s) < MAX_SAME_CLOCK_DISTANCE_S
+    )
+    is_answer &= ~np.isin(autopilot_timesync["ts1"], _requests_of_other_senders(recording, sender))
     return map_clock(
         f"system {sender[0]}, component {sender[1]}",
-        np.concatenate(stamps),
-        np.concatenate(received),
+        np.concatenate(timestamps_s),
+        np.concatenate(received_s),
         recording.boot_of_receipt,
-        (sync_asked_s[replies], replied_s[replies]),
-        (question_s[answers], answered_s[answers]),
-        unix,
+        (request_s[is_reply], reply_s[is_reply]),
+        (answered_request_s[is_answer], answer_s[is_answer]),
+        unix_line,
         has_receipt=frames.received_us is not None,
     )
 
 
-def _other_sync_questions(recording: Recording, sender: Address) -> NDArray[np.int64]:
+def _requests_of_other_senders(recording: Recording, sender: Address) -> NDArray[np.int64]:
     """Return ``ts1`` of the TIMESYNC requests of all other senders."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
-    sync = frames.table("TIMESYNC", rows[~frames.sent_by(sender, rows)])
-    return np.asarray(sync["ts1"][sync["tc1"] == 0])
+    timesync = frames.table("TIMESYNC", rows[~frames.sent_by(sender, rows)])
+    return np.asarray(timesync["ts1"][timesync["tc1"] == 0])
 
 
 def clock_maps(
     recording: Recording, clock_mappings: dict[Address, ClockMapping]
 ) -> tuple[ClockMap, ...]:
     """Return the maps from sender clocks and receive time to the boot clock."""
-    clocks = [sender.statement for sender in clock_mappings.values()]
+    clocks = [mapping.statement for mapping in clock_mappings.values()]
     received_us, line = recording.frames.received_us, recording.boot_of_receipt
     if received_us is not None and line.pairs:
         name = "receive time (UNIX time of the recording computer)"
         note = "the recording speed differs from real time (replayed link?)"
-        if abs(line.slope - 1.0) < MAX_SPEED_DIFFERENCE:
+        if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
             note = "from the messages with least delay; used only to order messages and map clocks"
         offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
-        numbers = line.pairs, offset_s, (line.slope - 1.0) * 1e6, line.jitter
-        clocks.append(ClockMap(name, "receive time", *numbers, note))
+        line_values = line.pairs, offset_s, (line.slope - 1.0) * 1e6, line.jitter
+        clocks.append(ClockMap(name, "receive time", *line_values, note))
     return tuple(clocks)
 
 
@@ -176,24 +196,26 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     for address, count in _count_frames(frames)[:MAX_SENDERS]:
         description = "no heartbeat"
         if address in vehicles:
-            kind, autopilot = vehicles[address]
-            description = messages.VEHICLE_TYPES.get(kind, f"type {kind}")
-            if autopilot != messages.NO_AUTOPILOT:
+            vehicle_type, autopilot = vehicles[address]
+            description = messages.VEHICLE_TYPES.get(vehicle_type, f"type {vehicle_type}")
+            if autopilot != messages.INVALID_AUTOPILOT:
                 description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
-        lost, chosen = _lost_share_of(frames, address), address == recording.address
-        sender_rows.append(Sender(*address, description, count, lost, chosen))
+        lost_fraction, is_chosen = _lost_fraction(frames, address), address == recording.address
+        sender_rows.append(Sender(*address, description, count, lost_fraction, is_chosen))
     return tuple(sender_rows)
 
 
-def _lost_share_of(frames: Frames, address: Address) -> float | None:
-    """Return the fraction of a sender's messages that are missing, by its sequence numbers.
+def _lost_fraction(frames: Frames, address: Address) -> float | None:
+    """Return the fraction of a sender's messages that are missing, from the sequence numbers.
 
     Repeated or slightly late messages are not lost. None if the sender does not count its
     messages, or counts them separately on two links.
     """
-    number = frames.sequence[frames.sent_by(address)].astype(np.int64)
-    step = np.mod(np.diff(number) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
-    place = np.append(0, np.cumsum(step))
-    share = float(1.0 - len(np.unique(place)) / (np.ptp(place) + 1))
-    counts = len(place) == 1 or bool(place.any())
-    return share if counts and share < MAX_LOST_SHARE else None
+    sequence = frames.sequence[frames.sent_by(address)].astype(np.int64)
+    step = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
+    unwrapped_sequence = np.append(0, np.cumsum(step))
+    lost_fraction = float(
+        1.0 - len(np.unique(unwrapped_sequence)) / (np.ptp(unwrapped_sequence) + 1)
+    )
+    is_counted = len(unwrapped_sequence) == 1 or bool(unwrapped_sequence.any())
+    return lost_fraction if is_counted and lost_fraction < MAX_LOST_FRACTION else None

@@ -1,4 +1,4 @@
-"""Reader of CSV files from positioning systems (UWB); keeps the clock and frame of the file.
+"""Reader of CSV files from positioning systems (UWB), in the clock and frame of the file.
 
 The documented format is a header and ``time, x, y, z`` in seconds and metres, optionally with
 ``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other separators, column names and units are detected.
@@ -32,15 +32,15 @@ MAX_FILE_BYTES = 500_000_000  # several days of UWB positions
 MIN_ROWS = 3
 # s; UWB systems have rates of 0.2 Hz to 200 Hz, with 10 % variation of the interval
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
-# s; tells UNIX time in s from a boot clock in µs, which has the same magnitude after half an hour
-MAX_UNIX_INTERVAL_S = 60.0
+# s; distinguishes UNIX time in s from a boot clock in µs, which half an hour after boot is as large
+MAX_UNIX_TIME_INTERVAL_S = 60.0
 # m; largest extent of an indoor flight
 MAX_SPREAD_M = 200.0
 MAX_COORDINATE = 1e9  # any length unit; larger values are timestamps or damage
-# The header is searched in this part of the file
-HEAD_LINES, HEAD_CHARS = 1000, 200_000
+# Beginning of the file in which the header is searched
+MAX_HEADER_LINES, MAX_HEADER_CHARS = 1000, 200_000
 MAX_COLUMNS = 200
-_COLUMNS = "`columns` TIME,X,Y,Z"
+_COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
 _SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
 
 
@@ -53,7 +53,7 @@ class PositionRecording:
     name : str
         File name without folder.
     sha256 : str
-        Hash of the file content.
+        SHA-256 hash of the file.
     size_bytes : int
     samples : DataFrame, shape (n, 6)
         ``x_m, y_m, z_m, sigma_x_m, sigma_y_m, sigma_z_m`` (m); NaN if not in the file. The index
@@ -86,39 +86,40 @@ class PositionRecording:
 class _Table:
     """Table in a text file: column names and rows."""
 
-    file: str
+    file_name: str
     separator: str
     names: list[str]  # of the columns
     body: str  # complete lines after the header
     header_line: int
 
     def label(self, *columns: int | None) -> str:
-        """Format the names of some columns for messages, without repetition."""
-        used_labels = dict.fromkeys(
+        """Format the different names of columns for messages; None is skipped."""
+        labels = dict.fromkeys(
             quote(self.names[at]) if self.names[at] else f"column {at + 1}"
             for at in columns
             if at is not None
         )
-        return ", ".join([*used_labels][:12]) + (", ..." if len(used_labels) > 12 else "")
+        return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
 
     def texts(self, columns: Iterable[int]) -> pd.DataFrame:
-        """Return the cells of some columns as text, without empty rows."""
-        used = sorted({*columns})
+        """Return the cells of columns as text, without empty rows."""
+        column_indices = sorted({*columns})
         try:
             texts = pd.read_csv(
                 io.StringIO(self.body),
                 sep=r"\s+" if self.separator == " " else self.separator,
                 header=None,
                 index_col=False,
-                names=range(used[-1] + 1),
-                usecols=used,
+                names=range(column_indices[-1] + 1),
+                usecols=column_indices,
                 dtype=str,
                 skipinitialspace=True,
                 quoting=csv.QUOTE_NONE,
             )
         except ValueError as error:
             raise LogError(
-                f"{self.file} contains no table of numbers.", "Export it as CSV again."
+                f"{self.file_name} contains no table of numbers.",
+                "Export the positions as CSV again.",
             ) from error
         return texts.dropna(how="all")
 
@@ -164,7 +165,7 @@ def read_position_csv(
     chosen_columns = _column_indices(table, columns or ())
     texts = table.texts([*chosen_columns, *(at for at, m in enumerate(meanings) if m.kind)])
     numbers = texts.apply(pd.to_numeric, errors="coerce").astype(np.float64)
-    time, position, sigma, frame, time_words = _choose_columns(
+    time, position, sigma, frame, time_text = _choose_columns(
         table, meanings, chosen_columns, numbers
     )
     axes = [at for at in position if at is not None]
@@ -172,7 +173,7 @@ def read_position_csv(
     is_usable = np.isfinite(numbers[time])
     is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
-        notes.insert(0, f"{_count_words(unusable_count)} dropped: no valid time or position")
+        notes.insert(0, f"{_format_row_count(unusable_count)} dropped: no valid time or position")
     for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
@@ -182,46 +183,46 @@ def read_position_csv(
                 "rows of one tag only"
             )
     numbers = numbers[is_usable]
-    ticks = numbers[time].to_numpy()
+    times = numbers[time].to_numpy()
     name_unit = meanings[time].unit
-    unit, unit_words = _time_unit(ticks, name_unit if name_unit in TIME_UNITS else "", time_unit)
-    seconds = ticks / round(1.0 / TIME_UNITS[unit])
-    usable = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
+    unit, unit_text = _time_unit(times, name_unit if name_unit in TIME_UNITS else "", time_unit)
+    seconds = times / round(1.0 / TIME_UNITS[unit])
+    usable_rows = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
     # Ranks instead of times, because times may be negative
-    ranks = np.unique(seconds[usable], return_inverse=True)[1].astype(np.int64)
-    keep = usable[longest_increasing_run(ranks + 1)]
-    if dropped := len(seconds) - len(keep):
+    ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
+    kept_rows = usable_rows[longest_increasing_run(ranks + 1)]
+    if dropped := len(seconds) - len(kept_rows):
         notes.append(
-            f"{_count_words(dropped)} dropped: timestamps repeat, go back or are out of range"
+            f"{_format_row_count(dropped)} dropped: timestamps repeat, go back or are out of range"
         )
-    if len(keep) < MIN_ROWS:
+    if len(kept_rows) < MIN_ROWS:
         raise LogError(
-            f"{table.file} contains {len(keep)} usable rows; at least {MIN_ROWS} are needed"
-            f"{''.join('; ' + note for note in notes)}",
-            f"Export it with decimal points, or name the columns with {_COLUMNS}.",
+            f"{table.file_name} contains {len(kept_rows)} usable rows; at least {MIN_ROWS} are "
+            f"needed{''.join('; ' + note for note in notes)}",
+            f"Export the file with decimal points, or name the columns with {_COLUMNS_OPTION}.",
         )
-    numbers = numbers.iloc[keep].set_index(pd.Index(seconds[keep], name="time_s"))
-    step = float(np.median(np.diff(numbers.index)))
-    if not MIN_INTERVAL_S <= step <= MAX_INTERVAL_S:
-        rate = f"one sample per {step:.3g} s (median)"
-        notes.append(f"{rate} is not a plausible UWB rate: check --position-time-unit")
-    scales, length_words = _length_units(numbers, axes, meanings, length_unit)
+    numbers = numbers.iloc[kept_rows].set_index(pd.Index(seconds[kept_rows], name="time_s"))
+    median_interval_s = float(np.median(np.diff(numbers.index)))
+    if not MIN_INTERVAL_S <= median_interval_s <= MAX_INTERVAL_S:
+        rate_text = f"one sample per {median_interval_s:.3g} s (median)"
+        notes.append(f"{rate_text} is not a plausible UWB rate: check --position-time-unit")
+    scales, length_text = _length_units(numbers, axes, meanings, length_unit)
     column_of_name = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
-    lengths = {
+    columns_m = {
         name: np.nan if at is None else numbers[at] * scales[at] for name, at in column_of_name
     }
-    samples = pd.DataFrame(lengths, index=numbers.index)
+    samples = pd.DataFrame(columns_m, index=numbers.index)
     samples = samples.where(np.isfinite(samples))
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
-    if rows := int(is_not_positive.any(axis=1).sum()):
-        notes.append(f"sigma is zero or negative in {rows} rows and was ignored there")
+    if bad_row_count := int(is_not_positive.any(axis=1).sum()):
+        notes.append(f"sigma is zero or negative in {bad_row_count} rows and was ignored there")
         samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
-    names = frame.upper() if frame else "x, y, z"
-    height = "" if len(axes) == 3 else " without height"
+    axis_names = frame.upper() if frame else "x, y, z"
+    height_text = "" if len(axes) == 3 else " without height"
     return PositionRecording(
-        name=table.file,
+        name=table.file_name,
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
         samples=samples,
@@ -231,8 +232,8 @@ def read_position_csv(
         detected=(
             f"table: {_SEPARATORS[table.separator]} between columns, header in line "
             f"{table.header_line}",
-            f"time: {time_words}, {clock} clock, in {unit_words}",
-            f"position: {table.label(*position)} as {names}{height}, in {length_words}",
+            f"time: {time_text}, {clock} clock, in {unit_text}",
+            f"position: {table.label(*position)} as {axis_names}{height_text}, in {length_text}",
             f"sigma: {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
@@ -249,15 +250,15 @@ def _check_options(
     ):
         if value is not None and value not in units:
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
-    titles = columns or ("1", "2", "3")
-    if "" in titles or not 3 <= len({*titles}) == len(titles) <= 5:
+    names = columns or ("1", "2", "3")
+    if "" in names or not 3 <= len({*names}) == len(names) <= 5:
         raise SettingsError(
-            f"{_COLUMNS}[,SIGMA]: {','.join(titles)!r} must name four or five different "
+            f"{_COLUMNS_OPTION}[,SIGMA]: {','.join(names)!r} must name four or five different "
             "columns (three without height)."
         )
 
 
-def _count_words(rows: int) -> str:
+def _format_row_count(rows: int) -> str:
     return "1 row was" if rows == 1 else f"{rows} rows were"
 
 
@@ -269,53 +270,53 @@ def _split_line(line: str, separator: str) -> list[str]:
 
 
 def _find_table(
-    file: str, content: bytes, columns: tuple[str, ...] | None
+    file_name: str, content: bytes, columns: tuple[str, ...] | None
 ) -> tuple[_Table, list[str]]:
-    """Find separator, header and first row; return also a note if the last line was dropped."""
+    """Find the table in a text file; return also a note if the last line was dropped."""
     text = decode_text(content)
     if text is None:
         raise LogError(
-            f"{file} is a binary file, not a text table",
+            f"{file_name} is a binary file, not a text table",
             "Give the CSV file of the positioning system. A flight log is given as LOG, without "
             "--position.",
         )
     notes = []
-    whole_lines, _, last = text.replace('"', "").rpartition("\n")
+    whole_lines, _, last_line = text.replace('"', "").rpartition("\n")
     text = f"{whole_lines}\n"
-    if last.strip():
+    if last_line.strip():
         notes.append("the last line was dropped: it has no line end and may be incomplete")
-    lines = text[: text.rfind("\n", 0, HEAD_CHARS) + 1].split("\n")[:HEAD_LINES]
+    lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     headers = (
         (at + 1, separator, names)
-        for at, line in enumerate(lines)
+        for at, header_line in enumerate(lines)
         for separator in _SEPARATORS
-        for names in [_split_line(line.strip("#% "), separator)]
+        for names in [_split_line(header_line.strip("#% "), separator)]
         if len(names) <= MAX_COLUMNS and _is_header(names, wanted_names)
     )
-    line, separator, names = next(headers, (0, "", []))
+    header_line, separator, names = next(headers, (0, "", []))
     if not names:
-        titles = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
+        title_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(
-            f"{file}: the first {len(lines)} lines contain no header with the columns "
-            f"{titles}. The first line is {quote(lines[0])}.",
-            f"Give a CSV file with a header, or name its columns with {_COLUMNS}.",
+            f"{file_name}: the first {len(lines)} lines contain no header with the columns "
+            f"{title_list}. The first line is {quote(lines[0])}.",
+            f"Give a CSV file with a header, or name its columns with {_COLUMNS_OPTION}.",
         )
-    body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", line)[line])
-    head = body[:HEAD_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
-    width = len(_split_line(head, separator))
-    if width > len(names):
+    body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", header_line)[header_line])
+    first_row = body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
+    row_width = len(_split_line(first_row, separator))
+    if row_width > len(names):
         raise LogError(
-            f"{file}: the header has {len(names)} columns, but the rows have {width}.",
-            "Export it with decimal points and a name for each column.",
+            f"{file_name}: the header has {len(names)} columns, but the rows have {row_width}.",
+            "Export the file with decimal points and a name for each column.",
         )
-    return _Table(file, separator, names, body, line), notes
+    return _Table(file_name, separator, names, body, header_line), notes
 
 
-def _is_header(fields: list[str], wanted: set[str]) -> bool:
+def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
     """Return True if the fields contain the wanted names, or else names of time and position."""
-    if wanted:
-        return wanted <= {name.casefold() for name in fields}
+    if wanted_names:
+        return wanted_names <= {name.casefold() for name in fields}
     meanings = [read_column_name(name) for name in fields]
     has_time = any(column.kind == "time" for column in meanings)
     return has_time and position_names.find_position(meanings) is not None
@@ -325,19 +326,21 @@ def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
     """Return the indices of the columns that the option names."""
     names = [name.casefold() for name in table.names]
     numbers = [str(at + 1) for at in range(len(names))]
-    found = []
+    indices = []
     for column in columns:
-        wanted = column.strip().casefold()
-        if wanted not in names + numbers:
+        wanted_name = column.strip().casefold()
+        if wanted_name not in names + numbers:
             raise SettingsError(
-                f"{table.file} has no column {quote(column)} (its columns are "
+                f"{table.file_name} has no column {quote(column)} (its columns are "
                 f"{table.label(*range(len(names)))})",
-                f"Name the columns with {_COLUMNS}.",
+                f"Name the columns with {_COLUMNS_OPTION}.",
             )
-        found.append((names if wanted in names else numbers).index(wanted))
-    if len({*found}) < len(found):
-        raise SettingsError(f"{_COLUMNS}: {quote(','.join(columns))} names one column twice.")
-    return found
+        indices.append((names if wanted_name in names else numbers).index(wanted_name))
+    if len({*indices}) < len(indices):
+        raise SettingsError(
+            f"{_COLUMNS_OPTION}: {quote(','.join(columns))} names one column twice."
+        )
+    return indices
 
 
 def _choose_columns(
@@ -348,26 +351,32 @@ def _choose_columns(
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
     """Choose the columns of time, position and sigma; return also frame and time description.
 
-    The option names them; otherwise their names select them. A filled column with the time of
-    measurement is preferred to the time of recording.
+    The columns that the option names are used, otherwise columns with known names. A column with
+    the time of measurement, unless empty, is preferred to the time of recording.
     """
     if chosen_columns:
-        time, words = chosen_columns[0], table.label(chosen_columns[0])
+        time, time_text = chosen_columns[0], table.label(chosen_columns[0])
         # The column names may contain the frame and so the order of the axes
         chosen_meanings = [
             m if at in chosen_columns[1:4] else ColumnMeaning() for at, m in enumerate(meanings)
         ]
-        found = position_names.find_position(chosen_meanings)
+        frame_and_position = position_names.find_position(chosen_meanings)
         position: _Columns = (*chosen_columns[1:4], None)[:3]
-        frame, position = found if found and {*found[1]} == {*position} else (None, position)
+        frame, position = (
+            frame_and_position
+            if frame_and_position and {*frame_and_position[1]} == {*position}
+            else (None, position)
+        )
     else:
-        times = [at for at, column in enumerate(meanings) if column.kind == "time"]
-        empty = numbers[times].fillna(0.0).eq(0.0).mean() >= 0.5
+        time_columns = [at for at, column in enumerate(meanings) if column.kind == "time"]
+        is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
         rank = position_names.TIME_KINDS.index
-        time, *other_times = sorted(times, key=lambda at: (bool(empty[at]), rank(meanings[at].key)))
-        words = table.label(time)
+        time, *other_times = sorted(
+            time_columns, key=lambda at: (bool(is_mostly_empty[at]), rank(meanings[at].key))
+        )
+        time_text = table.label(time)
         if other_times:
-            words += f", the {meanings[time].key} (not used: {table.label(*other_times)})"
+            time_text += f", the {meanings[time].key} (not used: {table.label(*other_times)})"
         frame, position = position_names.find_position(meanings) or (None, ())
     if position[2] is not None and numbers[position[2]].isna().all():
         position = (*position[:2], None)
@@ -376,56 +385,59 @@ def _choose_columns(
         if len(chosen_columns) > 4
         else position_names.find_sigma(meanings, frame)
     )
-    return time, position, sigma, frame, words
+    return time, position, sigma, frame, time_text
 
 
-def _time_unit(ticks: Array, name_unit: str, option: str | None) -> tuple[str, str]:
+def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, str]:
     """Return the unit of the time column and its description."""
     if option is not None:
         return option, f"{option} from --position-time-unit"
-    middle = float(np.median(ticks)) if len(ticks) else 0.0
-    if name_unit and abs(middle) * TIME_UNITS[name_unit] < UNIX_END_S:
+    median = float(np.median(times)) if len(times) else 0.0
+    if name_unit and abs(median) * TIME_UNITS[name_unit] < UNIX_END_S:
         return name_unit, f"{name_unit} from its name"
-    steps = np.diff(ticks)
+    steps = np.diff(times)
     steps = steps[steps > 0]
-    step = float(np.median(steps)) if len(steps) else 0.0
-    fits = []
+    median_step = float(np.median(steps)) if len(steps) else 0.0
+    plausible_units = []
     for unit, scale in TIME_UNITS.items():
-        is_unix = UNIX_START_S <= middle * scale < UNIX_END_S
-        if is_unix and step * scale <= MAX_UNIX_INTERVAL_S:
+        is_unix = UNIX_START_S <= median * scale < UNIX_END_S
+        if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
             return unit, f"{unit} from its magnitude"
-        if MIN_INTERVAL_S <= step * scale <= MAX_INTERVAL_S:
-            fits.append(unit)
-    if not fits:
+        if MIN_INTERVAL_S <= median_step * scale <= MAX_INTERVAL_S:
+            plausible_units.append(unit)
+    if not plausible_units:
         return "s", (
             "s assumed: no unit gives a plausible UWB rate (--position-time-unit overrides)"
         )
-    words = f"{fits[0]} from its interval of {step * TIME_UNITS[fits[0]]:.3g} s"
-    if fits[1:]:
-        words += f" ({fits[1]} is also possible: then give --position-time-unit)"
-    return fits[0], words
+    unit = plausible_units[0]
+    description = f"{unit} from its interval of {median_step * TIME_UNITS[unit]:.3g} s"
+    if plausible_units[1:]:
+        description += f" ({plausible_units[1]} is also possible: then give --position-time-unit)"
+    return unit, description
 
 
 def _length_units(
     numbers: pd.DataFrame, axes: list[int], meanings: Sequence[ColumnMeaning], option: str | None
 ) -> tuple[dict[int, float], str]:
-    """Return metres per unit of each column, and the description of the position's unit."""
+    """Return metres per unit of each column, and the description of the unit of the positions."""
     name_units = {at: m.unit for at, m in enumerate(meanings) if m.unit in LENGTH_UNITS}
     # Percentiles, because outliers must not determine the unit
     spreads = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
-    spread = float(spreads.max())
+    max_spread = float(spreads.max())
     unit, reason = "m", "no unit in the column names"
     if option is not None:
         unit, name_units, reason = option, {}, "from --position-unit"
-    elif used_labels := [name_units[at] for at in axes if at in name_units]:
-        unit, reason = used_labels[0], "from the column names"
-    elif MAX_SPREAD_M < spread <= MAX_SPREAD_M / LENGTH_UNITS["mm"]:
+    elif axis_units := [name_units[at] for at in axes if at in name_units]:
+        unit, reason = axis_units[0], "from the column names"
+    elif MAX_SPREAD_M < max_spread <= MAX_SPREAD_M / LENGTH_UNITS["mm"]:
         unit = "mm"
-        reason = f"{spread:.0f} m is too large for an indoor flight; if cm, give --position-unit"
-    elif spread > MAX_SPREAD_M:
+        reason = (
+            f"{max_spread:.0f} m is too large for an indoor flight; if cm, give --position-unit"
+        )
+    elif max_spread > MAX_SPREAD_M:
         reason = "assumed: no unit gives the size of an indoor flight; else give --position-unit"
     units = {at: name_units.get(at, unit) for at in map(int, numbers.columns)}
     scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
-    span = max(float(spreads[at]) * scales[at] for at in axes)
-    used = ", ".join(dict.fromkeys(units[at] for at in axes))
-    return scales, f"{used} ({reason}); 90 % of the positions within {span:.3g} m"
+    span_m = max(float(spreads[at]) * scales[at] for at in axes)
+    used_units = ", ".join(dict.fromkeys(units[at] for at in axes))
+    return scales, f"{used_units} ({reason}); 90 % of the positions within {span_m:.3g} m"

@@ -13,17 +13,21 @@ LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 Position = tuple[int, int, int | None]
 
 
-_WORDS = table(__file__, "position_names.toml", dict[str, dict[str, str]])
+_TABLE = table(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
-    {word: meaning for meaning, words in _WORDS[group].items() for word in words.split()}
+    {
+        word: meaning
+        for meaning, column_words in _TABLE[group].items()
+        for word in column_words.split()
+    }
     for group in ("units", "axes")
 )
-_ROLES = {role: {*words.split()} for role, words in _WORDS["roles"].items()}
+_ROLES = {role: {*column_words.split()} for role, column_words in _TABLE["roles"].items()}
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 _GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
-# (Frame, names of its axes in order); the first with both horizontal axes in the file is used
+# Frame and names of its axes; the first frame with both horizontal axes in the file is used
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),
@@ -35,7 +39,7 @@ _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Meaning of one column name; all "" if it is not known."""
+    """Meaning of one column name; all fields are "" for an unknown name."""
 
     kind: str = ""  # "time", "position", "sigma" or "tag"
     key: str = ""  # axis, or element of `TIME_KINDS`
@@ -47,27 +51,23 @@ def read_column_name(name: str) -> ColumnMeaning:
     """Return the kind, axis, unit and group that a column name contains."""
     plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
-    words = re.findall(r"[^\W_]+", plain_name)
-    unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
-    words = words[:-1] if unit else words
-    word_set = {*words}
+    column_words = re.findall(r"[^\W_]+", plain_name)
+    unit = _UNITS.get(column_words[-1], "") if len(column_words) > 1 else ""
+    column_words = column_words[:-1] if unit else column_words
+    word_set = {*column_words}
     if word_set & _ROLES["time"] and word_set <= _TIME_ROLES and unit not in LENGTH_UNITS:
         kinds = [bool(word_set & _ROLES["measured"]), not word_set & _ROLES["recorded"], True]
         return ColumnMeaning("time", TIME_KINDS[kinds.index(True)], unit)
     if word_set and word_set <= _ROLES["tag"]:
         return ColumnMeaning("tag")
-    name_parts: list[str] = []
-    for word in words:
+    parts: list[str] = []
+    for word in column_words:
         glued_match = (
             None if word in _ROLES["sigma"] | _ROLES["context"] else _GLUED_NAMES.fullmatch(word)
         )
-        name_parts += (
-            [name_part for name_part in glued_match.groups() if name_part]
-            if glued_match
-            else [word]
-        )
-    axes = [_AXES[name_part] for name_part in name_parts if name_part in _AXES]
-    other_parts = [name_part for name_part in name_parts if name_part not in _AXES]
+        parts += [part for part in glued_match.groups() if part] if glued_match else [word]
+    axes = [_AXES[part] for part in parts if part in _AXES]
+    other_parts = [part for part in parts if part not in _AXES]
     if (
         unit in TIME_UNITS
         or len(axes) > 1
@@ -82,23 +82,32 @@ def read_column_name(name: str) -> ColumnMeaning:
 
 
 def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Position] | None:
-    """Return frame and columns of the first position with three axes, or else without height."""
+    """Return frame and column indices of the position; None if there is no position.
+
+    The first position with three axes is preferred to a position without height.
+    """
     groups: dict[str, dict[str, int]] = {}
     for index, column in enumerate(meanings):
         if column.kind == "position":
             groups.setdefault(column.group, {}).setdefault(column.key, index)
-    for complete in (True, False):
+    for needs_height in (True, False):
         for axes in groups.values():
-            for frame, (first, second, third) in _FRAMES:
-                if first in axes and second in axes and (third in axes or not complete):
-                    return frame, (axes[first], axes[second], axes.get(third))
+            for frame, (first_axis, second_axis, third_axis) in _FRAMES:
+                if (
+                    first_axis in axes
+                    and second_axis in axes
+                    and (third_axis in axes or not needs_height)
+                ):
+                    return frame, (axes[first_axis], axes[second_axis], axes.get(third_axis))
     return None
 
 
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
-    """Return the sigma columns of the frame's axes; a sigma without axis is valid for all."""
+    """Return the sigma column of each axis of a frame; a sigma without axis is used for all."""
     # Reversed, so that the first of several columns with the same meaning is used
     sigmas = {m.key: at for at, m in [*enumerate(meanings)][::-1] if m.kind == "sigma"}
     axes = next(axes for name, axes in _FRAMES if name == frame)
-    both = zip(axes, "xyz", strict=True)
-    return tuple(sigmas.get(axis, sigmas.get(letter, sigmas.get(""))) for axis, letter in both)
+    axes_and_letters = zip(axes, "xyz", strict=True)
+    return tuple(
+        sigmas.get(axis, sigmas.get(letter, sigmas.get(""))) for axis, letter in axes_and_letters
+    )

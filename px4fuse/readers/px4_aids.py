@@ -29,53 +29,54 @@ def read_aids(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> dict[s
 
     ``enabled`` is the result of :func:`read_enabled_aids`. The topic ``estimator_aid_src`` of the
     aid is preferred: it contains each fusion attempt with time and result. The other topics repeat
-    a value until the next one; repeats are removed.
+    each value until the next fusion; repeated values are removed.
     """
-    found = {}
+    logs = {}
     for name, aid in AIDS.items():
         aid_enabled = enabled.get(name)
-        log = _read_own_topic(topics, aid, aid_enabled)
-        # The values of an aid that was never enabled are outdated or belong to another aid
+        log = _read_aid_topic(topics, aid, aid_enabled)
+        # The other topics contain outdated or foreign values of an aid that was never enabled
         if log is None and (name.startswith("ev_") if aid_enabled is None else aid_enabled.any()):
-            log = _read_last_values(topics, aid, aid_enabled)
+            log = _read_common_topics(topics, aid, aid_enabled)
         if log is not None:
-            found[name] = replace(log, parameters=aid.logged_parameters(topics.ekf2_parameters))
-    return found
+            logs[name] = replace(log, parameters=aid.logged_parameters(topics.ekf2_parameters))
+    return logs
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """Read one step function per aid: 1 while its fusion is enabled, otherwise 0.
 
-    From ``estimator_status_flags``, or the control bits of ``estimator_status`` in older logs.
+    The source is ``estimator_status_flags``, or the control bits of ``estimator_status`` in older
+    logs.
     """
     enabled, tables = {}, topics.of(px4.STATUS_FLAGS)
-    every = (*AIDS.values(), *DISTURBANCES.values())
-    named = {flag for aid in every for group in aid.flags for flag in group}
-    known = sorted(named.intersection(*tables)) if tables else []
-    if known:
+    all_aids = (*AIDS.values(), *DISTURBANCES.values())
+    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group}
+    logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
+    if logged_flags:
         flags = topics.primary_samples(
-            Layout(px4.STATUS_FLAGS, dict(zip(known, known, strict=True))), step=True
+            Layout(px4.STATUS_FLAGS, dict(zip(logged_flags, logged_flags, strict=True))), step=True
         )
-        for aid in every if len(flags) else ():
-            group = next((group for group in aid.flags if {*group} <= {*known}), None)
+        for aid in all_aids if len(flags) else ():
+            group = next((group for group in aid.flags if {*group} <= {*logged_flags}), None)
             if group is not None:
                 enabled[aid.name] = flags[list(group)].max(axis=1)
-    if not known and topics.find(px4.LAYOUTS["control_bits"]) is not None:
+    if not logged_flags and topics.find(px4.LAYOUTS["control_bits"]) is not None:
         bits = topics.primary_samples(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
-        for aid in every if len(bits) else ():
-            if aid.bit is not None:
-                on = bits.to_numpy().astype(np.int64) >> aid.bit & 1
-                enabled[aid.name] = pd.Series(on.astype(float), index=bits.index)
+        for aid in all_aids if len(bits) else ():
+            if aid.status_bit is not None:
+                is_enabled = bits.to_numpy().astype(np.int64) >> aid.status_bit & 1
+                enabled[aid.name] = pd.Series(is_enabled.astype(float), index=bits.index)
     return enabled
 
 
-def _read_own_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
+def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
     """Read an aid from its ``estimator_aid_src`` topic."""
     count = len(aid.axes)
-    at = [""] if count == 1 else [f"[{number}]" for number in range(count)]
+    elements = [""] if count == 1 else [f"[{number}]" for number in range(count)]
     columns = {
         f"{column_prefix}_{axis}": field_name + element
-        for axis, element in zip(aid.axes, at, strict=True)
+        for axis, element in zip(aid.axes, elements, strict=True)
         for column_prefix, field_name in (
             *((("observation", "observation"),) if aid.name in px4.WITH_OBSERVATION else ()),
             ("innovation", "innovation"),
@@ -88,69 +89,74 @@ def _read_own_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
     layout = Layout(f"estimator_aid_src_{aid.name}", columns)
     if topics.find(layout) is None:  # return early; reading an empty table takes time
         return None
-    frame = topics.primary_samples(layout).dropna()
+    samples = topics.primary_samples(layout).dropna()
     if enabled is not None and aid.name in px4.FLAG_ALWAYS_SET:
-        frame["fused"] = step_values_at(enabled, frame.index)
-    return _aid_log((layout.topic,), aid, frame, enabled)
+        samples["fused"] = step_values_at(enabled, samples.index)
+    return _make_aid_log((layout.topic,), aid, samples, enabled)
 
 
-def _read_last_values(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
+def _read_common_topics(
+    topics: Topics, aid: Aid, enabled: pd.Series[float] | None
+) -> AidLog | None:
     """Read an aid from the topics that contain the last value of all aids."""
-    gauss = aid.name == "mag_heading" and any(
-        "cs_mag" in one for one in topics.of(px4.STATUS_FLAGS)
+    is_in_gauss = aid.name == "mag_heading" and any(
+        "cs_mag" in table for table in topics.of(px4.STATUS_FLAGS)
     )
     layouts = (
         []
-        if gauss or not aid.fields
+        if is_in_gauss or not aid.fields
         else [
             tuple(
-                Layout(topic, _columns(what, aid, aid.fields))
-                for topic, what in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
+                Layout(topic, _columns(quantity, aid, aid.fields))
+                for topic, quantity in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
             )
         ]
     )
-    if aid.before:
-        both = _columns("innovation", aid, aid.before)
-        squares = (field.replace("innov", "innov_var") for field in aid.before)
-        both |= _columns("variance", aid, squares)
-        layouts.append((Layout(px4.OLD_INNOVATIONS, both),) * 2)
+    if aid.old_fields:
+        fields = _columns("innovation", aid, aid.old_fields)
+        variance_fields = (field.replace("innov", "innov_var") for field in aid.old_fields)
+        fields |= _columns("variance", aid, variance_fields)
+        layouts.append((Layout(px4.OLD_INNOVATIONS, fields),) * 2)
     for values, variances in layouts:
-        frame = topics.primary_samples(values, select=_drop_repeats)
+        samples = topics.primary_samples(values, select=_drop_repeats)
         if variances is not values:
             # The logger decimates each topic separately; S changes slowly
-            known = topics.primary_samples(variances).dropna()
-            frame = join_nearest(frame, known, JOIN_TOLERANCE_S)
-        excluded_count = len(frame) - len(frame := frame.dropna())
+            variance_samples = topics.primary_samples(variances).dropna()
+            samples = join_nearest(samples, variance_samples, JOIN_TOLERANCE_S)
+        excluded_count = len(samples) - len(samples := samples.dropna())
         if enabled is not None:
-            frame = frame[step_values_at(enabled, frame.index) > 0.0]
-        used = tuple(dict.fromkeys((values.topic, variances.topic)))
-        if (log := _aid_log(used, aid, frame, enabled, excluded_count)) is not None:
+            samples = samples[step_values_at(enabled, samples.index) > 0.0]
+        used_topics = tuple(dict.fromkeys((values.topic, variances.topic)))
+        if (log := _make_aid_log(used_topics, aid, samples, enabled, excluded_count)) is not None:
             return log
     return None
 
 
 def _drop_repeats(frame: pd.DataFrame) -> pd.DataFrame:
     """Remove repeated rows, and zeros, which mean "not fused yet"."""
-    known = frame.dropna()
-    first = known.iloc[:, 0]
-    return known[first.ne(first.shift()) & (first != 0.0)]
+    finite_frame = frame.dropna()
+    first_column = finite_frame.iloc[:, 0]
+    return finite_frame[first_column.ne(first_column.shift()) & (first_column != 0.0)]
 
 
 def _columns(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, str]:
     return {f"{name}_{axis}": field for axis, field in zip(aid.axes, fields, strict=True)}
 
 
-def _aid_log(
+def _make_aid_log(
     topics: tuple[str, ...],
     aid: Aid,
-    frame: pd.DataFrame,
+    samples: pd.DataFrame,
     enabled: pd.Series[float] | None,
     excluded_count: int = 0,
 ) -> AidLog | None:
-    """Build the record from rows with positive variance; reverse PX4's sign of innovations."""
-    frame = frame[(frame[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
-    negated = {one: -frame[one] for one in _columns("innovation", aid, aid.axes)}
+    """Build the log of an aid from rows with positive variance, with the innovations negated.
+
+    PX4 logs predicted minus measured. None without such rows.
+    """
+    samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
+    negated = {column: -samples[column] for column in _columns("innovation", aid, aid.axes)}
     aid_log = AidLog(
-        topics, aid.axes, frame.assign(**negated), enabled, excluded_count=excluded_count
+        topics, aid.axes, samples.assign(**negated), enabled, excluded_count=excluded_count
     )
-    return aid_log if len(frame) else None
+    return aid_log if len(samples) else None

@@ -15,30 +15,37 @@ from numpy.typing import ArrayLike
 
 from px4fuse import flight
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, settings_in_force
+from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
 from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout, expand_columns
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids, read_enabled_aids
-from px4fuse.readers.px4_innovations import innovations_of
+from px4fuse.readers.px4_innovations import innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
-VISION = "vehicle_visual_odometry"
-STATES = 22  # attitude, velocity, position, biases, magnetic fields; wind and terrain follow
+VISION_TOPIC = "vehicle_visual_odometry"
+STATE_COUNT = 22  # attitude, velocity, position, biases, magnetic fields; wind and terrain follow
 MAG_3D_BIT = 5  # filter_control_status_u, common.h
-ALL_FIELD_HZ = 10.0  # Hz; a faster topic is complete (EKF2 uses 14 samples per second)
-# IMU samples; distance to n + 0.5 within which EKF2 may round up or down
-HALF = 0.05
+MIN_COMPLETE_FIELD_HZ = 10.0  # a topic with a higher rate has all samples (EKF2 uses 14 per second)
+# IMU samples; closer to n + 0.5 EKF2 may round up or down
+MAX_HALF_DISTANCE = 0.05
 # s; longest interval between two rows of optical flow
-MAX_FLOW_S = 0.5
+MAX_FLOW_INTERVAL_S = 0.5
 # Horizontal aiding besides vision position
-OTHER_AIDING = ("gnss_pos", "gnss_vel", "optical_flow", "ev_vel", "aux_global_position", "airspeed")
+OTHER_HORIZONTAL_AIDS = (
+    "gnss_pos",
+    "gnss_vel",
+    "optical_flow",
+    "ev_vel",
+    "aux_global_position",
+    "airspeed",
+)
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
     "Record with SDLOG_PROFILE bit 0 (default). The topic is also missing if EKF2 had not started.",
 )
-_RESETS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
+_RESET_FIELDS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
     ("position", "z_reset_counter", ("", "", "delta_down_m")),
     ("velocity", "vxy_reset_counter", ("delta_north_m_s", "delta_east_m_s", "")),
@@ -51,16 +58,16 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     parameters = topics.log.parameters
     if parameters.get("EKF2_EN") == 0.0:
         return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
-    if (group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
+    if (estimator_group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
         return Unavailable(
             "EKF2",
-            f"SYS_MC_EST_GROUP is {group:.0f}, so another estimator was running",
+            f"SYS_MC_EST_GROUP is {estimator_group:.0f}, so another estimator was running",
             "Set SYS_MC_EST_GROUP to 2.",
         )
-    local = topics.read(px4.LOCAL_POSITION)
+    local_position = topics.read(px4.LOCAL_POSITION)
     if topics.find(px4.LOCAL_POSITION) is None:
         return Unavailable("EKF2", "vehicle_local_position is not logged", px4.DEFAULT_PROFILE)
-    state = local[Columns.STATE].dropna()
+    state = local_position[Columns.STATE].dropna()
     if state.empty:
         return Unavailable(
             "EKF2",
@@ -70,9 +77,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled = read_enabled_aids(topics)
     fusing = _read_fusing(topics, enabled)
-    gate = settings_in_force(parameters)[EV_POS.gate]
+    gate = effective_settings(parameters)[EV_POS.gate]
     aids = read_aids(topics, enabled)
-    innovations, innovation_topics = innovations_of(aids, fusing, gate)
+    innovations, innovation_topics = innovations_by_axis(aids, fusing, gate)
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
@@ -98,14 +105,14 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         innovations=innovations,
         innovation_topics=innovation_topics,
         fusing=fusing,
-        resets=read_resets(local),
+        resets=read_resets(local_position),
         instances=topics.primary,
         gate=gate,
         notes=tuple(notes),
         accelerometer_bias=_accelerometer_bias(topics, delayed),
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
-        record=_read_record(topics, delayed, local, enabled, step_s),
+        record=_read_record(topics, delayed, local_position, enabled, step_s),
         aids=aids,
     )
 
@@ -125,9 +132,10 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
 
 
 def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
-    """Read EKF2's state and variances at the fusion horizon, converted to one layout and unit.
+    """Read EKF2's state and variances at the fusion horizon, in the layout of all releases.
 
-    ``step_s`` is the prediction interval, for releases that store bias increments per prediction.
+    ``step_s`` is the prediction interval (s). It converts the biases of releases that store bias
+    increments per prediction.
     """
     topic, attitude = _state_vector(topics)
     if not topic:
@@ -138,8 +146,8 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
             f"the array lengths of {topic} are not known to px4fuse",
             "Report the PX4 version in a px4fuse issue.",
         )
-    states = [f"states[{i}]" for i in range(STATES)]
-    variances = [f"covariances[{i}]" for i in range(STATES - 4 + attitude)]
+    states = [f"states[{i}]" for i in range(STATE_COUNT)]
+    variances = [f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude)]
     raw = topics.primary_samples(
         Layout(topic, {name: name for name in states + variances})
     ).dropna()
@@ -154,7 +162,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
 
 
 def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
-    """Return the variances of position and velocity (m², m²/s²) that are all positive."""
+    """Return the variances of position (m²) and velocity (m²/s²); rows must be all positive."""
     if isinstance(delayed, Unavailable):
         return delayed
     variance = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
@@ -169,43 +177,48 @@ def target_step_s(topics: Topics) -> float:
 
 def _step_s(topics: Topics) -> float:
     """Return the prediction interval (s): a whole number of IMU samples (ImuDownSampler.cpp)."""
-    target = target_step_s(topics)
+    target_s = target_step_s(topics)
     imu = topics.read(px4.IMU)
     if len(imu) < 2:
-        return target
-    time = imu.index.to_numpy()
-    interval = float(np.median(np.diff(time)))
-    if interval >= target:
-        return target
+        return target_s
+    imu_s = imu.index.to_numpy()
+    interval_s = float(np.median(np.diff(imu_s)))
+    if interval_s >= target_s:
+        return target_s
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    known = topics.primary_samples(layout).index
-    return samples_per_step(target, interval, rows_of_timestamps(time, known)) * interval
+    step_ends_s = topics.primary_samples(layout).index
+    return (
+        samples_per_step(target_s, interval_s, rows_of_timestamps(imu_s, step_ends_s)) * interval_s
+    )
 
 
 def rows_of_timestamps(times_s: Array, known_s: ArrayLike) -> IntArray:
     """Return the rows of ``times_s`` whose time is in ``known_s``, rounded to 1 µs."""
-    wanted = np.rint(np.asarray(known_s, dtype=float) * 1e6)
-    return np.flatnonzero(np.isin(np.rint(times_s * 1e6), wanted))
+    known_us = np.rint(np.asarray(known_s, dtype=float) * 1e6)
+    return np.flatnonzero(np.isin(np.rint(times_s * 1e6), known_us))
 
 
 def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -> int:
     """Return the number of IMU samples per EKF2 prediction: the nearest whole number.
 
-    EKF2 rounds a mean of the measured intervals, so n + 0.5 may be rounded up or down. It is
-    rounded up here, unless the logged step ends (in IMU samples) fit the smaller number only.
+    EKF2 rounds a mean of the measured intervals, so n + 0.5 may be rounded up or down. This
+    function rounds up, unless only the smaller number is consistent with ``ends``, the logged ends
+    of predictions in IMU samples.
 
     >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
     (3, 3)
     >>> samples_per_step(0.010, 0.004, [0, 4, 6, 14])
     2
     """
-    exact = target_s / interval_s + 0.5
-    # Margin for timestamps in µs, so that rounding does not change the result
-    samples = max(int(exact + 1e-6), 1)
+    rounded_ratio = target_s / interval_s + 0.5
+    # The margin prevents that the rounding of timestamps to µs changes the result
+    samples = max(int(rounded_ratio + 1e-6), 1)
     gaps = np.diff(np.asarray(ends, dtype=float))
-    if samples > 1 and abs(exact - samples) < HALF and len(gaps):
-        fits, fewer = (np.mean(gaps % count == 0.0) > 0.9 for count in (samples, samples - 1))
-        return samples - int(fewer and not fits)
+    if samples > 1 and abs(rounded_ratio - samples) < MAX_HALF_DISTANCE and len(gaps):
+        fits_larger, fits_smaller = (
+            np.mean(gaps % count == 0.0) > 0.9 for count in (samples, samples - 1)
+        )
+        return samples - int(fits_smaller and not fits_larger)
     return samples
 
 
@@ -213,8 +226,8 @@ def _accelerometer_bias(
     topics: Topics, delayed: pd.DataFrame | Unavailable
 ) -> pd.DataFrame | Unavailable:
     """Read the accelerometer bias (m/s²) from estimator_sensor_bias or the state vector."""
-    if len(bias_topic := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
-        return bias_topic
+    if len(bias := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
+        return bias
     if isinstance(delayed, Unavailable) or delayed.empty:
         return flight.BIAS_NOT_LOGGED
     return delayed[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
@@ -227,8 +240,8 @@ def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
     prediction interval and the horizon is unavailable.
     """
     age_s = _publication_age_s(topics, _state_vector(topics)[0])
-    if len(age_s) and (lag := float(age_s.median())) > step_s:
-        return lag
+    if len(age_s) and (median_age_s := float(age_s.median())) > step_s:
+        return median_age_s
     return flight.HORIZON_NOT_LOGGED
 
 
@@ -236,9 +249,9 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     """Return the delay (s) from measurement to publication, indexed by measurement time (s)."""
     for table in topics.of(topic)[:1]:
         if "timestamp_sample" in table:
-            stamp_us = measurement_time_us(table)
-            times = pd.Index((stamp_us - topics.zero_us) * 1e-6, name="time_s")
-            age_us = table["timestamp"].astype(np.int64) - stamp_us
+            measured_us = measurement_time_us(table)
+            times = pd.Index((measured_us - topics.zero_us) * 1e-6, name="time_s")
+            age_us = table["timestamp"].astype(np.int64) - measured_us
             return pd.Series(age_us * 1e-6, index=times)
     return pd.Series(dtype=np.float64)
 
@@ -254,18 +267,18 @@ def _read_fusing(
             "estimator_status_flags and estimator_status are not logged",
             "Record with SDLOG_PROFILE bit 0 (default).",
         )
-    frame = pd.DataFrame({group: enabled[aid] for group, aid in vision.items()}).dropna()
+    flags = pd.DataFrame({group: enabled[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
-    if frame.empty:
+    if flags.empty:
         return Unavailable("EKF2 fusion flags", f"{topic} has no usable sample", "Record again.")
     topics.record_stream("ekf2_fusing", topic)
-    return frame
+    return flags
 
 
 def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
     """Read the resets of the published state from its counters (uint8, wrapping) and deltas."""
     resets = []
-    for quantity, counter, deltas in _RESETS:
+    for quantity, counter, deltas in _RESET_FIELDS:
         if counter not in local:
             continue
         for row in (np.flatnonzero(np.diff(local[counter].to_numpy()) != 0) + 1).tolist():
@@ -297,24 +310,24 @@ def _read_record(
     # once it has an origin (ekf_helper.cpp)
     if not usable_state[horizontal].to_numpy().any():
         usable_state[horizontal] = np.nan
-        altitude_m = _last(local, "ref_alt", 0.0)
+        altitude_m = _last_finite(local, "ref_alt", 0.0)
         usable_state["down_m"] += altitude_m
-    age_s = _publication_age_s(topics, VISION).sort_index()
+    age_s = _publication_age_s(topics, VISION_TOPIC).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,
         delayed=usable_state,
         per_step_biases=attitude == px4.QUATERNION_FILTER,
         other_aiding=tuple(
             AIDS[name].label.replace("external vision,", "vision")
-            for name in OTHER_AIDING
+            for name in OTHER_HORIZONTAL_AIDS
             if name in enabled and enabled[name].any()
         ),
         vision_age_s=age_s[~age_s.index.duplicated()],
         field_gauss=_read_field(topics, step_s),
         flow=_read_flow(topics, enabled),
-        latitude_deg=_last(local, "ref_lat", np.nan),
+        latitude_deg=_last_finite(local, "ref_lat", np.nan),
         altitude_m=altitude_m,
-        states={one: enabled[one] for one in DISTURBANCES if one in enabled},
+        states={name: enabled[name] for name in DISTURBANCES if name in enabled},
         height_bias={
             name: topics.primary_samples(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS.items()
@@ -323,71 +336,76 @@ def _read_record(
     )
 
 
-def _last(frame: pd.DataFrame, column: str, default: float) -> float:
+def _last_finite(frame: pd.DataFrame, column: str, default: float) -> float:
     """Return the last finite value of a column, or ``default``."""
-    known = frame[column].dropna().to_numpy() if column in frame else np.zeros(0)
-    return float(known[-1]) if len(known) else default
+    finite_values = frame[column].dropna().to_numpy() if column in frame else np.zeros(0)
+    return float(finite_values[-1]) if len(finite_values) else default
 
 
 def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the magnetic field from the better one of the two topics that contain it.
+    """Read the magnetic field from one of the two topics that contain it.
 
-    A topic with all samples is preferred, then one with EKF2's low-pass filtered innovation.
+    A topic with all samples is preferred, then a topic with EKF2's low-pass filtered innovation.
     """
-    fields_found = []
+    candidates = []
     for topic, name in px4.MAGNETOMETER:
-        measured = expand_columns({"forward_gauss right_gauss down_gauss": f"{name}[]"})
-        bias_topic = expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"})
-        frame = topics.primary_samples(Layout(topic, measured, bias_topic)).dropna()
-        if name == "observation":  # by the time that EKF2 takes it to be of
+        measured_columns = expand_columns({"forward_gauss right_gauss down_gauss": f"{name}[]"})
+        innovation_columns = expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"})
+        frame = topics.primary_samples(Layout(topic, measured_columns, innovation_columns)).dropna()
+        if name == "observation":  # undo EKF2's shift of the measurement times
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
             frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
-        fields_found.append(frame)
-    complete_fields = [
-        one for one in fields_found if len(one) > ALL_FIELD_HZ * topics.log.duration_s
+        candidates.append(frame)
+    complete = [
+        field for field in candidates if len(field) > MIN_COMPLETE_FIELD_HZ * topics.log.duration_s
     ]
-    filtered_fields = [one for one in fields_found if Columns.FIELD_INNOVATION[0] in one]
-    field_used = max(complete_fields or filtered_fields or fields_found, key=len)
+    with_innovation = [field for field in candidates if Columns.FIELD_INNOVATION[0] in field]
+    field = max(complete or with_innovation or candidates, key=len)
     bits = topics.read(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
-    if field_used.empty or bits.empty:
+    if field.empty or bits.empty:
         return pd.DataFrame()
-    flags = step_values_at(bits, field_used.index).astype(np.int64)
-    return field_used.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
+    flags = step_values_at(bits, field.index).astype(np.int64)
+    return field.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
 def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
-    """Read optical flow velocities: means between two rows, from EKF2's low-pass filter states."""
-    speed, interval, noise = (
-        topics.primary_samples(px4.LAYOUTS[f"flow_{part}"]).dropna()
-        for part in ("velocity", "interval", "noise")
+    """Compute mean optical flow velocities between two rows, from EKF2's low-pass filter states."""
+    velocity, interval, noise = (
+        topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
+        for quantity in ("velocity", "interval", "noise")
     )
     interval_s = float(interval["interval_us"].median()) * 1e-6
     if not interval_s > 0.0 or noise.empty:
         return pd.DataFrame()
-    times = speed.index.to_numpy()
-    # Over longer intervals the low pass has lost the earlier samples
-    row = np.flatnonzero((np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_S)) + 1
-    if FLOW.name in enabled:
-        row = row[step_values_at(enabled[FLOW.name], times[row]) > 0.0]
-    samples = np.rint((times[row] - times[row - 1]) / interval_s)
-    filter_memory = ((1.0 - flight.FLOW_SHARE) ** samples)[:, None]
-    low_passed = speed[["forward_m_s", "right_m_s"]].to_numpy()
-    forward, right = (
-        (low_passed[row] - filter_memory * low_passed[row - 1]) / (1.0 - filter_memory)
-    ).T
-    now = speed.iloc[row]
-    range2 = (now["newest_forward_m_s"] ** 2 + now["newest_right_m_s"] ** 2) / (
-        now["x_rad_s"] ** 2 + now["y_rad_s"] ** 2
+    times = velocity.index.to_numpy()
+    # After longer intervals the low pass no longer contains the earlier samples
+    rows = (
+        np.flatnonzero(
+            (np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_INTERVAL_S)
+        )
+        + 1
     )
+    if FLOW.name in enabled:
+        rows = rows[step_values_at(enabled[FLOW.name], times[rows]) > 0.0]
+    sample_count = np.rint((times[rows] - times[rows - 1]) / interval_s)
+    filter_memory = ((1.0 - flight.FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
+    low_passed = velocity[["forward_m_s", "right_m_s"]].to_numpy()
+    forward, right = (
+        (low_passed[rows] - filter_memory * low_passed[rows - 1]) / (1.0 - filter_memory)
+    ).T
+    velocity_rows = velocity.iloc[rows]
+    squared_range = (
+        velocity_rows["newest_forward_m_s"] ** 2 + velocity_rows["newest_right_m_s"] ** 2
+    ) / (velocity_rows["x_rad_s"] ** 2 + velocity_rows["y_rad_s"] ** 2)
     flow = pd.DataFrame(
         {
             "forward_m_s": forward,
             "right_m_s": right,
-            "samples": samples,
+            "samples": sample_count,
             "interval_s": interval_s,
-            "noise_m2_s2": range2 * np.interp(times[row], noise.index, noise["noise"]),
+            "noise_m2_s2": squared_range * np.interp(times[rows], noise.index, noise["noise"]),
         },
-        index=now.index,
+        index=velocity_rows.index,
     )
     return flow.replace(np.inf, np.nan).dropna()
 
@@ -398,5 +416,5 @@ def _attitude_variance(quaternion: Array, variance: Array) -> Array:
     δθ = 2 Im(δq ⊗ q*); correlations are not logged and assumed to be zero.
     """
     w, x, y, z = quaternion.T
-    turns = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
-    return np.asarray(4.0 * np.einsum("ijn,nj->ni", turns**2, variance))
+    error_per_quaternion = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
+    return np.asarray(4.0 * np.einsum("ijn,nj->ni", error_per_quaternion**2, variance))

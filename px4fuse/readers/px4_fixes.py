@@ -9,26 +9,26 @@ from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# s; times this close are the same fix (fixes are at least 0.05 s apart)
-SAME_FIX_S = 0.01
-# degrees; about 100 km
-NEAR_DEG = 1.0
+# s; times closer than this belong to the same fix (fixes are at least 0.05 s apart)
+MAX_SAME_FIX_S = 0.01
+# degrees, about 100 km; a larger distance from the logged latitude shows that the unit is m
+MAX_LATITUDE_DISTANCE_DEG = 1.0
 # s; candidate intervals of receivers, which send 4 to 20 fixes per second
 PERIODS_S = np.arange(0.05, 0.26, 0.0005)
-# s; tolerance of fix times on the receiver's time grid: EKF2's step and clock jitter
-ON_GRID_S = 0.006
-# Logged fixes needed to check the reconstruction
-MIN_KNOWN = 10
-# Number of intervals with n and with n + 1 periods that the estimate of the period needs
+# s; tolerance of fix intervals as multiples of the period: EKF2's step and clock jitter
+MAX_GRID_ERROR_S = 0.006
+# Minimum number of logged fixes to check the reconstruction
+MIN_LOGGED_FIXES = 10
+# Minimum number of intervals with n and with n + 1 periods, to estimate the period
 MIN_REPEATED_INTERVALS = 3
 # m; RMS limit of the reconstruction error, measured at fixes that are also logged
-EXACT_M = 0.1
+MAX_RECONSTRUCTION_ERROR_M = 0.1
 
 
 def read_unlogged_fixes(
     topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable
 ) -> pd.DataFrame:
-    """Read unlogged fixes from EKF2's GNSS innovation topics (PX4 v1.16 and newer).
+    """Read the fixes that are missing in ``gps`` from EKF2's GNSS topics (PX4 v1.16 and newer).
 
     ``gps`` contains the logged fixes. The logger drops fixes above its limit of 10 per second.
     """
@@ -36,26 +36,29 @@ def read_unlogged_fixes(
     if isinstance(ekf2, Unavailable) or not all(map(topics.find, layouts)):
         return pd.DataFrame()
     position, velocity = map(topics.primary_samples, layouts)
-    # Messages without a fix also have a row
+    # Rows that are neither fused nor rejected have no fix
     is_fix = position[["fused", "rejected"]].any(axis=1)
     position = position.loc[is_fix].drop(columns=["fused", "rejected"])
     # EKF2 shifts GNSS times back by half a prediction step (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
-    # Only if GNSS is the height reference: otherwise the observation includes EKF2's bias
+    # Unless GNSS is the height reference, the observed height includes EKF2's bias estimate
     height, reference = px4.LAYOUTS["fused_height"], topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0)
     if topics.find(height) and reference == 1.0:
         fixes = fixes.join(topics.primary_samples(height))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
-    at = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
-    distance_s = np.minimum(*(np.abs(gps.index.to_numpy()[at - k] - fixes.index) for k in (0, 1)))
+    next_row = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
+    distance_s = np.minimum(
+        *(np.abs(gps.index.to_numpy()[next_row - k] - fixes.index) for k in (0, 1))
+    )
     is_between_fixes = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
-    known, unlogged_fixes = (
-        fixes[distance_s <= SAME_FIX_S],
-        fixes[(distance_s > SAME_FIX_S) & is_between_fixes],
+    logged_fixes, unlogged_fixes = (
+        fixes[distance_s <= MAX_SAME_FIX_S],
+        fixes[(distance_s > MAX_SAME_FIX_S) & is_between_fixes],
     )
     # Before v1.16 the observation is a local position in m
     is_in_degrees = (
-        known["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median() < NEAR_DEG
+        logged_fixes["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median()
+        < MAX_LATITUDE_DISTANCE_DEG
     )
     return unlogged_fixes if is_in_degrees else pd.DataFrame()
 
@@ -63,11 +66,11 @@ def read_unlogged_fixes(
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Reconstruct fixes between the logged ones as EKF2 position plus innovation.
+    """Reconstruct unlogged fixes between logged fixes as EKF2 position plus innovation.
 
     An innovation belongs to the last fix before its log time (2 Hz up to v1.15). That fix is a
-    whole number n of receiver intervals after a logged fix. For n = 0 the fix is also logged; these
-    give the reconstruction error, and nothing is returned if it exceeds EXACT_M.
+    whole number n of receiver intervals after a logged fix. For n = 0 the fix is also logged, which
+    gives the reconstruction error. Nothing is returned if it exceeds MAX_RECONSTRUCTION_ERROR_M.
 
     Parameters
     ----------
@@ -86,26 +89,26 @@ def reconstruct_fixes(
     no_fixes = pd.DataFrame(columns=fixes.columns)
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
         return no_fixes, ()
-    found = with_gnss_innovations(ekf2).innovations
-    north, east = found["north"], found["east"]
+    gnss_innovations = with_gnss_innovations(ekf2).innovations
+    north, east = gnss_innovations["north"], gnss_innovations["east"]
     interval_s = _interval_s(fixes.index.to_numpy())
     if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
         return no_fixes, ()
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
-    times, rows = fixes.index.to_numpy(), north.index.to_numpy()
-    before = np.searchsorted(times, rows - delay_beyond_horizon_s) - 1
-    is_between_fixes = (before >= 0) & (before < len(times) - 1)
-    rows, before = rows[is_between_fixes], before[is_between_fixes]
-    intervals_passed = (rows - delay_beyond_horizon_s - times[before]) / interval_s
+    fix_s, innovation_s = fixes.index.to_numpy(), north.index.to_numpy()
+    previous_fix = np.searchsorted(fix_s, innovation_s - delay_beyond_horizon_s) - 1
+    is_between_fixes = (previous_fix >= 0) & (previous_fix < len(fix_s) - 1)
+    innovation_s, previous_fix = innovation_s[is_between_fixes], previous_fix[is_between_fixes]
+    intervals_passed = (innovation_s - delay_beyond_horizon_s - fix_s[previous_fix]) / interval_s
     # Skip innovations logged within one EKF2 step of a fix: their fix is ambiguous
     is_unambiguous = intervals_passed % 1.0 > ekf2.step_s / interval_s
-    rows, before, intervals_passed = (
-        rows[is_unambiguous],
-        before[is_unambiguous],
+    innovation_s, previous_fix, intervals_passed = (
+        innovation_s[is_unambiguous],
+        previous_fix[is_unambiguous],
         np.floor(intervals_passed[is_unambiguous]),
     )
-    fix_time_s = times[before] + intervals_passed * interval_s
-    fixes_found = pd.DataFrame(
+    fix_time_s = fix_s[previous_fix] + intervals_passed * interval_s
+    reconstructed = pd.DataFrame(
         {
             column: np.interp(
                 fix_time_s + delay_beyond_horizon_s,
@@ -119,35 +122,39 @@ def reconstruct_fixes(
         },
         index=pd.Index(fix_time_s, name="time_s"),
     )
-    known = intervals_passed == 0.0
-    error = (fixes_found - fixes[fixes_found.columns].to_numpy()[before])[known].dropna()
-    exact_m = float(np.sqrt(np.mean(error.to_numpy() ** 2))) if len(error) >= MIN_KNOWN else np.inf
-    fixes_found = fixes_found[~known].dropna()
-    fixes_found = fixes_found[~fixes_found.index.duplicated()]
-    if exact_m > EXACT_M or fixes_found.empty:
+    is_logged = intervals_passed == 0.0
+    error = (reconstructed - fixes[reconstructed.columns].to_numpy()[previous_fix])[
+        is_logged
+    ].dropna()
+    error_m = (
+        float(np.sqrt(np.mean(error.to_numpy() ** 2))) if len(error) >= MIN_LOGGED_FIXES else np.inf
+    )
+    reconstructed = reconstructed[~is_logged].dropna()
+    reconstructed = reconstructed[~reconstructed.index.duplicated()]
+    if error_m > MAX_RECONSTRUCTION_ERROR_M or reconstructed.empty:
         return no_fixes, ()
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
-            fixes_found[column] = np.interp(fixes_found.index, times, fixes[column])
-    return fixes_found, (
-        f"{len(fixes_found)} GNSS fixes that were not logged are reconstructed as EKF2 position "
-        f"plus innovation, with interpolated heights (RMS error {exact_m:.2f} m per axis at "
+            reconstructed[column] = np.interp(reconstructed.index, fix_s, fixes[column])
+    return reconstructed, (
+        f"{len(reconstructed)} GNSS fixes that were not logged are reconstructed as EKF2 position "
+        f"plus innovation, with interpolated heights (RMS error {error_m:.2f} m per axis at "
         f"{len(error)} logged fixes)",
     )
 
 
 def _interval_s(times: Array) -> float | None:
-    """Estimate the receiver's interval (s): the longest whose multiples are the logged intervals.
+    """Estimate the receiver's interval (s): the longest with the logged intervals as multiples.
 
     None if all logged intervals are the same multiple, because that multiple is then unknown.
     """
     gaps = np.diff(times)[:, None]
     grid_error_s = np.abs(gaps / PERIODS_S - np.round(gaps / PERIODS_S)) * PERIODS_S
     worst_error_s = np.percentile(grid_error_s, 98, axis=0)
-    fits = np.flatnonzero(worst_error_s <= ON_GRID_S)
-    if not len(fits):
+    fitting_periods = np.flatnonzero(worst_error_s <= MAX_GRID_ERROR_S)
+    if not len(fitting_periods):
         return None
-    longest_period_s = PERIODS_S[fits[-1]]
+    longest_period_s = PERIODS_S[fitting_periods[-1]]
     # Refine to the best fit near the longest period
     near_periods = np.flatnonzero(np.abs(PERIODS_S - longest_period_s) < 0.1 * longest_period_s)
     best_period_s = PERIODS_S[near_periods[np.argmin(worst_error_s[near_periods])]]

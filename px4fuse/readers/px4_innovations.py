@@ -1,4 +1,4 @@
-"""EKF2 innovations of a position source, per axis, from the logged EKF2 aids."""
+"""Innovations of a position source along each axis, from the logged EKF2 aids."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -7,14 +7,14 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import GNSS_POS, TABLE
+from px4fuse.ekf2_parameters import GNSS_POS, TABLES
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
 
 Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
 
 @dataclass(frozen=True)
-class FusedSource:
+class Ekf2Source:
     """Position source of EKF2: name, aids, and actions to enable and log them.
 
     ``height`` is the name of a separate height sensor, or "".
@@ -29,7 +29,7 @@ class FusedSource:
 
 
 VISION, GNSS, GNSS_AND_BAROMETER = (
-    msgspec.convert(TABLE["sources"][name], FusedSource)
+    msgspec.convert(TABLES["sources"][name], Ekf2Source)
     for name in ("vision", "gnss", "gnss_and_barometer")
 )
 
@@ -42,7 +42,7 @@ def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
     return bool(log.samples["fused"].any() if "fused" in log.samples else log.enabled is not None)
 
 
-def with_gnss_innovations(ekf2: Ekf2, source: FusedSource = GNSS) -> Ekf2:
+def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
     """Replace the innovations of external vision by those of GNSS."""
     enabled = {
         group: log.enabled
@@ -56,19 +56,21 @@ def with_gnss_innovations(ekf2: Ekf2, source: FusedSource = GNSS) -> Ekf2:
         columns = ["horizontal", "vertical", "yaw"]
         fusing = pd.DataFrame(enabled).ffill().bfill().reindex(columns=columns, fill_value=0.0)
     log = ekf2.aids.get("gnss_pos")
-    logged = {} if log is None else log.parameters
-    gate = logged.get(GNSS_POS.gate, GNSS_POS.default_gate)
-    found, topics = innovations_of(ekf2.aids, fusing, gate, source)
-    return replace(ekf2, innovations=found, innovation_topics=topics, fusing=fusing, gate=gate)
+    parameters = {} if log is None else log.parameters
+    gate = parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
+    innovations, topics = innovations_by_axis(ekf2.aids, fusing, gate, source)
+    return replace(
+        ekf2, innovations=innovations, innovation_topics=topics, fusing=fusing, gate=gate
+    )
 
 
-def innovations_of(
+def innovations_by_axis(
     aids: Mapping[str, AidLog],
     fusing: pd.DataFrame | Unavailable,
     gate: float,
-    source: FusedSource = VISION,
+    source: Ekf2Source = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
-    """Return the innovations per axis and their topics.
+    """Return the innovations along each axis and the topics that contain them.
 
     Parameters
     ----------
@@ -77,20 +79,20 @@ def innovations_of(
         Fusion flags, as in :class:`~px4fuse.flight.Ekf2`.
     gate : float
         Innovation gate (in √S), used if rejections are not logged.
-    source : FusedSource
+    source : Ekf2Source
     """
-    found: Innovations = {}
+    innovations: Innovations = {}
     used_topics: dict[str, None] = {}
     for axis in AXIS_NAMES:
         group = "vertical" if axis == "down" else "horizontal"
         sensor = (axis == "down" and source.height) or source.name
         log = aids.get(source.vertical if axis == "down" else source.horizontal)
-        frame = None if log is None else along(log, axis, gate)
+        axis_innovations = None if log is None else innovations_along(log, axis, gate)
         if isinstance(fusing, pd.DataFrame) and not fusing[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
             reason = f"EKF2 never fused {sensor} for {quantity} in this log"
             remedy = source.remedies[group]
-        elif log is None or frame is None or frame.empty:
+        elif log is None or axis_innovations is None or axis_innovations.empty:
             reason = (
                 f"no usable estimator_aid_src_{source.horizontal}, "
                 f"estimator_aid_src_{source.vertical}, estimator_innovations or ekf2_innovations "
@@ -98,17 +100,22 @@ def innovations_of(
             )
             remedy = source.to_log
         else:
-            found[axis] = frame
+            innovations[axis] = axis_innovations
             used_topics |= dict.fromkeys(log.topics)
             continue
-        found[axis] = Unavailable(f"EKF2 innovations, {axis}", reason, remedy)
-    return found, tuple(used_topics)
+        innovations[axis] = Unavailable(f"EKF2 innovations, {axis}", reason, remedy)
+    return innovations, tuple(used_topics)
 
 
-def along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
-    """Return the innovations of one axis; a rejection applies to all axes of the aid."""
+def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
+    """Return the fused and rejected innovations of an aid along one axis.
+
+    EKF2 rejects all axes of an aid together.
+    """
     samples = log.samples
-    nis = {one: samples[f"innovation_{one}"] ** 2 / samples[f"variance_{one}"] for one in log.axes}
+    nis = {
+        name: samples[f"innovation_{name}"] ** 2 / samples[f"variance_{name}"] for name in log.axes
+    }
     is_beyond_gate = pd.DataFrame(nis).max(axis=1) > gate**2
     frame = pd.DataFrame(
         {

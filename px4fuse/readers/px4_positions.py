@@ -10,7 +10,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
 from px4fuse.flight import (
     Columns,
     Ekf2,
@@ -33,10 +33,10 @@ from px4fuse.readers.ulog_topics import Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-# µs; a sample published this soon after its measurement time has the arrival time instead
-SAME_TIME_US = 100
-# Fraction of such samples above which a topic has arrival times
-ARRIVAL_SHARE = 0.9
+# µs; a sample with a smaller publication delay has the arrival time instead of measurement time
+MAX_ARRIVAL_DELAY_US = 100
+# Fraction of samples with arrival time above which the whole topic has arrival times
+MIN_ARRIVAL_FRACTION = 0.9
 # s; largest time difference of height and position: 2.5 cm error at a climb rate of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
 # Hz; a lower GNSS rate means that the logger decimated the fixes (receivers send 5 to 20 Hz)
@@ -51,20 +51,22 @@ def read_positions(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Read all external positions in order of preference, and the reasons for missing ones."""
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
-    # EKF2's observations have no orientation; a source with fused yaw counts as odometry
+    # EKF2's observations contain no orientation, so fused yaw shows that the source is odometry
     turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
-    found = [
+    tracks_and_missing = [
         *(_read_logged(topics, name) for name in px4.LOGGED),
         _read_ev_pos_aid(topics, turns),
         _reconstruct(topics, ekf2, turns),
         _read_gps(topics, ekf2),
     ]
-    missing = tuple(track for track in found if isinstance(track, Unavailable))
-    return sort_by_preference(track for track in found if isinstance(track, PositionTrack)), missing
+    missing = tuple(track for track in tracks_and_missing if isinstance(track, Unavailable))
+    return sort_by_preference(
+        track for track in tracks_and_missing if isinstance(track, PositionTrack)
+    ), missing
 
 
 def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
-    """Describe a missing position source; the default action is that of the ULog track."""
+    """Describe a missing position source; the default ``remedy`` is that of the ULog track."""
     remedy = remedy or px4.TRACKS[name].remedy
     return Unavailable(f"position source {name}", reason, remedy, source=name)
 
@@ -78,7 +80,7 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a track of the samples with valid position; unavailable if they are too few.
+    """Make a track of the samples with valid position; Unavailable with too few.
 
     Parameters
     ----------
@@ -100,28 +102,30 @@ def make_track(
     return PositionTrack(name=name, samples=samples, origin=origin, **track_fields)
 
 
-def _track(
+def _make_ulog_track(
     topics: Topics,
     name: str,
     samples: pd.DataFrame,
-    used: tuple[str, ...],
+    topic_names: tuple[str, ...],
     *,
     turns: bool = False,
-    **more: Any,
+    **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a ULog track; ``turns`` is True if it has an orientation that changes."""
+    """Make a ULog track; ``turns`` is True if the source has a changing orientation."""
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, turns=turns)
-    places = ("", "", "") if origin.aid is None else origin.aid.place
-    known = {
+    arm_parameters = ("", "", "") if origin.aid is None else origin.aid.lever_arm
+    default_fields = {
         "description": source.description,
-        "topics": used,
+        "topics": topic_names,
         "log": topics.log.name,
         "frame": "NED",
         "clock": AUTOPILOT_CLOCK,
-        "lever_arm_m": tuple(float(topics.ekf2_parameters.get(place, 0.0)) for place in places),
+        "lever_arm_m": tuple(
+            float(topics.ekf2_parameters.get(parameter, 0.0)) for parameter in arm_parameters
+        ),
     }
-    return make_track(name, samples, origin, **(known | more))
+    return make_track(name, samples, origin, **(default_fields | track_fields))
 
 
 def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
@@ -135,9 +139,9 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
         if field in samples and len(samples):
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
-        frame = "NED"  # rotated by EKF2, although the field still contains the original frame
+        frame = "NED"  # EKF2 rotates the positions, but the field contains the original frame
     orientation = read_orientation(samples)
-    return _track(
+    return _make_ulog_track(
         topics,
         name,
         samples,
@@ -158,7 +162,10 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     if "timestamp_sample" not in table:
         return None
     age_us = table["timestamp"].astype(np.int64) - table["timestamp_sample"].astype(np.int64)
-    if len(age_us) < MIN_TRACK_SAMPLES or np.mean(np.abs(age_us) <= SAME_TIME_US) < ARRIVAL_SHARE:
+    if (
+        len(age_us) < MIN_TRACK_SAMPLES
+        or np.mean(np.abs(age_us) <= MAX_ARRIVAL_DELAY_US) < MIN_ARRIVAL_FRACTION
+    ):
         return None
     return ClockMap(
         "sender timestamps",
@@ -167,28 +174,28 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
         0.0,
         0.0,
         0.0,
-        "PX4 replaced them by the arrival time: the clocks were not synchronised",
+        "PX4 replaced the timestamps by arrival times: the clocks were not synchronised",
     )
 
 
 def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable:
     layout = topics.find(px4.LAYOUTS["kept_horizontal"])
     if layout is None:
-        return unavailable(px4.KEPT_OBSERVATION, f"{px4.KEPT_OBSERVATION} is not logged")
-    samples, used = topics.primary_samples(layout), [layout.topic]
+        return unavailable(px4.FUSED_OBSERVATION, f"{px4.FUSED_OBSERVATION} is not logged")
+    samples, used_topics = topics.primary_samples(layout), [layout.topic]
     notes: tuple[str, ...] = ()
     vertical = topics.find(px4.LAYOUTS["kept_vertical"])
     if vertical is not None:
         samples, notes = _with_height(samples, topics.primary_samples(vertical))
-        used.append(vertical.topic)
+        used_topics.append(vertical.topic)
     # EKF2 subtracts its delay and half its prediction interval from the sender's timestamp
     # (estimator_interface.cpp)
     samples = _shift_times(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
-    return _track(
+    return _make_ulog_track(
         topics,
-        px4.KEPT_OBSERVATION,
+        px4.FUSED_OBSERVATION,
         samples,
-        tuple(used),
+        tuple(used_topics),
         turns=turns,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
@@ -202,15 +209,17 @@ def _shift_times(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
 def _with_height(
     samples: pd.DataFrame, height: pd.DataFrame
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Add the nearest height to each horizontal position; note how many have none.
+    """Add the nearest height to each horizontal position; note the number of missing heights.
 
     Both have the timestamp of one external vision sample, but the logger decimates each topic
     separately.
     """
     joined = join_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
     without_height = int(joined.pop("_found").isna().sum())
-    within = f"within {1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
-    note = f"{without_height} of {len(joined)} external vision positions have no height {within}"
+    limit_text = f"within {1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
+    note = (
+        f"{without_height} of {len(joined)} external vision positions have no height {limit_text}"
+    )
     return joined, (note,) if without_height else ()
 
 
@@ -240,7 +249,7 @@ def _reconstruct(
     notes: tuple[str, ...] = ()
     if "down_m" in tracks:
         samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
-    return _track(
+    return _make_ulog_track(
         topics,
         px4.RECONSTRUCTION,
         _shift_times(samples, _delay_s(topics)),
@@ -262,12 +271,12 @@ def project(
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
     difference = longitude - longitude_0
-    sine, cosine, along = np.sin(latitude), np.cos(latitude), np.cos(difference)
+    sine, cosine, cosine_difference = np.sin(latitude), np.cos(latitude), np.cos(difference)
     sine_0, cosine_0 = np.sin(latitude_0), np.cos(latitude_0)
-    angle = np.arccos(np.clip(sine_0 * sine + cosine_0 * cosine * along, -1.0, 1.0))
-    k = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
-    north = k * (cosine_0 * sine - sine_0 * cosine * along)
-    east = k * cosine * np.sin(difference)
+    angle = np.arccos(np.clip(sine_0 * sine + cosine_0 * cosine * cosine_difference, -1.0, 1.0))
+    arc_over_chord = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
+    north = arc_over_chord * (cosine_0 * sine - sine_0 * cosine * cosine_difference)
+    east = arc_over_chord * cosine * np.sin(difference)
     return north * EARTH_RADIUS_M, east * EARTH_RADIUS_M
 
 
@@ -278,12 +287,14 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
     """
     x, y = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
     latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
-    c = np.hypot(x, y)
+    angle = np.hypot(x, y)
     # sin(c)/c, with the limit 1 at the origin
-    share = np.sinc(c / np.pi)
+    sine_ratio = np.sinc(angle / np.pi)
     sine, cosine = np.sin(latitude_0), np.cos(latitude_0)
-    latitude = np.arcsin(np.cos(c) * sine + x * share * cosine)
-    longitude = longitude_0 + np.arctan2(y * share, cosine * np.cos(c) - x * sine * share)
+    latitude = np.arcsin(np.cos(angle) * sine + x * sine_ratio * cosine)
+    longitude = longitude_0 + np.arctan2(
+        y * sine_ratio, cosine * np.cos(angle) - x * sine * sine_ratio
+    )
     return np.degrees(latitude), np.degrees(longitude)
 
 
@@ -300,23 +311,24 @@ def _local_origin(topics: Topics) -> GeodeticPosition | None:
     return tuple(origin.iloc[-1].tolist())
 
 
-def project_to_ned(geo: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
+def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert latitude, longitude and altitude to north, east, down (m) from the origin.
 
     The default origin is the first sample.
     """
-    latitude, longitude, altitude = geo[GLOBAL_COLUMNS].to_numpy().T
+    latitude, longitude, altitude = global_positions[GLOBAL_COLUMNS].to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
     north, east = project(latitude, longitude, origin[:2])
-    place = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
-    return pd.DataFrame(place, index=geo.index)
+    ned = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
+    return pd.DataFrame(ned, index=global_positions.index)
 
 
 def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     """Read GNSS positions, with the measurement times that EKF2 assumes.
 
-    These are the timestamps minus EKF2_GPS_DELAY; since PX4 main of 2026 the measurement times of
-    the driver if they differ (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
+    The measurement times are the timestamps minus EKF2_GPS_DELAY. PX4 main of 2026 and newer uses
+    the measurement times of the driver if they differ from the timestamps (EKF2.cpp
+    UpdateGpsSample, estimator_interface.cpp).
     """
     layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
@@ -329,9 +341,9 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
     has_driver_times = GNSS_MODE in parameters and bool(
-        np.any(published_s - gps.index > SAME_TIME_US * 1e-6)
+        np.any(published_s - gps.index > MAX_ARRIVAL_DELAY_US * 1e-6)
     )
-    delay_ms = 0.0 if has_driver_times else settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
+    delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, measurement times of the receiver driver"
     if not has_driver_times:
         gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
@@ -347,7 +359,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
-    # Joined before the check, so that a damaged fix is dropped with its velocity
+    # The velocity is joined before the check, so that it is dropped together with a damaged fix
     samples = samples.assign(**_velocity(gps).set_axis(samples.index))
     samples = finite_rows(samples, Columns.POSITION)
     rate_hz, notes = sample_rate(samples), tuple[str, ...]()
@@ -369,10 +381,10 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
             f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
             f"estimator_aid_src_gnss_pos ({interpolated} with interpolated height)",
         )
-    more: dict[str, Any] = {}
+    track_fields: dict[str, Any] = {}
     if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # logged per receiver since v1.17
-        more["lever_arm_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
-    found = _track(
+        track_fields["lever_arm_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
+    track = _make_ulog_track(
         topics,
         px4.GPS_POSITION,
         samples,
@@ -381,15 +393,15 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         notes=notes,
         velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
         age_s=delay_ms * 1e-3,
-        **more,
+        **track_fields,
     )
-    if isinstance(found, Unavailable):
-        return found
-    return replace(found, origin=structs.replace(found.origin, is_automatic=fused_aid(ekf2)))
+    if isinstance(track, Unavailable):
+        return track
+    return replace(track, origin=structs.replace(track.origin, is_automatic=fused_aid(ekf2)))
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
-    """Return the barometer height as ``down_m`` with times minus ``delay_s``; None if too few."""
+    """Return the barometer height as ``down_m``, ``delay_s`` earlier; None if too few."""
     heights = altitude_m[np.isfinite(altitude_m)]
     if len(heights) < MIN_TRACK_SAMPLES:
         return None
@@ -408,30 +420,30 @@ def read_truth(
 ) -> Truth | Unavailable:
     """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
-    Up to v1.13 it has only latitude and longitude. If EKF2 fused GNSS, EKF2's origin differs from
-    that of the simulation, so the ground truth is shifted to EKF2's origin.
+    Up to v1.13 the simulation logs only latitude and longitude. If EKF2 fused GNSS, EKF2's origin
+    differs from that of the simulation, so the ground truth is shifted to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
-    logged = topics.read(px4.LAYOUTS["truth_local"])
-    local = finite_rows(logged, logged.columns.tolist())
-    geo = finite_rows(topics.read(px4.LAYOUTS["truth_global"]), GLOBAL_COLUMNS[:2])
+    logged_local = topics.read(px4.LAYOUTS["truth_local"])
+    local = finite_rows(logged_local, logged_local.columns.tolist())
+    global_positions = finite_rows(topics.read(px4.LAYOUTS["truth_global"]), GLOBAL_COLUMNS[:2])
     if len(local):
-        if len(geo) and fused_aid(ekf2):
-            local = _move_to_origin(local, project_to_ned(geo, _local_origin(topics)))
+        if len(global_positions) and fused_aid(ekf2):
+            local = _move_to_origin(local, project_to_ned(global_positions, _local_origin(topics)))
         return Truth(px4.LAYOUTS["truth_local"].topic, local, attitude)
-    if len(geo):
-        velocity = geo.reindex(columns=Columns.VELOCITY)
-        samples = project_to_ned(geo, _local_origin(topics)).join(velocity)
+    if len(global_positions):
+        velocity = global_positions.reindex(columns=Columns.VELOCITY)
+        samples = project_to_ned(global_positions, _local_origin(topics)).join(velocity)
         return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
-    captured = motion_capture(positions, "vehicle_mocap_odometry")
-    if captured is None and len(logged):
+    mocap_truth = motion_capture(positions, "vehicle_mocap_odometry")
+    if mocap_truth is None and len(logged_local):
         return Unavailable(
             "ground truth",
             f"{px4.LAYOUTS['truth_local'].topic} has no sample with finite positions and "
             "velocities below 1e9 m and m/s",
             "Check the simulation that writes the ground truth.",
         )
-    return captured or Unavailable(
+    return mocap_truth or Unavailable(
         "ground truth",
         "the log has neither simulation ground truth nor motion capture",
         "On real flights, send motion capture as ATT_POS_MOCAP.",
@@ -442,14 +454,16 @@ def _move_to_origin(local: pd.DataFrame, global_samples: pd.DataFrame) -> pd.Dat
     """Shift local positions to the origin of ``global_samples`` by the median difference."""
     moved_samples = local.copy()
     for column in Columns.POSITION:
-        at = np.interp(global_samples.index, local.index, local[column], left=np.nan, right=np.nan)
-        shift = (global_samples[column] - at).median()
+        local_at_global = np.interp(
+            global_samples.index, local.index, local[column], left=np.nan, right=np.nan
+        )
+        shift = (global_samples[column] - local_at_global).median()
         moved_samples[column] += shift if np.isfinite(shift) else 0.0
     return moved_samples
 
 
 def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
-    """Return motion capture as ground truth if external vision exists besides it; else None."""
+    """Return motion capture as ground truth if there is external vision, too; else None."""
     if any(track.origin.is_vision for track in positions):
         for track in positions:
             if track.topics[0] == topic:

@@ -22,8 +22,8 @@ from px4fuse.record import table
 class TrackSource:
     """Position track that a ULog may contain; its key is the name for ``--position-source``.
 
-    ``kind`` and ``path`` define its origin, ``remedy`` is the action to log it, and ``layouts``
-    are the layouts of its topic, if it has one.
+    ``kind`` and ``path`` define the origin of the track, ``remedy`` is the action to log the
+    track, and ``layouts`` are the layouts of its topic, if any.
     """
 
     kind: str
@@ -38,12 +38,12 @@ class TrackSource:
         return find_origin(self.kind, self.path)
 
 
-_ROWS = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
-LAYOUTS = expand_layouts(_ROWS["layouts"])
-TRACKS = msgspec.convert(_ROWS["tracks"], dict[str, TrackSource])
-FRAMES = msgspec.convert(_ROWS["frames"], dict[str, dict[int, str]], strict=False)
-NAV_STATES = msgspec.convert(_ROWS["nav_states"], dict[int, str], strict=False)
-UNUSED: Mapping[str, str] = _ROWS["unused"]
+_TABLE = table(__file__, "px4_topics.toml", dict[str, dict[str, Any]])
+LAYOUTS = expand_layouts(_TABLE["layouts"])
+TRACKS = msgspec.convert(_TABLE["tracks"], dict[str, TrackSource])
+FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=False)
+NAV_STATES = msgspec.convert(_TABLE["nav_states"], dict[int, str], strict=False)
+UNUSED: Mapping[str, str] = _TABLE["unused"]
 IMU, LOCAL_POSITION = LAYOUTS["imu"], LAYOUTS["local_position"]
 HEIGHT_BIAS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
 # Action for topics that the default logging profile contains
@@ -55,8 +55,8 @@ MAGNETOMETER = (
     ("vehicle_magnetometer", "magnetometer_ga"),
     ("estimator_aid_src_mag", "observation"),
 )
-# (number of states, number of variances): number of attitude variances, before velocity and
-# position. 4: quaternion filter, whose biases are increments per prediction; 3: error-state filter
+# Number of attitude variances by the numbers of states and of variances in the log. 4: quaternion
+# filter, whose biases are increments per prediction; 3: error-state filter
 # (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)
 ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
@@ -67,7 +67,7 @@ ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
 QUATERNION_FILTER = 4
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 # Names for ``--position-source``: EKF2's observations, reconstruction from innovations, GNSS
-KEPT_OBSERVATION = "estimator_aid_src_ev_pos"
+FUSED_OBSERVATION = "estimator_aid_src_ev_pos"
 RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
 # Tracks of external vision and motion capture with a logged topic

@@ -14,8 +14,8 @@ from px4fuse.errors import TrajectoryError
 
 # s; valid UNIX times are between 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# A file with a control character in this part is binary; NUL is searched in the whole file
-_SNIFFED_CHARS = 100_000
+# A file with a control character in its first characters, or NUL anywhere, is binary
+_CHECKED_CHARS = 100_000
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks, written by Windows shells
 _CONTROL = re.compile("[\x00-\x08\x0e-\x1b]")
 _NUMBER = re.compile(
@@ -37,7 +37,7 @@ def decode_text(content: bytes) -> str | None:
             text = content.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = content.decode("latin-1")
-    if "\0" in text or _CONTROL.search(text, 0, _SNIFFED_CHARS):
+    if "\0" in text or _CONTROL.search(text, 0, _CHECKED_CHARS):
         return None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
@@ -67,36 +67,36 @@ class Rows:
 
     Attributes
     ----------
-    file : str
+    file_name : str
         File name for messages.
     lines : list of (int, str)
         Line number in the file, and text of the line.
     """
 
-    file: str
+    file_name: str
     lines: list[tuple[int, str]] = field(default_factory=list)
 
     def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
         """Return an error that names the line of a row."""
         return TrajectoryError(
-            format_line_error(self.file, self.lines[row][0], description, remedy)
+            format_line_error(self.file_name, self.lines[row][0], description, remedy)
         )
 
-    def raise_where(self, bad: BoolArray, description: str, remedy: str) -> None:
+    def raise_where(self, is_invalid: BoolArray, description: str, remedy: str) -> None:
         """Raise TrajectoryError for the first row in which the mask (n,) or (n, k) is True."""
-        bad_places = np.argwhere(bad)
-        if len(bad_places):
-            raise self.row_error(int(bad_places[0, 0]), description, remedy)
+        invalid_indices = np.argwhere(is_invalid)
+        if len(invalid_indices):
+            raise self.row_error(int(invalid_indices[0, 0]), description, remedy)
 
     def parse(
         self, words: int, values: int, separator: str | None = None
     ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
-        """Parse rows with columns of words, then columns of numbers; ``#`` begins a comment.
+        """Parse rows of word columns followed by number columns; ``#`` begins a comment.
 
         Parameters
         ----------
         words, values : int
-            Number of columns of each.
+            Number of word columns and of number columns.
         separator : str, optional
             White space by default.
 
@@ -108,7 +108,7 @@ class Rows:
         Raises
         ------
         TrajectoryError
-            A row has other columns; the message names the first one.
+            A row does not have these columns; the message names the first such row.
         """
         texts = [text for _, text in self.lines]
         columns = [("words", "U80", (words,)), ("values", "f8", (values,))]
@@ -121,7 +121,7 @@ class Rows:
                 and all(is_number(field_text.strip()) for field_text in fields[words:])
                 for fields in row_fields
             )
-            row = next((row for row, good in enumerate(is_valid) if not good), 0)
+            row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
             description = f"{quote(texts[row])} is not {words + values} columns of numbers"
             raise self.row_error(row, description, "Correct or remove that line.") from error
         return table["words"], np.ascontiguousarray(table["values"])

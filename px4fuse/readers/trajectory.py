@@ -22,29 +22,32 @@ from px4fuse.reading import display_name, read_bytes_limited
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
-COLUMNS = 8
-MAX_USUAL_STEP_S = 10.0
+TUM_COLUMNS = 8
+MAX_USUAL_INTERVAL_S = 10.0
 EUROC_COLUMNS = (8, 17)  # pose only, or also velocity and biases of gyro and accelerometer
-# s; key frames may be minutes apart, but frame rates are below 1 kHz
+# s; plausible median intervals: key frames may be minutes apart, frame rates are below 1 kHz
 MAX_INTERVAL_S, MIN_INTERVAL_S = 1000.0, 1e-3
-PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
+UNITS_PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
 MAX_NORM_ERROR = 0.1
-MAX_VALUE = 1e9  # larger values are timestamps or damage
-UNIT_NORM = 1e-15  # smaller norm errors stay, so that a written file is read back identically
-MAX_REPEATED = 0.01  # fraction of repeated timestamps; more means that digits are missing
-IDENTITY_M, IDENTITY_RAD = 1e-6, 1e-6
-# Level motion: extent (RMS) in the third principal direction over the second, second over first,
-# and tilt of the third direction against y
-MAX_THICKNESS, MIN_WIDTH, MAX_TILT_RAD = 1 / 3, 0.1, math.radians(20.0)
-# A regular frame rate: fraction of intervals, and their relative deviation from the median
-REGULAR_SHARE, REGULAR_WITHIN = 0.9, 0.5
-GAP_INTERVALS, GAP_S = 2.5, 0.3
+MAX_COORDINATE_M = 1e9  # larger values are timestamps or damage
+# Smaller deviations from norm 1 are not corrected, so that a file is read exactly as written
+UNIT_NORM_TOLERANCE = 1e-15
+MAX_REPEATED_FRACTION = (
+    0.01  # fraction of repeated timestamps; a larger fraction shows missing digits
+)
+MAX_IDENTITY_M, MAX_IDENTITY_RAD = 1e-6, 1e-6
+# Limits of level motion: extent (RMS) along the third principal axis over that along the second,
+# second over first, and angle between the third axis and y
+MAX_THICKNESS_RATIO, MIN_WIDTH_RATIO, MAX_TILT_RAD = 1 / 3, 0.1, math.radians(20.0)
+# A frame rate is regular if this fraction of intervals is this close to the median (relative)
+MIN_REGULAR_FRACTION, MAX_INTERVAL_DEVIATION = 0.9, 0.5
+MIN_GAP_INTERVALS, MIN_GAP_S = 2.5, 0.3
 
 _TUM = "TUM (time x y z qx qy qz qw)"
 _EUROC = "EuRoC (time, x, y, z, qw, qx, qy, qz with commas)"
 # Matches "q_RS_w []" and "qw"
-_NAME_OF_AXIS = re.compile(r"\bq(?:\w*_)?([wxyz])\b")
-_TRUTH = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])", re.IGNORECASE)
+_QUATERNION_NAME = re.compile(r"\bq(?:\w*_)?([wxyz])\b")
+_TRUTH_WORDS = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])", re.IGNORECASE)
 _REMEDY = f"Export the trajectory as {_TUM}, in seconds."
 
 
@@ -74,35 +77,35 @@ def read_trajectory(path: str | Path) -> Trajectory:
     content = read_bytes_limited(
         path, TrajectoryError, MAX_FILE_BYTES, empty_remedy="Export it again"
     )
-    rows, comments, truncation_note = _rows(name, content)
-    first = rows.lines[0][1].partition("#")[0]
-    separator, columns = ("," if "," in first else None), len(_fields(first))
-    if columns not in ((COLUMNS,) if separator is None else EUROC_COLUMNS):
+    rows, comments, truncation_note = _split_rows(name, content)
+    first_row = rows.lines[0][1].partition("#")[0]
+    separator, columns = ("," if "," in first_row else None), len(_fields(first_row))
+    if columns not in ((TUM_COLUMNS,) if separator is None else EUROC_COLUMNS):
         raise rows.row_error(
             0,
-            f"{columns} columns; TUM has {COLUMNS} separated by blanks, EuRoC {EUROC_COLUMNS[0]} "
-            f"or {EUROC_COLUMNS[1]} separated by commas",
+            f"the line has {columns} columns; TUM has {TUM_COLUMNS} separated by blanks, EuRoC "
+            f"{EUROC_COLUMNS[0]} or {EUROC_COLUMNS[1]} separated by commas",
             _REMEDY,
         )
-    w_first, words = _quaternion_order(rows, separator, comments)
-    stamps, values = rows.parse(1, columns - 1, separator)
-    time, time_words = _stamps_in_seconds(rows, stamps[:, 0].tolist())
-    problem = f"a value is not finite, or above {MAX_VALUE:.0e}"
-    rows.raise_where(~(np.abs(values[:, :7]) < MAX_VALUE), problem, "Remove that line.")
-    position, rotation = values[:, :3], _read_rotation(rows, values[:, 3:7], w_first)
-    keep, dropped = _increasing_rows(rows, time)
-    time, position, rotation = time[keep], position[keep], rotation[keep]
-    kind, kind_words = _detect_kind(path, columns, comments, position, rotation)
-    frame, frame_words = _detect_frame(kind, position)
+    is_w_first, format_name = _detect_quaternion_order(rows, separator, comments)
+    timestamps, values = rows.parse(1, columns - 1, separator)
+    time, time_note = _convert_timestamps(rows, timestamps[:, 0].tolist())
+    fault = f"a value is not finite, or above {MAX_COORDINATE_M:.0e}"
+    rows.raise_where(~(np.abs(values[:, :7]) < MAX_COORDINATE_M), fault, "Remove that line.")
+    position, rotation = values[:, :3], _read_rotation(rows, values[:, 3:7], is_w_first)
+    is_kept, dropped_note = _increasing_rows(rows, time)
+    time, position, rotation = time[is_kept], position[is_kept], rotation[is_kept]
+    kind, kind_note = _detect_kind(path, columns, comments, position, rotation)
+    frame, frame_note = _detect_frame(kind, position)
     is_unix = UNIX_START_S <= time[0] < UNIX_END_S
-    clock = "its timestamps are UNIX time" if is_unix else "its timestamps are not UNIX time"
+    clock_text = "its timestamps are UNIX time" if is_unix else "its timestamps are not UNIX time"
     reader_notes = (
-        f"Recognised as {words}; {clock}.",
-        time_words,
-        kind_words,
-        frame_words,
-        dropped,
-        _gap_words(time, kind),
+        f"Recognised as {format_name}; {clock_text}.",
+        time_note,
+        kind_note,
+        frame_note,
+        dropped_note,
+        _describe_gaps(time, kind),
         truncation_note,
     )
     return Trajectory(
@@ -143,34 +146,40 @@ def tum_text(trajectory: Trajectory) -> str:
     return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n"
 
 
-def _rows(name: str, content: bytes) -> tuple[Rows, str, str]:
-    """Return rows of numbers, comments with header, and a note on an incomplete last row."""
+def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
+    """Split a file into numeric rows, comments with header, and a note on an incomplete row."""
     text = decode_text(content)
     if text is None:
         is_ulog = content.startswith(b"ULog")
-        what = "a PX4 log" if is_ulog else "a binary file"
+        fault = "a PX4 log" if is_ulog else "a binary file"
         remedy = f"Choose a track of the log: {name}:vio or {name}:ekf2." if is_ulog else _REMEDY
-        raise TrajectoryError(f"{name}: {what}, not a trajectory file", remedy)
+        raise TrajectoryError(f"{name}: {fault}, not a trajectory file", remedy)
     lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     comments = [line for _, line in lines if line.lstrip().startswith("#")]
-    data = [row for row in lines if not row[1].lstrip().startswith("#")]
-    if len(data) > 1 and not _is_numeric_row(data[0][1]) and _is_numeric_row(data[1][1]):
-        comments.append(data.pop(0)[1])  # header without #
-    if data and not _is_numeric_row(data[0][1]):
-        what = f"not a trajectory file: its first line is {quote(data[0][1])}"
-        raise TrajectoryError(f"{name}: {what}", _REMEDY)
+    numeric_rows = [row for row in lines if not row[1].lstrip().startswith("#")]
+    if (
+        len(numeric_rows) > 1
+        and not _is_numeric_row(numeric_rows[0][1])
+        and _is_numeric_row(numeric_rows[1][1])
+    ):
+        comments.append(numeric_rows.pop(0)[1])  # header without #
+    if numeric_rows and not _is_numeric_row(numeric_rows[0][1]):
+        fault = f"not a trajectory file: its first line is {quote(numeric_rows[0][1])}"
+        raise TrajectoryError(f"{name}: {fault}", _REMEDY)
     truncation_note = ""
-    is_short = len(data) > 1 and len(_fields(data[-1][1])) < len(_fields(data[0][1]))
+    is_short = len(numeric_rows) > 1 and len(_fields(numeric_rows[-1][1])) < len(
+        _fields(numeric_rows[0][1])
+    )
     if is_short and not text.endswith("\n"):
-        truncation_note = f"The last line ({data[-1][0]}) was dropped: it is incomplete."
-        data.pop()
-    if len(data) < MIN_POSES:
+        truncation_note = f"The last line ({numeric_rows[-1][0]}) was dropped: it is incomplete."
+        numeric_rows.pop()
+    if len(numeric_rows) < MIN_POSES:
         raise TrajectoryError(
-            f"{name} contains {len(data)} poses; at least {MIN_POSES} are needed",
+            f"{name} contains {len(numeric_rows)} poses; at least {MIN_POSES} are needed",
             "Export the trajectory again. The file is almost empty if SLAM lost tracking at the "
             "start.",
         )
-    return Rows(name, data), "\n".join(comments), truncation_note
+    return Rows(name, numeric_rows), "\n".join(comments), truncation_note
 
 
 def _fields(line: str) -> list[str]:
@@ -183,54 +192,66 @@ def _is_numeric_row(line: str) -> bool:
     return all(is_number(field.strip()) for field in _fields(line))
 
 
-def _quaternion_order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]:
+def _detect_quaternion_order(rows: Rows, separator: str | None, comments: str) -> tuple[bool, str]:
     """Return True if w is the first quaternion component, and the name of the format.
 
     Without a header, blanks mean TUM, and commas with UNIX time in nanoseconds mean EuRoC.
     """
-    order = "".join(_NAME_OF_AXIS.findall(comments.casefold())[-4:])
-    w_first = order == "wxyz"
+    order = "".join(_QUATERNION_NAME.findall(comments.casefold())[-4:])
+    is_w_first = order == "wxyz"
     if order not in ("wxyz", "xyzw") and separator is not None:
-        first = _fields(rows.lines[0][1])
-        has_header = any(len(line.split(",")) == len(first) for line in comments.split("\n"))
-        w_first = not has_header and float(first[0]) * 1e-9 >= UNIX_START_S
-        if not w_first:
+        first_row = _fields(rows.lines[0][1])
+        has_header = any(len(line.split(",")) == len(first_row) for line in comments.split("\n"))
+        is_w_first = not has_header and float(first_row[0]) * 1e-9 >= UNIX_START_S
+        if not is_w_first:
             raise rows.row_error(
                 0,
                 "the position of the quaternion's w is unknown: the header does not name it",
                 "Add the line '#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z' with the columns in "
                 "their order.",
             )
-    if w_first == (separator is not None):
-        return w_first, _EUROC if w_first else _TUM
-    order = "blanks, quaternion w first" if w_first else "commas, quaternion w last"
-    return w_first, f"columns separated by {order}, according to the header"
+    if is_w_first == (separator is not None):
+        return is_w_first, _EUROC if is_w_first else _TUM
+    order = "blanks, quaternion w first" if is_w_first else "commas, quaternion w last"
+    return is_w_first, f"columns separated by {order}, according to the header"
 
 
-def _stamps_in_seconds(rows: Rows, stamps: list[str]) -> tuple[Array, str]:
-    """Convert the timestamps to s; return also a note if their unit is not seconds."""
-    bad = np.array([not is_number(one.strip()) or not np.isfinite(float(one)) for one in stamps])
-    rows.raise_where(bad, "column 1 is not a time", "Correct or remove that line.")
-    values = np.array(stamps, dtype=np.float64)
-    step = float(np.median(np.abs(np.diff(values))))
-    if step <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
+def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
+    """Convert the timestamps to s; return also a note if their unit is not certainly seconds."""
+    is_invalid = np.array(
+        [not is_number(text.strip()) or not np.isfinite(float(text)) for text in timestamps]
+    )
+    rows.raise_where(is_invalid, "column 1 is not a time", "Correct or remove that line.")
+    values = np.array(timestamps, dtype=np.float64)
+    median_interval = float(np.median(np.abs(np.diff(values))))
+    if median_interval <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
         interval_note = (
-            f"The timestamps are read as seconds, with an interval of {step:.0f} s. Check that "
-            "they are not milliseconds."
+            f"The timestamps are read as seconds, with an interval of {median_interval:.0f} s. "
+            "Check that they are not milliseconds."
         )
-        return values, interval_note if step >= MAX_USUAL_STEP_S else ""
-    for unit, per_second in PER_SECOND.items():
-        first, last = float(values[0]) / per_second, float(np.abs(values).max()) / per_second
-        # Times that are not UNIX times are known in nanoseconds only (ORB-SLAM3)
-        is_known = first >= UNIX_START_S or unit == "nanoseconds"
-        if is_known and last < UNIX_END_S and MIN_INTERVAL_S <= step / per_second <= MAX_INTERVAL_S:
-            ticks = np.array([int(Decimal(stamp)) for stamp in stamps], dtype=np.int64)
-            words = f"Its timestamps are {unit} and were divided by {per_second:.0e}."
+        return values, interval_note if median_interval >= MAX_USUAL_INTERVAL_S else ""
+    for unit, units_per_second in UNITS_PER_SECOND.items():
+        first, last = (
+            float(values[0]) / units_per_second,
+            float(np.abs(values).max()) / units_per_second,
+        )
+        # Only nanoseconds are accepted for times that are not UNIX time (ORB-SLAM3 writes these)
+        is_accepted = first >= UNIX_START_S or unit == "nanoseconds"
+        if (
+            is_accepted
+            and last < UNIX_END_S
+            and MIN_INTERVAL_S <= median_interval / units_per_second <= MAX_INTERVAL_S
+        ):
+            counts = np.array([int(Decimal(timestamp)) for timestamp in timestamps], dtype=np.int64)
+            unit_note = f"Its timestamps are {unit} and were divided by {units_per_second:.0e}."
             # Divided in two parts, because float64 cannot represent UNIX time in ns
-            return ticks // per_second + ticks % per_second / per_second, words
+            return (
+                counts // units_per_second + counts % units_per_second / units_per_second,
+                unit_note,
+            )
     raise TrajectoryError(
-        f"{rows.file}: the median interval of the timestamps, {step:.3g}, is not valid in any unit "
-        "from seconds to nanoseconds",
+        f"{rows.file_name}: the median interval of the timestamps, {median_interval:.3g}, is not "
+        "valid in any unit from seconds to nanoseconds",
         "Give timestamps in seconds.",
     )
 
@@ -239,25 +260,25 @@ def _increasing_rows(rows: Rows, time: Array) -> tuple[BoolArray, str]:
     """Return a mask without repeated timestamps, and a note on the dropped rows."""
     steps = np.diff(time, prepend=-np.inf)
     remedy = "Sort the lines by time, or separate the recordings."
-    rows.raise_where(steps < 0.0, "its timestamp is before that of the line above", remedy)
-    repeated = int((steps == 0.0).sum())
-    if repeated > MAX_REPEATED * len(steps):
-        what = (
-            f"its timestamp equals that of the line above, as in {repeated} of {len(steps)} lines"
-        )
+    fault = "the timestamp is before that of the line above"
+    rows.raise_where(steps < 0.0, fault, remedy)
+    repeated_count = int((steps == 0.0).sum())
+    if repeated_count > MAX_REPEATED_FRACTION * len(steps):
+        lines = f"{repeated_count} of {len(steps)} lines"
+        fault = f"the timestamp is the same as in the line above, as in {lines}"
         remedy = "Export the timestamps with all digits (%.9f)."
-        rows.raise_where(steps == 0.0, what, remedy)
-    note = f"Dropped poses with a repeated timestamp: {repeated}." if repeated else ""
+        rows.raise_where(steps == 0.0, fault, remedy)
+    note = f"Dropped poses with a repeated timestamp: {repeated_count}." if repeated_count else ""
     return steps > 0.0, note
 
 
-def _read_rotation(rows: Rows, quaternion: Array, w_first: bool) -> Rotation:
+def _read_rotation(rows: Rows, quaternion: Array, is_w_first: bool) -> Rotation:
     norms = np.linalg.norm(quaternion, axis=1)
-    what = "columns 5 to 8 are not a quaternion: its norm is not 1"
+    fault = "columns 5 to 8 are not a quaternion: its norm is not 1"
     remedy = f"Remove that line, or check the order of the columns. {_REMEDY}"
-    rows.raise_where(np.abs(norms - 1.0) > MAX_NORM_ERROR, what, remedy)
-    norms[np.abs(norms - 1.0) < UNIT_NORM] = 1.0
-    quaternion = np.roll(quaternion, -1, axis=1) if w_first else quaternion
+    rows.raise_where(np.abs(norms - 1.0) > MAX_NORM_ERROR, fault, remedy)
+    norms[np.abs(norms - 1.0) < UNIT_NORM_TOLERANCE] = 1.0
+    quaternion = np.roll(quaternion, -1, axis=1) if is_w_first else quaternion
     return Rotation(quaternion / norms[:, None], normalize=False)
 
 
@@ -271,9 +292,9 @@ def _detect_kind(
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
     for source, text in text_by_source.items():
-        if _TRUTH.search(text):
+        if _TRUTH_WORDS.search(text):
             return "truth", f"Ground truth, according to {source}."
-    if np.abs(position[0]).max() < IDENTITY_M and rotation[0].magnitude() < IDENTITY_RAD:
+    if np.abs(position[0]).max() < MAX_IDENTITY_M and rotation[0].magnitude() < MAX_IDENTITY_RAD:
         return "slam", "SLAM: the first pose is the identity, so the world is the first key frame."
     return "unknown", ""
 
@@ -283,34 +304,34 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     if kind != "slam":
         return "unknown", ""
     centred = position - position.mean(axis=0)
-    spread, axes = np.linalg.eigh(centred.T @ centred)  # ascending
-    thin, width, length = np.sqrt(np.maximum(spread, 0.0) / len(position))
+    eigenvalues, axes = np.linalg.eigh(centred.T @ centred)  # ascending
+    height, width, length = np.sqrt(np.maximum(eigenvalues, 0.0) / len(position))
     tilt = math.acos(min(1.0, abs(float(axes[1, 0]))))
-    is_level = width > MIN_WIDTH * length and thin < MAX_THICKNESS * width
+    is_level = width > MIN_WIDTH_RATIO * length and height < MAX_THICKNESS_RATIO * width
     if not is_level or tilt > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (
         "Camera frame (x right, y down, z forward): the motion is level, "
-        f"with an extent of {length:.2g}, {width:.2g} and {thin:.2g} m (RMS). Its vertical is "
+        f"with an extent of {length:.2g}, {width:.2g} and {height:.2g} m (RMS). The vertical is "
         f"{math.degrees(tilt):.0f}° from y."
     )
 
 
-def _gap_words(time: Array, kind: Kind) -> str:
-    """Return a note on missing frames or on an irregular rate (key frames); "" if none."""
-    steps = np.diff(time)
-    median = float(np.median(steps))
-    near: BoolArray = np.abs(steps - median) <= REGULAR_WITHIN * median
-    if near.mean() < REGULAR_SHARE:
-        interval = f"interval {median:.3g} s (median), {steps.max():.3g} s (maximum)"
-        return f"Poses have no regular rate ({interval}): key frames only, or many poses lost."
-    gaps = np.flatnonzero(steps > max(GAP_INTERVALS * median, GAP_S))
+def _describe_gaps(time: Array, kind: Kind) -> str:
+    """Return a note on missing frames or an irregular rate (key frames); "" if all are regular."""
+    intervals_s = np.diff(time)
+    median_s = float(np.median(intervals_s))
+    is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s
+    if is_regular.mean() < MIN_REGULAR_FRACTION:
+        interval_text = f"interval {median_s:.3g} s (median), {intervals_s.max():.3g} s (maximum)"
+        return f"Poses have no regular rate ({interval_text}): key frames only, or many poses lost."
+    gaps = np.flatnonzero(intervals_s > max(MIN_GAP_INTERVALS * median_s, MIN_GAP_S))
     if not len(gaps):
         return ""
-    lost = steps[gaps] - median
-    missing = int((np.rint(steps[gaps] / median) - 1).sum())
-    longest = time[gaps[np.argmax(lost)]] - time[0]
-    what = "Tracking lost" if kind == "slam" else "No poses"
-    several = f"in {len(gaps)} gaps, the longest " if len(gaps) > 1 else ""
-    where = f"{several}at {longest:.1f} s after the start"
-    return f"{what} for {lost.sum():.1f} s {where}, {missing} frames missing."
+    lost_s = intervals_s[gaps] - median_s
+    missing_count = int((np.rint(intervals_s[gaps] / median_s) - 1).sum())
+    longest_start_s = time[gaps[np.argmax(lost_s)]] - time[0]
+    event = "Tracking lost" if kind == "slam" else "No poses"
+    longest_text = f"in {len(gaps)} gaps, the longest " if len(gaps) > 1 else ""
+    location = f"{longest_text}at {longest_start_s:.1f} s after the start"
+    return f"{event} for {lost_s.sum():.1f} s {location}, {missing_count} frames missing."

@@ -6,7 +6,7 @@ from msgspec import structs
 
 from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.flight import MODES_NOT_LOGGED, Columns, Flight, FlightMode, Truth, Unavailable
-from px4fuse.log import Unused
+from px4fuse.log import UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
@@ -16,7 +16,7 @@ from px4fuse.readers.ulog_topics import Topics, dropped_note, longest_increasing
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 # s; longer intervals between IMU samples count as missing data
-IMU_GAP_S = 0.2
+MIN_IMU_GAP_S = 0.2
 # s; valid UTC of a receiver: PX4's GPS_EPOCH_SECS (gps_helper.h) to 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
@@ -32,9 +32,11 @@ def read_ulog(name: str, content: bytes) -> Flight:
     topics = read_topics(name, content)
     remedy = "Check that the sensors were running during logging."
     imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU, remedy)
-    logged = common.with_attitude(topics.read(px4.LAYOUTS["attitude"]))
+    attitude_samples = common.with_attitude(topics.read(px4.LAYOUTS["attitude"]))
     remedy = "Check that the estimator was running during logging."
-    attitude = _require_samples(topics, logged, "attitude", px4.LAYOUTS["attitude"], remedy)
+    attitude = _require_samples(
+        topics, attitude_samples, "attitude", px4.LAYOUTS["attitude"], remedy
+    )
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions, ekf2)
@@ -44,15 +46,15 @@ def read_ulog(name: str, content: bytes) -> Flight:
     altitude_m = topics.read(px4.LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
-    dropped = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
-    notes = (dropped_note(count, topic, "zero or go back") for topic, count in dropped)
+    dropped_counts = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
+    notes = (dropped_note(count, topic, "zero or go back") for topic, count in dropped_counts)
     return Flight(
         log=structs.replace(
             topics.log,
             notes=(*topics.log.notes, *notes),
-            dropped=dict(dropped),
-            start_unix_s=_start_unix(topics),
-            damage=_damage(topics, imu, in_flight),
+            dropped=dict(dropped_counts),
+            start_unix_s=_start_unix_s(topics),
+            damage=_describe_damage(topics, imu, in_flight),
             ends_in_flight=in_flight,
         ),
         imu=imu,
@@ -62,56 +64,60 @@ def read_ulog(name: str, content: bytes) -> Flight:
         truth=truth,
         airborne=airborne,
         modes=_read_modes(topics),
-        tumble_spans=_read_tumbled(topics),
+        tumble_spans=_read_tumble_spans(topics),
         barometer=barometer(altitude_m, delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=topics.streams,
         unused=tuple(
-            Unused(name, len(table["timestamp"]), reason)
+            UnusedData(name, len(table["timestamp"]), reason)
             for name, reason in px4.UNUSED.items()
             for table in topics.of(name)[:1]
         ),
     )
 
 
-def _damage(topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool) -> tuple[str, ...]:
+def _describe_damage(
+    topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool
+) -> tuple[str, ...]:
     """Return sentences about missing parts of the file."""
     end_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_cut:
         damage_sentences.append(common.format_truncation("message", end_s, in_flight))
     if topics.is_damaged:
-        missing = "all IMU data are missing"
+        missing_text = "all IMU data are missing"
         if not isinstance(imu, Unavailable):
             steps_s = np.diff(imu.index.to_numpy())
-            missing_s = float(steps_s[steps_s > IMU_GAP_S].sum())
-            missing = f"{missing_s:.1f} s of {end_s:.1f} s of IMU data are missing"
-        damage_sentences.append(f"the file is damaged: {missing}; invalid messages were skipped")
+            missing_s = float(steps_s[steps_s > MIN_IMU_GAP_S].sum())
+            missing_text = f"{missing_s:.1f} s of {end_s:.1f} s of IMU data are missing"
+        damage_sentences.append(
+            f"the file is damaged: {missing_text}; invalid messages were skipped"
+        )
     return tuple(damage_sentences)
 
 
-def _start_unix(topics: Topics) -> float | None:
-    """Return the UNIX time (s) of time zero: the median over the fixes of the GPS receiver."""
+def _start_unix_s(topics: Topics) -> float | None:
+    """Return the UNIX time (s) of time zero: median over the fixes of the GNSS receiver."""
     gps = topics.read(*px4.layouts_of_track(px4.GPS_POSITION))
     if "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
-    known = utc_s.between(*UTC_RANGE_S)
+    is_valid = utc_s.between(*UTC_RANGE_S)
     if "fix_type" in gps:
-        known &= gps["fix_type"] >= GPS_3D_FIX
-    return float((utc_s - gps.index)[known].median()) if known.any() else None
+        is_valid &= gps["fix_type"] >= GPS_3D_FIX
+    return float((utc_s - gps.index)[is_valid].median()) if is_valid.any() else None
 
 
 def _require_samples(
-    topics: Topics, samples: pd.DataFrame, what: str, layout: Layout, remedy: str
+    topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
 ) -> pd.DataFrame | Unavailable:
-    """Return the samples and record their topic; unavailable if fewer than two."""
+    """Return the samples and record their topic; Unavailable with fewer than two samples."""
     topic = layout.topic
     if topics.find(layout) is None:
-        return Unavailable(what, f"{topic} is not logged", px4.DEFAULT_PROFILE)
+        return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE)
     if len(samples) < 2:
-        return Unavailable(what, f"{topic} contains only {len(samples)} usable samples", remedy)
-    topics.record_stream(what.lower(), topic)
+        return Unavailable(name, f"{topic} contains only {len(samples)} usable samples", remedy)
+    topics.record_stream(name.lower(), topic)
     return samples
 
 
@@ -121,29 +127,31 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
         offset_us = imu.pop("accelerometer_offset_us")
         imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
         time_us = np.rint(imu.index.to_numpy() * 1e6 + offset_us[imu.index].to_numpy())
-        keep = longest_increasing_run(time_us.astype(np.int64) + topics.zero_us)
-        imu = imu.iloc[keep].set_axis(pd.Index(time_us[keep] * 1e-6, name="time_s"))
+        kept_rows = longest_increasing_run(time_us.astype(np.int64) + topics.zero_us)
+        imu = imu.iloc[kept_rows].set_axis(pd.Index(time_us[kept_rows] * 1e-6, name="time_s"))
     columns = Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
-    return common.finite_rows(imu, columns, common.BEYOND_IMU)
+    return common.finite_rows(imu, columns, common.MAX_IMU_VALUE)
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
     """Read the intervals (s) from take-off to touch-down, as the land detector reports them."""
-    detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
-    if detected.empty:
+    land_detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
+    if land_detected.empty:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
             "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
         )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
-    return common.flight_spans(detected["landed"], topics.log.duration_s)
+    return common.flight_spans(land_detected["landed"], topics.log.duration_s)
 
 
-def _read_tumbled(topics: Topics) -> tuple[tuple[float, float], ...]:
+def _read_tumble_spans(topics: Topics) -> tuple[tuple[float, float], ...]:
     """Read the intervals (s) in which PX4's failure detector reports roll or pitch."""
-    upright = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
-    return common.flight_spans(upright, topics.log.duration_s)
+    is_upright = (
+        topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
+    )
+    return common.flight_spans(is_upright, topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:

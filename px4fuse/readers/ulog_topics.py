@@ -22,21 +22,21 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import REPORTED, valid_parameters
+from px4fuse.ekf2_parameters import REPORTED, replace_invalid_parameters
 from px4fuse.errors import LogError
 from px4fuse.log import Dropout, LogInfo, Stream
-from px4fuse.readers.field_maps import IMPOSSIBLE, Layout
+from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 from px4fuse.text import join_first
 
 _MICROSECOND = 1e-6
-# s; a measurement time further than this from publication is not boot time (GPS topics before
-# v1.16 have receiver time, ground truth in v1.13 has 0)
+# s; a measurement time further from the publication time is not boot time (GPS topics before v1.16
+# have receiver time, ground truth in v1.13 has 0)
 MAX_PUBLICATION_LAG_S = 10.0
-# s; samples this far outside the data span are left over from before
-WINDOW_MARGIN_S = 2.0
-RELEASE = 255
-# Info message with a note of the log's author to its users
+# s; samples further outside the time span of the data are outdated
+MAX_OUTSIDE_S = 2.0
+RELEASE_TYPE = 255
+# Info message with a note of the log's author to the users of the log
 NOTE_KEY = "px4fuse_note"
 # s; after a longer gap of the IMU timestamps the samples are from another boot
 MAX_DATA_GAP_S = 600.0
@@ -101,19 +101,19 @@ class _Content(io.BytesIO):
         return self.position
 
 
-def _skip_if_short(read: Callable[..., Any]) -> Callable[..., Any]:
+def _skip_if_short(parse: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a parser to raise ValueError instead of struct.error for short messages.
 
     pyulog skips a message after ValueError, but stops reading the file after struct.error.
     """
 
-    def checked(*arguments: Any, **named: Any) -> Any:
+    def parse_checked(*arguments: Any, **keywords: Any) -> Any:
         try:
-            return read(*arguments, **named)
+            return parse(*arguments, **keywords)
         except struct.error as error:
             raise ValueError(str(error)) from error
 
-    return checked
+    return parse_checked
 
 
 class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no types
@@ -200,23 +200,23 @@ class Topics:
     @cached_property
     def primary(self) -> Instances:
         """Primary EKF2 instance from each time on (``EKF2Selector.cpp``)."""
-        selected = self.read(LAYOUTS["selector"], step=True)["instance"]
-        selected = selected[selected < 255]  # 255: none selected yet
-        if selected.empty:
+        instances = self.read(LAYOUTS["selector"], step=True)["instance"]
+        instances = instances[instances < 255]  # 255: none selected yet
+        if instances.empty:
             return NO_SELECTOR
-        changes = selected[selected.ne(selected.shift())]
+        changes = instances[instances.ne(instances.shift())]
         times = [-np.inf, *changes.index[1:]]
         return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout whose fields are in the log, or None."""
+        """Return the first layout with all required fields in the log, or None."""
         for layout in layouts:
             if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
                 return layout
         return None
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
-        """Read one layout as a frame of float64 columns, indexed by measurement time in s.
+        """Read one layout as a DataFrame of float64, indexed by measurement time in s.
 
         Parameters
         ----------
@@ -234,31 +234,31 @@ class Topics:
         """
         available = self.instances(layout.topic)
         table = self.tables[layout.topic, instance if instance in available else available[0]]
-        optional = {
+        optional_columns = {
             column: field_name
             for column, field_name in layout.optional.items()
             if field_name in table
         }
-        columns = {**layout.columns, **optional}
+        columns = {**layout.columns, **optional_columns}
         time_us = measurement_time_us(table)
-        keep = longest_increasing_run(time_us)
-        if len(keep) < len(time_us):
-            self.dropped[layout.topic, instance] = len(time_us) - len(keep)
+        kept_rows = longest_increasing_run(time_us)
+        if len(kept_rows) < len(time_us):
+            self.dropped[layout.topic, instance] = len(time_us) - len(kept_rows)
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
             frame = pd.DataFrame(
                 {
-                    column: table[field_name][keep].astype(np.float64)
+                    column: table[field_name][kept_rows].astype(np.float64)
                     * layout.scale.get(column, 1.0)
                     for column, field_name in columns.items()
                 },
-                index=pd.Index((time_us[keep] - self.zero_us) * _MICROSECOND, name="time_s"),
+                index=pd.Index((time_us[kept_rows] - self.zero_us) * _MICROSECOND, name="time_s"),
             )
-        frame = frame.where(np.abs(frame) < IMPOSSIBLE)  # damaged values become NaN
-        end = self.log.duration_s + WINDOW_MARGIN_S
-        return frame if step else frame[(frame.index >= -WINDOW_MARGIN_S) & (frame.index <= end)]
+        frame = frame.where(np.abs(frame) < MAX_FIELD_VALUE)  # damaged values become NaN
+        end_s = self.log.duration_s + MAX_OUTSIDE_S
+        return frame if step else frame[(frame.index >= -MAX_OUTSIDE_S) & (frame.index <= end_s)]
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """Read the first layout in the log as in :meth:`frame`; empty if none is."""
+        """Read the first layout that is in the log, as :meth:`frame`; empty without such."""
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.frame(layout, step=step)
 
@@ -284,25 +284,27 @@ class Topics:
             return _empty_frame(layout)
         available = self.instances(layout.topic)
         is_single = self.primary == NO_SELECTOR
-        starts, numbers = (np.array(part) for part in zip(*self.primary, strict=True))
+        switch_s, numbers = (np.array(values) for values in zip(*self.primary, strict=True))
         primary_frames: list[pd.DataFrame] = []
         for number in available[:1] if is_single else available:
             frame = self.frame(layout, number, step=step)
             frame = frame if select is None else select(frame)
-            at = np.searchsorted(starts, frame.index.to_numpy(), side="right") - 1
+            at = np.searchsorted(switch_s, frame.index.to_numpy(), side="right") - 1
             primary_frames.append(frame if is_single else frame[numbers[at] == number])
         joined_frames = pd.concat(primary_frames).sort_index()
         return joined_frames[~joined_frames.index.duplicated()]
 
-    def record_stream(self, part: str, *topics: str) -> None:
+    def record_stream(self, flight_part: str, *topics: str) -> None:
         """Record the source of a part of the flight, with measurement or publication time."""
         # The timestamp of sensor_combined is the gyro's measurement time
-        measured = part == "imu" or any(
+        has_measurement_time = flight_part == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
             for table in self.of(topics[0])
         )
-        clock = f"autopilot boot clock, at {'measurement' if measured else 'publication'}"
-        self.streams[part] = Stream(topics, clock, self.log.name)
+        clock = (
+            f"autopilot boot clock, at {'measurement' if has_measurement_time else 'publication'}"
+        )
+        self.streams[flight_part] = Stream(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:
@@ -316,17 +318,17 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
 
     Otherwise it is the publication time, ``timestamp``, which is up to 0.2 s later in EKF2 topics.
     """
-    published = table["timestamp"].astype(np.int64)
-    sampled = table.get("timestamp_sample")
-    if sampled is None:
-        return published
-    sampled = sampled.astype(np.int64)
-    lag_s = np.abs(published - sampled) * _MICROSECOND
+    published_us = table["timestamp"].astype(np.int64)
+    sampled_us = table.get("timestamp_sample")
+    if sampled_us is None:
+        return published_us
+    sampled_us = sampled_us.astype(np.int64)
+    lag_s = np.abs(published_us - sampled_us) * _MICROSECOND
     # Single invalid measurement times, such as in the first message, are replaced by publication
-    plausible = (sampled > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
-    if np.count_nonzero(plausible) * 2 < len(plausible):
-        return published
-    return np.where(plausible, sampled, published)
+    is_plausible = (sampled_us > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
+    if np.count_nonzero(is_plausible) * 2 < len(is_plausible):
+        return published_us
+    return np.where(is_plausible, sampled_us, published_us)
 
 
 def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
@@ -336,35 +338,37 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     ones. Patience sorting, Fredman 1975.
     """
     indices = np.flatnonzero(time_us > 0)
-    stamps = time_us[indices]
-    if len(stamps) < 2 or np.all(np.diff(stamps) > 0):
+    times = time_us[indices]
+    if len(times) < 2 or np.all(np.diff(times) > 0):
         return indices
-    tails: list[int] = []  # smallest last timestamp of an increasing subsequence of each length
-    tail_at: list[int] = []  # index of that timestamp
-    previous = np.empty(len(stamps), dtype=np.intp)
-    for at, stamp in enumerate(stamps.tolist()):
-        length = bisect_left(tails, stamp)
-        previous[at] = tail_at[length - 1] if length else -1
-        tails[length : length + 1] = [stamp]
-        tail_at[length : length + 1] = [at]
+    last_times: list[
+        int
+    ] = []  # smallest last timestamp of an increasing subsequence of each length
+    last_indices: list[int] = []  # index of that timestamp
+    previous_index = np.empty(len(times), dtype=np.intp)
+    for index, time in enumerate(times.tolist()):
+        length = bisect_left(last_times, time)
+        previous_index[index] = last_indices[length - 1] if length else -1
+        last_times[length : length + 1] = [time]
+        last_indices[length : length + 1] = [index]
     run = []
-    at = tail_at[-1]
-    while at >= 0:
-        run.append(at)
-        at = int(previous[at])
+    index = last_indices[-1]
+    while index >= 0:
+        run.append(index)
+        index = int(previous_index[index])
     return indices[np.array(run[::-1], dtype=np.intp)]
 
 
-def dropped_note(count: int, name: str, why: str) -> str:
+def dropped_note(count: int, name: str, fault: str) -> str:
     """Format the note on samples that were dropped because of invalid timestamps.
 
     >>> dropped_note(1, "ATTITUDE", "zero")
     '1 sample of ATTITUDE was dropped: its timestamp is zero'
     """
     if count == 1:
-        why = why.replace("go back", "goes back").replace("are outside", "is outside")
-        return f"1 sample of {name} was dropped: its timestamp is {why}"
-    return f"{count} samples of {name} were dropped: their timestamps are {why}"
+        fault = fault.replace("go back", "goes back").replace("are outside", "is outside")
+        return f"1 sample of {name} was dropped: its timestamp is {fault}"
+    return f"{count} samples of {name} were dropped: their timestamps are {fault}"
 
 
 def read_topics(name: str, content: bytes) -> Topics:
@@ -379,9 +383,9 @@ def read_topics(name: str, content: bytes) -> Topics:
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints its warnings
             ulog = _Reader(source, message_name_filter_list=topics())
-            tables = _tables(ulog)
-            # Without topics that px4fuse uses, all other topics give the duration of the log
-            time_tables = tables or _tables(_Reader(_Content(content)))
+            tables = _read_tables(ulog)
+            # If px4fuse uses no topic of the log, the other topics give the duration of the log
+            time_tables = tables or _read_tables(_Reader(_Content(content)))
     except _PARSE_ERRORS as error:
         raise LogError(
             f"{name}: the ULog cannot be read ({str(error) or type(error).__name__}).",
@@ -391,25 +395,25 @@ def read_topics(name: str, content: bytes) -> Topics:
     if not time_tables:
         raise LogError(
             f"{name}: this ULog contains no data (no IMU, no position, no EKF2)",
-            "If it was cut off, copy it again. Otherwise record with SDLOG_PROFILE 129.",
+            "If the file is incomplete, copy it again. Otherwise record with SDLOG_PROFILE 129.",
         )
     if not tables:
         names = sorted({topic for topic, _ in time_tables})
         notes += (f"px4fuse uses none of the topics in this log ({join_first(names, 5)})",)
     if NOTE_KEY in ulog.msg_info_dict:
-        notes += (_text(ulog.msg_info_dict, NOTE_KEY, ""),)
+        notes += (_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(time_tables, name)
     parameter_items = ulog.initial_parameters.items()
     numbers = {name: float(v) for name, v in parameter_items if isinstance(v, int | float)}
-    parameter_values, faults = valid_parameters(numbers)
+    parameter_values, parameter_faults = replace_invalid_parameters(numbers)
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
         bytes=size,
         format="ULog",
         firmware=_firmware(ulog.msg_info_dict),
-        firmware_hash=_text(ulog.msg_info_dict, "ver_sw", "unknown"),
-        hardware=_text(ulog.msg_info_dict, "ver_hw", "unknown"),
+        firmware_hash=_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
+        hardware=_printable_text(ulog.msg_info_dict, "ver_hw", "unknown"),
         boot_time_s=zero_us * _MICROSECOND,
         duration_s=(end_us - zero_us) * _MICROSECOND,
         dropouts=tuple(
@@ -419,10 +423,10 @@ def read_topics(name: str, content: bytes) -> Topics:
         parameters=MappingProxyType(
             {name: parameter_values[name] for name in REPORTED if name in parameter_values}
         ),
-        notes=(*notes, *faults),
+        notes=(*notes, *parameter_faults),
         bytes_read=source.start - source.skipped_bytes,
-        autopilot=_text(ulog.msg_info_dict, "sys_name", "PX4"),
-        vehicle=_text(ulog.msg_info_dict, "sys_uuid", ""),
+        autopilot=_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
+        vehicle=_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
     )
     parameters = {
         name: value for name, value in parameter_values.items() if name.startswith("EKF2_")
@@ -433,8 +437,8 @@ def read_topics(name: str, content: bytes) -> Topics:
     )
 
 
-def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
-    """Return the topic tables; two subscriptions to a topic are joined on their common fields."""
+def _read_tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
+    """Return the topic tables; two subscriptions to a topic become one with the common fields."""
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
     for data in ulog.data_list:
         if "timestamp" not in data.data:
@@ -442,8 +446,12 @@ def _tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
         key = (data.name, data.multi_id)
         table = {name: np.asarray(values) for name, values in data.data.items()}
         if key in tables:
-            first = tables[key]
-            table = {one: np.concatenate([first[one], table[one]]) for one in first if one in table}
+            other_table = tables[key]
+            table = {
+                name: np.concatenate([other_table[name], table[name]])
+                for name in other_table
+                if name in table
+            }
             order = np.argsort(table["timestamp"], kind="stable")
             table = {name: values[order] for name, values in table.items()}
         tables[key] = table
@@ -454,33 +462,39 @@ def _data_span(
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]], name: str
 ) -> tuple[int, int]:
     """Return the first and last time (µs) of the IMU, or else of the topic with most samples."""
-    for key in sorted(tables, key=lambda of: (of[0] != IMU.topic, -len(tables[of]["timestamp"]))):
+    for key in sorted(
+        tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
+    ):
         time_us = tables[key]["timestamp"].astype(np.int64)
         increasing_us = time_us[longest_increasing_run(time_us)]
         if len(increasing_us):
-            # Timestamps hours away from the others are leftovers, so the longest interval is used
+            # Timestamps hours away from the others are outdated, so the longest run is used
             breaks = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND) + 1
-            stretch = max(np.split(increasing_us, breaks), key=len)
-            return int(stretch[0]), int(stretch[-1])
+            longest_us = max(np.split(increasing_us, breaks), key=len)
+            return int(longest_us[0]), int(longest_us[-1])
     raise LogError(
         f"{name}: all timestamps are zero, so the data have no time",
-        "The logger started before the clock. Record again.",
+        "The logger started before the clock of the autopilot. Record again.",
     )
 
 
-def _text(info: dict[str, Any], key: str, otherwise: str) -> str:
+def _printable_text(info: dict[str, Any], key: str, default: str) -> str:
     """Return a text from the log without control characters, which could affect a terminal."""
-    text = str(info.get(key, otherwise))
-    return "".join(c for c in text if c.isprintable()) or otherwise
+    text = str(info.get(key, default))
+    return "".join(c for c in text if c.isprintable()) or default
 
 
 def _firmware(info: dict[str, Any]) -> str:
     release = info.get("ver_sw_release")
     if not isinstance(release, int):
         return "unknown"
-    major, minor, patch, kind = (release & 0xFFFFFFFF).to_bytes(4, "big")
+    major, minor, patch, release_type = (release & 0xFFFFFFFF).to_bytes(4, "big")
     if (major, minor, patch) == (0, 0, 0):
         return "PX4 development version"
     # last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255 release
-    suffix = "" if kind == RELEASE else ("-dev", "-alpha", "-beta", "-rc")[kind // 64]
-    return f"{_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"
+    suffix = (
+        ""
+        if release_type == RELEASE_TYPE
+        else ("-dev", "-alpha", "-beta", "-rc")[release_type // 64]
+    )
+    return f"{_printable_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"

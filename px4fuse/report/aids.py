@@ -12,7 +12,7 @@ from px4fuse.flight import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
 from px4fuse.report.cover import flight_line, write_findings
 from px4fuse.report.event_marks import GROUND_BAND
-from px4fuse.report.page import Cell, Page, appendix
+from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import format_sigma_verdict
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults
@@ -24,24 +24,24 @@ LEAD = (
     "does not prove accuracy: time-correlated errors, wrong delays and wrong headings do not show "
     "in it."
 )
-STRIP_HEIGHT = 21.0  # points; height of the axes of one aid
-MAX_NORMALISED = 4.0  # √S; larger innovations are drawn at the edge
+AID_PANEL_HEIGHT = 21.0  # points; height of the axes of one aid
+MAX_NORMALISED = 4.0  # larger normalised innovations ν/√S are drawn at the edge
 MAX_DOTS = 400  # drawn points per axis
-# A comparison has the aids page only if EKF2 fused one of these, not external vision alone
+# A comparison has the aids page only if EKF2 fused one of these besides external vision
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix page if EKF2 fused a horizontal aid besides external vision."""
-    page = Page(appendix(TITLE), LEAD)
-    aid_results = write_appendix(page, analysis)
+    page = Page(appendix_title(TITLE), LEAD)
+    aid_results = write_aids_of_comparison(page, analysis)
     if aid_results:
-        _draw_strips(page, analysis.flight, aid_results)
+        _draw_aid_panels(page, analysis.flight, aid_results)
         yield page
 
 
-def write_appendix(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
-    """Write the table of a comparison's aids and return them; {} for external vision alone."""
+def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
+    """Write the aids of a comparison and return them; {} if EKF2 fused external vision only."""
     aid_results = analysis.aids
     if isinstance(aid_results, Unavailable):
         return {}
@@ -53,26 +53,26 @@ def write_appendix(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
     return aid_results
 
 
-def draw_alone(alone: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
+def draw_aids_only(analysis: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
     page = Page(TITLE, LEAD)
-    page.write(flight_line(results.student, alone.flight.log), colour=style.MUTED_COLOUR)
-    write_alone(page, alone, results.findings)
-    _draw_strips(page, alone.flight, alone.aids)
+    page.write(flight_line(results.student, analysis.flight.log), colour=style.MUTED_COLOUR)
+    write_aids_only(page, analysis, results.findings)
+    _draw_aid_panels(page, analysis.flight, analysis.aids)
     yield page
 
 
-def write_alone(page: Page, alone: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
+def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
     """Write the reason for the missing comparison, the table of aids and the findings."""
-    missing_data = alone.missing_data
+    missing_data = analysis.missing_data
     page.write(f"No comparison with KF: {missing_data.reason}.", above=2.0)
     page.write(with_options(missing_data.remedy), colour=style.MUTED_COLOUR)
-    write_aids(page, alone.aids)
+    write_aids(page, analysis.aids)
     write_findings(page, findings)
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
-    """Write a table row per aid and axis, and a list of the disabled aids below it."""
+    """Write a table with a row for each aid and axis, and below it the disabled aids."""
     rows: list[list[Cell]] = []
     for aid in aids.values():
         if aid.verdict == "disabled":
@@ -139,37 +139,43 @@ def format_aid_verdict(aid: AidResult) -> str:
     return format_sigma_verdict(aid.verdict, max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5)
 
 
-def _draw_strips(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
+def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
     """Draw the normalised innovations of each fused aid, one panel below the other."""
     span = flight_span(flight)
     if isinstance(flight.ekf2, Unavailable) or isinstance(span, Unavailable):
         return
     fused_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
     page.heading("Normalised innovations of each aid (all axes)", above=8.0)
-    page.numbers(
+    page.write_small(
         "Normalised innovations ν/√S. Expected: 95 % within ±2 (lines). Hollow: not "
         f"fused. Grey: fusion disabled. Values beyond ±{MAX_NORMALISED:g} are drawn "
         "at the edge."
     )
     for name in fused_names:
-        _draw_strip(page, aids[name], flight.ekf2.aids[name], span, last=name == fused_names[-1])
+        _draw_aid_panel(
+            page, aids[name], flight.ekf2.aids[name], span, with_time_label=name == fused_names[-1]
+        )
 
 
-def _draw_strip(
-    page: Page, aid: AidResult, log: AidLog, span: tuple[float, float], *, last: bool
+def _draw_aid_panel(
+    page: Page, aid: AidResult, log: AidLog, span: tuple[float, float], *, with_time_label: bool
 ) -> None:
     samples = log.samples.loc[span[0] : span[1]]
-    axes = page.panel(aid.label, "", STRIP_HEIGHT, above=1.0)
-    fused = samples["fused"].to_numpy() > 0.0 if "fused" in samples else np.ones(len(samples), bool)
+    axes = page.panel(aid.label, "", AID_PANEL_HEIGHT, above=1.0)
+    is_fused = (
+        samples["fused"].to_numpy() > 0.0 if "fused" in samples else np.ones(len(samples), bool)
+    )
     for axis in log.axes:
-        value = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
-        clipped = value.clip(-MAX_NORMALISED, MAX_NORMALISED).to_numpy()
-        for mask, dot_style in ((fused, style.EKF2_DOTS), (~fused, style.EKF2_REJECTED)):
+        normalised = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
+        clipped = normalised.clip(-MAX_NORMALISED, MAX_NORMALISED).to_numpy()
+        for mask, dot_style in ((is_fused, style.EKF2_DOTS), (~is_fused, style.EKF2_REJECTED)):
             if mask.any():
-                dots = style.thin_series(samples.index.to_numpy()[mask], clipped[mask], MAX_DOTS)
+                dots = style.decimate_series(
+                    samples.index.to_numpy()[mask], clipped[mask], MAX_DOTS
+                )
                 axes.plot(*dots, **dot_style | {"ms": 1.4})
-    for level in (-2.0, 2.0):
-        axes.axhline(level, color="black", lw=0.4, ls=(0, (1, 1.5)))
+    for limit in (-2.0, 2.0):
+        axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if log.enabled is not None:
         grid = np.linspace(*span, 2000)
         is_disabled = step_values_at(log.enabled, pd.Index(grid)) <= 0.0
@@ -183,4 +189,4 @@ def _draw_strip(
                 **GROUND_BAND,
             )
     axes.set(xlim=span, ylim=(-1.1 * MAX_NORMALISED, 1.1 * MAX_NORMALISED), yticks=(-2.0, 2.0))
-    style.label_time_axis(axes, last)
+    style.label_time_axis(axes, with_time_label)

@@ -7,18 +7,18 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings import Finding
-from px4fuse.findings.source_clock import typed_offset_s
+from px4fuse.findings.source_clock import clock_offset_option_s
 from px4fuse.flight import Unavailable
-from px4fuse.report.page import Page, legend_above
+from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.text import format_p_value
 
 CURVE_HEIGHT = 170.0  # points; height of the axes
-MAX_DROP = 12.0  # nats; lower end of the log-likelihood axis
-CURVE_REACH = 2.5  # distance that is drawn on each side, as a multiple of the 95 % interval
-NEGLIGIBLE_S = 0.010  # s; one EKF2 step (EKF2_PREDICT_US)
-# Findings for which the report has the page
+MAX_DROP_NATS = 12.0  # lower end of the log-likelihood axis, below the maximum
+CURVE_HALF_WIDTH = 2.5  # drawn range on each side of the estimate, in half 95 % intervals
+NEGLIGIBLE_OFFSET_S = 0.010  # one EKF2 step (EKF2_PREDICT_US)
+# Ids of the findings for which the report has this page
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
@@ -31,11 +31,11 @@ def summary_line(analysis: Analysis, findings: Iterable[Finding]) -> str:
 
 
 def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
-    """Return True if the time offset is significant, changes or cannot be estimated."""
+    """Return True if the time offset is a finding or cannot be estimated from the data."""
     clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
-    return not clock.is_determinable or any(one.id in CLOCK_FINDINGS for one in findings)
+    return not clock.is_determinable or any(finding.id in CLOCK_FINDINGS for finding in findings)
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
@@ -55,23 +55,33 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             "position source."
         ),
     }
-    if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_S):
+    if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_OFFSET_S):
         side = "late" if offset < 0.0 else "early"
         advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
-        typed = typed_offset_s(comparison, clock)
-        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed:.3f}"
-    delay, name = delay_ms(comparison), aid_of(comparison).delay
+        typed_offset = clock_offset_option_s(comparison, clock)
+        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed_offset:.3f}"
+    configured_delay_ms, delay_name = delay_ms(comparison), aid_of(comparison).delay
     age_s = comparison.source.age_s
-    least, most = age_s - high, age_s - low
-    if delay is not None and least - NEGLIGIBLE_S <= delay * 1e-3 <= most + NEGLIGIBLE_S:
-        advice["PX4"] = f"{name} {delay:g} ms is within the 95 % interval."
-    elif delay is not None and offset > age_s and delay <= 0.0:
-        advice["PX4"] = f"{name} is 0 ms and cannot be negative. Correct the sender's clock."
-    elif delay is not None:
-        ml_delay_ms, least, most = (max(1e3 * s, 0.0) for s in (age_s - offset, least, most))
+    min_delay_s, max_delay_s = age_s - high, age_s - low
+    if (
+        configured_delay_ms is not None
+        and min_delay_s - NEGLIGIBLE_OFFSET_S
+        <= configured_delay_ms * 1e-3
+        <= max_delay_s + NEGLIGIBLE_OFFSET_S
+    ):
+        advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
+    elif configured_delay_ms is not None and offset > age_s and configured_delay_ms <= 0.0:
         advice["PX4"] = (
-            f"Set {name} to {ml_delay_ms:.0f} ms (now {delay:g} ms; 95 % {least:.0f} to "
-            f"{most:.0f} ms), or correct the sender's clock."
+            f"The maximum-likelihood {delay_name} is {1e3 * (age_s - offset):.0f} ms, but "
+            f"{delay_name} cannot be negative. Correct the sender's clock."
+        )
+    elif configured_delay_ms is not None:
+        ml_delay_ms, min_ms, max_ms = (
+            max(1e3 * s, 0.0) for s in (age_s - offset, min_delay_s, max_delay_s)
+        )
+        advice["PX4"] = (
+            f"Set {delay_name} to {ml_delay_ms:.0f} ms (now {configured_delay_ms:g} ms; 95 % "
+            f"{min_ms:.0f} to {max_ms:.0f} ms), or correct the sender's clock."
         )
     if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
@@ -89,24 +99,24 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the page if the time offset needs one, see :func:`has_page`."""
+    """Draw the page if :func:`has_page` is true."""
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
         return
     page = Page(
         "Appendix: time offset of the position source",
         (
-            "Late or early timestamps hardly change the innovations: the filter follows "
-            "the positions. px4fuse maximises the likelihood of the positions over the "
+            "Late or early timestamps hardly change the innovations, because the filter "
+            "follows the positions. px4fuse maximises the likelihood of the positions over the "
             "time offset, jointly with sensor biases, attitude errors and noises. The "
             "attitude comes from the gyros alone. EKF2's attitude was corrected by the "
             "same positions, so it is not used."
         ),
     )
-    page.advice(clock_advice(analysis, clock), size=8.5)
-    (low, high), best = clock.interval_s, clock.offset_s
+    page.write_labelled_texts(clock_advice(analysis, clock), size=8.5)
+    (low, high), estimate_s = clock.interval_s, clock.offset_s
     curve_sentence = (
-        f"Maximum at {best:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The "
+        f"Maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The "
         "interval also includes the IMU noise, so it is wider than the curve shows. "
         f"{clock.count} measurements."
     )
@@ -117,16 +127,16 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
 
 def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     """Draw the log-likelihood over the time offset, with the 95 % interval."""
-    (low, high), best, applied = clock.interval_s, clock.offset_s, clock.applied_s
+    (low, high), estimate_s, applied = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low, high, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_drop, **KF_LINE)
     axes.axvline(applied, color="black", lw=0.8, ls="--", label="as analysed")
-    axes.set_ylim(min(MAX_DROP, float(clock.curve_drop.max()) * 1.05), 0.0)
-    reach = CURVE_REACH * max(high - best, best - low)
+    axes.set_ylim(min(MAX_DROP_NATS, float(clock.curve_drop.max()) * 1.05), 0.0)
+    half_width = CURVE_HALF_WIDTH * max(high - estimate_s, estimate_s - low)
     ends = clock.curve_s[0], clock.curve_s[-1]
     axes.set_xlim(
-        min(max(best - reach, ends[0]), applied - 0.1 * reach),
-        max(min(best + reach, ends[1]), applied + 0.1 * reach),
+        min(max(estimate_s - half_width, ends[0]), applied - 0.1 * half_width),
+        max(min(estimate_s + half_width, ends[1]), applied + 0.1 * half_width),
     )
     axes.set_xlabel("offset added to the source's timestamps (s)")
-    legend_above(axes)
+    draw_legend_above(axes)

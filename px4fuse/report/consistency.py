@@ -10,12 +10,12 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import Statistic
-from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
+from px4fuse.comparison.model import AxisComparison, FilterSummary, UntestedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable
 from px4fuse.report import event_marks
-from px4fuse.report.page import Cell, Page, halves, legend_above
+from px4fuse.report.page import Cell, Page, draw_legend_above, halves
 from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, format_verdict, verdict_rows
 from px4fuse.report.style import (
     DOTS,
@@ -31,13 +31,13 @@ from px4fuse.text import format_number, format_p_value
 MAX_LAG = 20
 MAX_NORMALISED = 4.0
 BINS = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
-# Upper end of the density axis; the normal curve has its maximum at 0.4 and stays visible
+# Upper limit of the density axis; the normal curve (maximum 0.4) stays visible
 MAX_DENSITY = 1.6
-# p value of the Ljung-Box test below which the caption reports non-white innovations
-SMALL_P = 0.01
+# p value of the Ljung-Box test below which the caption calls the innovations not white
+MAX_NON_WHITE_P = 0.01
 RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # points; heights of the axes
-GREY = "#dcdcdc"
-# Statistic that a cause explains: its label, and the power of the value that is printed
+BAND_GREY = "#dcdcdc"
+# Label of each statistic that a cause explains, and the power with which its value is printed
 CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
@@ -45,24 +45,24 @@ CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
 }
 
 
-class Series(NamedTuple):
+class FilterSeries(NamedTuple):
     """Normalised innovations ν/√S of one filter, with their statistics."""
 
     name: str
     values: pd.Series[float]
-    statement: Consistency
+    consistency: Consistency
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page: three panels of the main axis, and a table of all axes."""
     result = analysis.main
-    along = result.axis.called
+    axis_text = result.axis.label
     page = Page(
         "Appendix: consistency",
         (
             "Innovations ν of a consistent filter have variance S (mean NIS = mean of "
             "ν²/S = 1), are normally distributed with mean 0, and are white. Both "
-            f"filters are tested in the same way along {along}; the table lists all "
+            f"filters are tested in the same way along {axis_text}; the table lists all "
             "axes."
         ),
     )
@@ -77,27 +77,27 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
             above=LEGEND_HEIGHT,
         )
         _draw_running_nis(axes, series)
-        legend_above(axes)
-        first, second = halves()
-        left = first.panel(
+        draw_legend_above(axes)
+        left_page, right_page = halves()
+        left = left_page.panel(
             "Distribution of ν/√S",
             _shape_sentence(series),
             LOWER_HEIGHT,
             above=LEGEND_HEIGHT,
             left=4.0,
         )
-        right = second.panel(
+        right = right_page.panel(
             "Autocorrelation", _whiteness_sentence(series), LOWER_HEIGHT, above=LEGEND_HEIGHT
         )
         _draw_histogram(left, series)
         _draw_autocorrelation(right, series)
         for axes in (left, right):
-            legend_above(axes, handlelength=1.4)
-        page.beside(first, second)
+            draw_legend_above(axes, handlelength=1.4)
+        page.add_columns(left_page, right_page)
     else:
         kf_summary = result.filters["kf"]
         reason = kf_summary.reason if isinstance(kf_summary, Unavailable) else "too few innovations"
-        page.write(f"Along {along}: {reason}.")
+        page.write(f"Along {axis_text}: {reason}.")
     page.heading("All axes", above=12.0)
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     page.table(head, verdict_rows(analysis.axes.values(), _statistic_cells), right=(2, 5, 6, 7, 8))
@@ -106,14 +106,14 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write the table of re-runs along the main axis: one change each, before and after."""
+    """Write the table of re-runs along the main axis, each with one change."""
     axis = analysis.main.axis
     rows: list[list[Cell]] = []
     for cause in analysis.causes:
         if cause.axis == axis.name:
             owner = "KF" if cause.filter == "kf" else "EKF2"
             statistic, power = CAUSE_STATISTICS[cause.statistic]
-            values = (format_number(number**power, 2) for number in (cause.before, cause.after))
+            values = (format_number(value**power, 2) for value in (cause.before, cause.after))
             rows.append(
                 [
                     owner,
@@ -125,69 +125,72 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
             )
     if not rows:
         return
-    page.heading(f"Tested causes along {axis.called}", above=12.0)
+    page.heading(f"Tested causes along {axis.label}", above=12.0)
     head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(head, rows, right=(3, 4))
     page.write(
         (
-            "Each row is a re-run with one change. 'all': the change brings the number "
-            "into its band. Otherwise the share of its logarithm (for distances: of its "
-            "mean square). A share of 50 % or more counts as the cause."
+            "Each row is a re-run with one change. 'all': the change brings the quantity "
+            "into its band. Otherwise: explained share of the logarithm of the quantity (for "
+            "distances: of the mean square). A share of 50 % or more counts as the cause."
         ),
         size=7.5,
         colour=MUTED_COLOUR,
     )
 
 
-def _series(result: AxisComparison) -> list[Series]:
+def _series(result: AxisComparison) -> list[FilterSeries]:
     """Return the normalised innovations of each filter with at least MIN_INNOVATIONS."""
-    frames = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
+    innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     series = []
-    for name, one in filters_by_name(result).items():
-        frame = frames[name]
-        if isinstance(frame, pd.DataFrame) and isinstance(one, Consistency):
-            values = frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])
-            known = values[np.isfinite(values)]
-            if len(known) >= MIN_INNOVATIONS:
-                series.append(Series(name, known, one))
+    for name, consistency in filters_by_name(result).items():
+        table = innovation_tables[name]
+        if isinstance(table, pd.DataFrame) and isinstance(consistency, Consistency):
+            values = table["innovation_m"] / np.sqrt(table["innovation_variance_m2"])
+            finite_values = values[np.isfinite(values)]
+            if len(finite_values) >= MIN_INNOVATIONS:
+                series.append(FilterSeries(name, finite_values, consistency))
     return series
 
 
-def _thin_line_style(one: Series) -> dict[str, Any]:
-    return {"color": LINES[one.name]["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
+def _thin_line_style(filter_series: FilterSeries) -> dict[str, Any]:
+    return {"color": LINES[filter_series.name]["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
 
 
-def _draw_running_nis(axes: Axes, series: list[Series]) -> None:
+def _draw_running_nis(axes: Axes, series: list[FilterSeries]) -> None:
     lowest, highest = 0.5, 2.0
-    for one in series:
-        number = np.arange(1, len(one.values) + 1)
-        running = (one.values**2).cumsum() / number
-        draw_curve(axes, running.iloc[2:], **LINES[one.name], label=one.name)
+    for filter_series in series:
+        number = np.arange(1, len(filter_series.values) + 1)
+        running = (filter_series.values**2).cumsum() / number
+        draw_curve(axes, running.iloc[2:], **LINES[filter_series.name], label=filter_series.name)
         drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
-        time = one.values.index[drawn_counts - 1]
-        if one.name == "KF":
-            axes.fill_between(time, low, high, color=GREY, lw=0, label="95 % band KF")
+        time = filter_series.values.index[drawn_counts - 1]
+        if filter_series.name == "KF":
+            axes.fill_between(time, low, high, color=BAND_GREY, lw=0, label="95 % band KF")
         else:
-            axes.plot(time, low, **_thin_line_style(one))
-            axes.plot(time, high, **_thin_line_style(one), label="95 % band EKF2")
-        settled = running.iloc[len(running) // 4 :]
-        lowest, highest = min(lowest, 0.7 * settled.min()), max(highest, 1.4 * settled.max())
+            axes.plot(time, low, **_thin_line_style(filter_series))
+            axes.plot(time, high, **_thin_line_style(filter_series), label="95 % band EKF2")
+        settled_nis = running.iloc[len(running) // 4 :]
+        lowest, highest = (
+            min(lowest, 0.7 * settled_nis.min()),
+            max(highest, 1.4 * settled_nis.max()),
+        )
     axes.axhline(1.0, color="black", lw=0.5)
     axes.set(yscale="log", ylim=(lowest, highest))
     set_plain_ticks(axes.yaxis)
 
 
-def _draw_histogram(axes: Axes, series: list[Series]) -> None:
+def _draw_histogram(axes: Axes, series: list[FilterSeries]) -> None:
     x = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 81)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(x, normal, color=GREY, lw=0, label="normal")
+    axes.fill_between(x, normal, color=BAND_GREY, lw=0, label="normal")
     highest = 0.4
-    for one in series:
+    for filter_series in series:
         density, _ = np.histogram(
-            one.values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=BINS, density=True
+            filter_series.values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=BINS, density=True
         )
-        axes.stairs(density, BINS, **LINES[one.name], label=one.name)
+        axes.stairs(density, BINS, **LINES[filter_series.name], label=filter_series.name)
         highest = max(highest, float(density.max()))
     axes.set_xlim(-MAX_NORMALISED, MAX_NORMALISED)
     axes.set_ylim(0.0, min(1.15 * highest, MAX_DENSITY))
@@ -195,16 +198,23 @@ def _draw_histogram(axes: Axes, series: list[Series]) -> None:
     axes.set_xlabel("ν / √S")
 
 
-def _draw_autocorrelation(axes: Axes, series: list[Series]) -> None:
-    for shift, one in zip((-0.18, 0.18), series, strict=False):
-        lags = min(MAX_LAG, len(one.values) // 3)
-        r = autocorrelation(np.asarray(one.values, np.float64), lags)
-        at = np.arange(1, lags + 1) + shift
-        axes.vlines(at, 0.0, r, color=LINES[one.name]["color"], lw=1.2)
-        filled = {"mfc": LINES[one.name]["color"] if one.name == "KF" else "white"}
-        axes.plot(at, r, **DOTS[one.name] | filled | {"ms": 3.0, "mew": 0.6}, label=one.name)
-        bound = _whiteness_bound(one)
-        if one.name == "KF":
+def _draw_autocorrelation(axes: Axes, series: list[FilterSeries]) -> None:
+    for shift, filter_series in zip((-0.18, 0.18), series, strict=False):
+        lags = min(MAX_LAG, len(filter_series.values) // 3)
+        r = autocorrelation(np.asarray(filter_series.values, np.float64), lags)
+        positions = np.arange(1, lags + 1) + shift
+        axes.vlines(positions, 0.0, r, color=LINES[filter_series.name]["color"], lw=1.2)
+        fill_style = {
+            "mfc": LINES[filter_series.name]["color"] if filter_series.name == "KF" else "white"
+        }
+        axes.plot(
+            positions,
+            r,
+            **DOTS[filter_series.name] | fill_style | {"ms": 3.0, "mew": 0.6},
+            label=filter_series.name,
+        )
+        bound = _whiteness_bound(filter_series)
+        if filter_series.name == "KF":
             axes.axhspan(
                 -bound,
                 bound,
@@ -215,7 +225,7 @@ def _draw_autocorrelation(axes: Axes, series: list[Series]) -> None:
             )
         else:
             for level in (-bound, bound):
-                axes.axhline(level, **_thin_line_style(one))
+                axes.axhline(level, **_thin_line_style(filter_series))
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
@@ -223,46 +233,53 @@ def _draw_autocorrelation(axes: Axes, series: list[Series]) -> None:
     axes.set_xlabel("lag (measurements)")
 
 
-def _whiteness_bound(one: Series) -> float:
-    """Half width of the 95 % band for the autocorrelation of white innovations."""
-    return float(1.96 / np.sqrt(len(one.values)))
+def _whiteness_bound(filter_series: FilterSeries) -> float:
+    """Return the half width of the 95 % band for the autocorrelation of white innovations."""
+    return float(1.96 / np.sqrt(len(filter_series.values)))
 
 
-def _nis_sentence(series: list[Series]) -> str:
+def _nis_sentence(series: list[FilterSeries]) -> str:
     return " ".join(
-        f"{one.name}: final mean NIS {format_number(one.statement.nis_mean)} "
-        "(expected {:.2f} to {:.2f}): ".format(*one.statement.nis_band)
-        + f"{format_verdict(one.statement)}."
-        for one in series
+        f"{name}: final mean NIS {format_number(consistency.nis_mean)} "
+        "(expected {:.2f} to {:.2f}): ".format(*consistency.nis_band)
+        + f"{format_verdict(consistency)}."
+        for name, _, consistency in series
     )
 
 
-def _shape_sentence(series: list[Series]) -> str:
+def _shape_sentence(series: list[FilterSeries]) -> str:
     return "\n".join(
-        f"{one.name}: {one.statement.fraction_outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), "
-        f"mean {one.statement.innovation_mean_m:+z.3f} m ({format_p_value(one.statement.bias_p)})."
-        for one in series
+        f"{name}: {consistency.fraction_outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), "
+        f"mean {consistency.innovation_mean_m:+z.3f} m ({format_p_value(consistency.bias_p)})."
+        for name, _, consistency in series
     )
 
 
-def _whiteness_sentence(series: list[Series]) -> str:
+def _whiteness_sentence(series: list[FilterSeries]) -> str:
     sentences = []
-    for one in series:
-        r, p = one.statement.lag1_autocorrelation, one.statement.ljung_box_p
-        reading = "white" if p >= SMALL_P else "not white"
-        if p < SMALL_P and abs(r) > _whiteness_bound(one):
-            reading = "the filter lags" if r > 0.0 else "the filter follows measurement noise"
-        sentences.append(f"{one.name}: lag 1 {r:+.2f}, Ljung-Box {format_p_value(p)}: {reading}.")
+    for filter_series in series:
+        r, p = filter_series.consistency.lag1_autocorrelation, filter_series.consistency.ljung_box_p
+        interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
+        if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(filter_series):
+            interpretation = (
+                "the filter lags" if r > 0.0 else "the filter follows measurement noise"
+            )
+        sentences.append(
+            f"{filter_series.name}: lag 1 {r:+.2f}, Ljung-Box {format_p_value(p)}: "
+            f"{interpretation}."
+        )
     return "\n".join(sentences)
 
 
-def _statistic_cells(_: AxisComparison, __: str, one: FilterSummary | UnjudgedFilter) -> list[str]:
-    if isinstance(one, Unavailable):
+def _statistic_cells(
+    _: AxisComparison, __: str, consistency: FilterSummary | UntestedFilter
+) -> list[str]:
+    if isinstance(consistency, Unavailable):
         return [""] * 5
     return [
-        f"{one.count}",
-        f"{one.fraction_outside_two_sigma:.1%}",
-        f"{one.bias_t:+.1f}",
-        f"{one.lag1_autocorrelation:+.2f}",
-        format_p_value(one.ljung_box_p),
+        f"{consistency.count}",
+        f"{consistency.fraction_outside_two_sigma:.1%}",
+        f"{consistency.bias_t:+.1f}",
+        f"{consistency.lag1_autocorrelation:+.2f}",
+        format_p_value(consistency.ljung_box_p),
     ]

@@ -8,15 +8,15 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
+from px4fuse.comparison.causal_replays import error_above_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.signals import AISLE, Axis, within
-from px4fuse.findings import Finding, by_root, finding_title
+from px4fuse.filter.signals import AISLE, Axis, cut_to_segment
+from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.log import LogInfo
 from px4fuse.report.event_marks import LANDING_MARK, TAKE_OFF_MARK
-from px4fuse.report.page import PAGE_WIDTH, Page, halves, legend_above, styled_text
+from px4fuse.report.page import PAGE_WIDTH, Page, draw_legend_above, halves, styled_text
 from px4fuse.report.phrases import (
     filters_by_name,
     format_clock_map,
@@ -39,7 +39,7 @@ from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.model import Student
 from px4fuse.text import capitalise_first, format_number
 
-# Ratio of length and width above which the track is drawn along the page; else north is up
+# Length / width of the track above which the map shows it along the page; else north is up
 MIN_LONG_RATIO = 2.2
 MAX_MAP_HEIGHT, MIN_MAP_HEIGHT = 120.0, 56.0  # points; of a map above the facts
 SIDE_MAP_HEIGHT, SIDE_MAP_WIDTH = 150.0, 256.0  # points; of a map beside the facts
@@ -51,7 +51,7 @@ HORIZONTAL_AXES = ("north", "east")
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the cover; findings that do not fit continue on the next page."""
     page = Page("EKF2 check: comparison with a two-state Kalman filter (KF)")
-    page.foot(_map_and_facts(analysis, facts(analysis)))
+    page.add_foot(_map_and_facts(analysis, facts(analysis)))
     page.write(flight_line(results.student, analysis.flight.log), colour=MUTED_COLOUR, above=-4.0)
     for sentence in results.summary:
         page.write(sentence, size=10.5, above=2.0)
@@ -77,24 +77,26 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
     page.heading("Findings", 10.5, above=12.0)
     if not findings:
         page.write("None.")
-    for findings_of_cause in by_root(findings):
+    for findings_of_cause in group_by_root(findings):
         write_finding(page, findings_of_cause)
 
 
 def _write_verdict(page: Page, analysis: Analysis) -> None:
-    """Write the verdicts along the main axis in large letters, KF left and EKF2 right."""
+    """Write the verdicts along the main axis in large letters: KF left, EKF2 right."""
     result, columns = analysis.main, []
-    along = result.axis.called
-    for (name, one), colour in zip(
+    axis_text = result.axis.label
+    for (name, consistency), colour in zip(
         filters_by_name(result).items(), (KF_COLOUR, EKF2_COLOUR), strict=False
     ):
-        is_judged = isinstance(one, Consistency)
+        is_judged = isinstance(consistency, Consistency)
         column, _ = halves()
-        large_text = format_verdict(one)
-        if excess := error_beyond_reported_sigma(one):
-            rmse, sigma = (format_number(m, 2) for m in (excess.rmse_m, excess.reported_sigma_m))
+        large_text = format_verdict(consistency)
+        if excess := error_above_reported_sigma(consistency):
+            rmse, sigma = (
+                format_number(value_m, 2) for value_m in (excess.rmse_m, excess.reported_sigma_m)
+            )
             large_text = f"position RMSE {rmse} m, reported σ {sigma} m"
-        column.write(f"{name} along {along}")
+        column.write(f"{name} along {axis_text}")
         column.write(
             large_text,
             size=12.0,
@@ -102,10 +104,10 @@ def _write_verdict(page: Page, analysis: Analysis) -> None:
             colour=colour if is_judged else MUTED_COLOUR,
             above=1.0,
         )
-        if isinstance(one, Unavailable):
-            column.write(f"{one.reason}.", above=1.0)
+        if isinstance(consistency, Unavailable):
+            column.write(f"{consistency.reason}.", above=1.0)
         columns.append(column)
-    page.beside(*columns, above=14.0)
+    page.add_columns(*columns, above=14.0)
     notes = [
         (
             "Mean NIS: expected 1. Below its 95 % band: underconfident (σ too large). "
@@ -120,47 +122,47 @@ def _write_verdict(page: Page, analysis: Analysis) -> None:
 
 
 def facts(comparison: Comparison) -> dict[str, str]:
-    """Return filter settings, position source, segment and input files as labelled texts."""
+    """Return filter settings, position source, segment and input files as texts by label."""
     flight = comparison.flight
     log, source, segment = flight.log, comparison.source, comparison.segment
     position = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
         f"{source.frame}; {comparison.source_reason}"
     )
-    placement, clock = "", ""
+    alignment_text, clock_text = "", ""
     if source.alignment is not None:
-        alignment, clock = source.alignment, source.clock
+        alignment, clock_text = source.alignment, source.clock
         sigma = alignment.clock_offset_sigma_s
-        placement = (
+        alignment_text = (
             f"{alignment.frame}, yaw {alignment.yaw_deg:.1f}°, clock "
             f"{alignment.clock_offset_s:+.3f}{'' if sigma is None else f' ± {sigma:.3f}'} s"
         )
     if source.clock_map is not None:
-        clock = format_clock_map(source.clock_map)
+        clock_text = format_clock_map(source.clock_map)
     aisle = _aisle(comparison)
-    entries = {
+    texts = {
         "Filter": format_settings(comparison.settings),
         "Position": position,
-        "Aligned": placement,
-        "Clock": clock,
+        "Aligned": alignment_text,
+        "Clock": clock_text,
         "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
         "Aisle": "" if aisle is None else f"{aisle.heading_deg:.1f}° from north ({aisle.note})",
         "Inputs": ", ".join(f"{file.name}, SHA-256 {file.sha256[:12]}…" for file in flight.inputs),
         "SHA-256": f"{log.sha256[:32]}…, {log.bytes / 1e6:.2f} MB",
     }
-    return {label: text for label, text in entries.items() if text}
+    return {label: text for label, text in texts.items() if text}
 
 
 def write_finding(page: Page, group: list[Finding]) -> None:
     """Write severity, time, title with id, message, action and consequences of a finding."""
-    finding, *followers = group
+    finding, *consequences = group
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
     texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
     if finding.remedy:
         texts.append(styled_text(f"Action: {finding.remedy}", 7.5, MUTED_COLOUR))
-    if followers:
-        texts.append(styled_text(format_consequences(followers), 7.5, MUTED_COLOUR))
-    page.labelled(
+    if consequences:
+        texts.append(styled_text(format_consequences(consequences), 7.5, MUTED_COLOUR))
+    page.write_labelled(
         f"{finding.severity}\n{finding.when}".strip(),
         *texts,
         size=7.0,
@@ -195,32 +197,37 @@ NORTH_UP = MapView(np.pi / 2.0, ("east", "north"))
 def _map_and_facts(analysis: Analysis, facts: Mapping[str, str]) -> Page:
     """Draw the map, with the facts below it (long track) or beside it."""
     tracks = _tracks(analysis)
-    along = _map_view(analysis)
-    wide, high = (float(np.ptp(values)) for values in along.project(*tracks["measurement"]))
-    is_long = wide >= MIN_LONG_RATIO * max(high, 1e-6)
+    aisle_view = _map_view(analysis)
+    length_m, width_m = (
+        float(np.ptp(values)) for values in aisle_view.project(*tracks["measurement"])
+    )
+    is_long = length_m >= MIN_LONG_RATIO * max(width_m, 1e-6)
     page, view, height = Page(), NORTH_UP, SIDE_MAP_HEIGHT
-    map_page, beside = Page(width=SIDE_MAP_WIDTH), Page(width=PAGE_WIDTH - SIDE_MAP_WIDTH - 14.0)
+    map_page, facts_page = (
+        Page(width=SIDE_MAP_WIDTH),
+        Page(width=PAGE_WIDTH - SIDE_MAP_WIDTH - 14.0),
+    )
     if is_long:
-        map_page, beside, view = page, page, along
+        map_page, facts_page, view = page, page, aisle_view
         height = float(
-            np.clip(1.3 * high * PAGE_WIDTH / (1.1 * wide), MIN_MAP_HEIGHT, MAX_MAP_HEIGHT)
+            np.clip(1.3 * width_m * PAGE_WIDTH / (1.1 * length_m), MIN_MAP_HEIGHT, MAX_MAP_HEIGHT)
         )
-    # the narrow map needs two lines for its legend
+    # The legend of the narrow map needs two lines
     above = 16.0 if is_long else 28.0
     _draw_map(map_page.panel("Map", "", height, above=above, left=36.0), analysis, view, tracks)
     for label, text in facts.items():
-        beside.labelled(label, text, size=7.0, above=-0.5)
+        facts_page.write_labelled(label, text, size=7.0, above=-0.5)
     if not is_long:
-        page.beside(map_page, beside)
+        page.add_columns(map_page, facts_page)
     return page
 
 
 def _tracks(comparison: Comparison) -> dict[str, Coordinates]:
-    """North and east (m) of each track within the segment."""
+    """Return north and east (m) of each track within the segment."""
     segment, flight = comparison.segment, comparison.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
-        inside = within(frame, segment)
+        inside = cut_to_segment(frame, segment)
         return inside["north_m"].to_numpy(), inside["east_m"].to_numpy()
 
     tracks = {"measurement": cut(comparison.source.samples)}
@@ -270,4 +277,4 @@ def _draw_map(
                 *coordinates, **{**mark_style, "ms": 7.0, "mec": "white", "mew": 0.6}, label=label
             )
     set_map_axes(axes, *view.labels)
-    legend_above(axes, columns=3 if view is NORTH_UP else 9, handlelength=1.8)
+    draw_legend_above(axes, column_count=3 if view is NORTH_UP else 9, handlelength=1.8)

@@ -1,4 +1,4 @@
-"""Page on the difference KF - EKF2: replays from KF to the logged EKF2, one change at a time."""
+"""Page on the difference KF - EKF2, divided into the changes that turn KF into the logged EKF2."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -28,14 +28,18 @@ from px4fuse.report.style import (
 from px4fuse.text import capitalise_first
 
 TITLE = "Difference between KF and EKF2, step by step"
-ROW_HEIGHT, LABEL_WIDTH, COLUMN_GAP = 12.0, 128.0, 14.0  # points; bar, step names, columns
-NAMED_FRACTION = 0.62  # share of the page width for the left column, with the step names
+ROW_HEIGHT, LABEL_WIDTH, COLUMN_GAP = (
+    12.0,
+    128.0,
+    14.0,
+)  # points; height of a bar, width of the step names, gap between columns
+LEFT_COLUMN_FRACTION = 0.62  # of the page width; this column has the step names
 TIME_HEIGHT = 105.0  # points; height of the axes
-AWAY_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that increase the difference
+INCREASE_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that increase the difference
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the steps of each explained axis; no page if no axis is explained."""
+    """Draw the steps for each axis with an explanation; no page if no axis has one."""
     explanations = _explanations(analysis)
     if not any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
@@ -44,9 +48,9 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     page = Page(
         TITLE,
         (
-            "Replays that change KF into the logged EKF2, one step at a time (px4fuse's "
-            "model of EKF2). Each bar is the reduction of the mean square difference in "
-            "that step; hatched bars increase it. The bars add up to 100 %."
+            "A series of replays changes KF into the logged EKF2, one step at a time (with "
+            "px4fuse's model of EKF2). Each bar is the reduction of the mean square "
+            "difference by that step; a hatched bar is an increase. The bars add up to 100 %."
         ),
     )
     for name, explanation in explanations.items():
@@ -56,14 +60,14 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         else:
             _draw_axis(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
-    assert isinstance(replay, Ekf2Replay)  # the explanation was made from it
+    assert isinstance(replay, Ekf2Replay)  # explanations exist only with a replay
     assert replay.agreement is not None
-    page.numbers(f"EKF2 replay: {format_agreement(replay.agreement)}.")
+    page.write_small(f"EKF2 replay: {format_agreement(replay.agreement)}.")
     yield page
 
 
 def _explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return the explanation of the aisle axis, else those of all axes."""
+    """Return the explanation of the aisle axis if it exists, else those of all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
@@ -71,13 +75,13 @@ def _explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Un
 def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
     """Write the largest step of the difference KF - EKF2, or the reason why it is unknown."""
     if isinstance(explanation, Unavailable):
-        page.labelled("KF-EKF2", f"Difference not explained: {explanation.reason}.")
+        page.write_labelled("KF-EKF2", f"Difference not explained: {explanation.reason}.")
     else:
-        page.labelled("KF-EKF2", explanation.sentences[0])
+        page.write_labelled("KF-EKF2", explanation.sentences[0])
 
 
 def unexplained_note(analysis: Analysis) -> str:
-    """Return the reason why the page is missing; "" if it exists or the log has no EKF2."""
+    """Return the reason why the report has no such page; "" if it has or the log has no EKF2."""
     explanations = list(_explanations(analysis).values())
     if isinstance(analysis.flight.ekf2, Unavailable) or any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations
@@ -119,7 +123,7 @@ def _draw_axis(
     for sentence in explanation.sentences:
         page.write(sentence, size=8.5, above=1.0)
     names = [step.name for step in explanation.steps]
-    columns = halves(NAMED_FRACTION, gap=COLUMN_GAP)
+    columns = halves(LEFT_COLUMN_FRACTION, gap=COLUMN_GAP)
     quantities = (
         ("position", "m", "m2", explanation.unexplained_mean_square_m2),
         ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
@@ -138,38 +142,44 @@ def _draw_axis(
         axes = column.panel(title, "", height, left=left)
         _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained / total)
     axes.set_yticklabels([])
-    page.beside(*columns, gap=COLUMN_GAP)
+    page.add_columns(*columns, gap=COLUMN_GAP)
     title = "Position difference KF - EKF2 (m, dark) and unexplained part (light)"
     axes = event_marks.panel(
-        page, analysis, title, _time_sentence(explanation), TIME_HEIGHT, axis=name, strip=True
+        page,
+        analysis,
+        title,
+        _time_sentence(explanation),
+        TIME_HEIGHT,
+        axis=name,
+        with_mode_names=True,
     )
     position_difference, remainder = (
-        pd.Series(v, explanation.times_s)
-        for v in (explanation.kf_minus_ekf2_m, explanation.unexplained_m)
+        pd.Series(values, explanation.times_s)
+        for values in (explanation.kf_minus_ekf2_m, explanation.unexplained_m)
     )
     for start, end in explanation.spans_s:
         draw_curve(axes, position_difference.loc[start:end], **LINES["KF"])
         draw_curve(axes, remainder.loc[start:end], color=EKF2_COLOUR, lw=0.8)
 
 
-def _draw_waterfall(axes: Axes, names: list[str], shares: Array, left: float) -> None:
-    """Draw bars from the total mean square down to the unexplained part (% of the total)."""
-    before = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
-    rows, farthest = len(names) + 2, max(100.0, float(before.max()))
+def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_share: float) -> None:
+    """Draw bars from the total mean square down to the unexplained rest (% of the total)."""
+    bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
+    rows, right_end = len(names) + 2, max(100.0, float(bar_ends.max()))
     style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6, "color": KF_COLOUR}
     axes.barh(0, 100.0, **style)
-    for row, (share, start) in enumerate(zip(shares, before, strict=False), start=1):
-        style |= {"color": KF_BAND_COLOUR, "hatch": ""} if share >= 0.0 else AWAY_STYLE
-        axes.barh(row, -share, left=start, **style)
-        axes.plot([start] * 2, [row - 1.35, row + 0.35], color=MUTED_COLOUR, lw=0.5)
+    for row, (share, bar_start) in enumerate(zip(shares, bar_ends, strict=False), start=1):
+        style |= {"color": KF_BAND_COLOUR, "hatch": ""} if share >= 0.0 else INCREASE_STYLE
+        axes.barh(row, -share, left=bar_start, **style)
+        axes.plot([bar_start] * 2, [row - 1.35, row + 0.35], color=MUTED_COLOUR, lw=0.5)
     style |= {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR, "hatch": ""}
-    axes.barh(rows - 1, left, **style)
-    for row, number in enumerate((100.0, *shares, left)):
-        digits = 1 if 0.05 <= abs(number) < 9.95 else 0
-        axes.text(1.03 * farthest, row, f"{number:z.{digits}f} %", va="center", size=6.5)
+    axes.barh(rows - 1, unexplained_share, **style)
+    for row, percent in enumerate((100.0, *shares, unexplained_share)):
+        digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
+        axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=6.5)
     axes.set_yticks(range(rows), ["KF - EKF2, total", *names, "unexplained"])
     axes.set_ylim(rows - 0.4, -0.6)
-    axes.set_xlim(min(0.0, float(before.min())), 1.2 * farthest)
+    axes.set_xlim(min(0.0, float(bar_ends.min())), 1.2 * right_end)
     axes.set_xlabel("% of the mean square")
     axes.grid(visible=False)
 

@@ -1,4 +1,4 @@
-"""Page on trajectory errors: map coloured by error, APE and RPE, named as in evo."""
+"""Page on trajectory errors: map coloured by error, APE and RPE (the names of the tool evo)."""
 
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.flight import Unavailable
-from px4fuse.loop.analysis import SMALLEST_STAMP_S
+from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
 from px4fuse.report.page import PAGE_WIDTH, Page, halves
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes, Colormap
@@ -16,7 +16,7 @@ from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
-# Indices of the axes to the right, up the page and vertical; True if the vertical axis is down
+# Indices of the axes drawn to the right, drawn upwards, and vertical; True if that one is down
 PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "NED": (1, 0, 2, True),
     "FRD": (1, 0, 2, True),
@@ -24,12 +24,12 @@ PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "camera": (0, 2, 1, True),
     "unknown": (0, 1, 2, False),
 }
-# Ratio of height and length of a path below which the side view is left out
+# Height / length of a path below which the page has no side view
 MAX_FLAT_RATIO = 0.1
-# Time step, as a multiple of the median one, above which a line is interrupted
+# Time step, as a multiple of the median step, above which a line is interrupted
 MIN_GAP_STEPS = 10.0
 MAX_PATH_POINTS = 1200
-MIN_SCALE_M = 1e-3  # m; minimum range of an error axis, so that rounding errors look small
+MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis, so that rounding errors look small
 PANEL_HEIGHT, MAP_HEIGHT, MAP_GAP = 76.0, 128.0, 16.0  # points
 MAX_DELTA_LABELS = 12
 REFERENCE_LINE: dict[str, Any] = {"color": TRUTH_COLOUR, "lw": 0.8, "ls": (0, (4, 2))}
@@ -39,9 +39,19 @@ STATISTIC_LINES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("mean", "mean", {"color": "black", "lw": 0.9, "ls": (0, (5, 2))}),
     ("median", "median", {"color": "black", "lw": 0.9, "ls": (0, (5, 1.5, 1, 1.5))}),
 )
-NEGLIGIBLE_M = 1e-6  # m; smaller errors are rounding
+NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors are rounding errors
 SHADES_CAPTION = "Darker: larger error. ×: largest error."
-SCORE_HEAD = ("error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)")
+ERROR_TABLE_HEAD = (
+    "error",
+    "RMSE",
+    "95 %",
+    "mean",
+    "median",
+    "std",
+    "max",
+    "n",
+    "rotation\nRMSE (°)",
+)
 
 
 @cache
@@ -56,7 +66,7 @@ def error_colours() -> Colormap:
 
 
 class View(NamedTuple):
-    """View of a path: indices of the axes across and up the page, and their names."""
+    """View of a path: indices and names of the axes drawn to the right and upwards."""
 
     across: int
     up: int
@@ -68,20 +78,22 @@ class View(NamedTuple):
         return np.asarray(position_m[:, (self.across, self.up)])
 
 
-def path_views(score: Evaluation) -> list[View]:
+def path_views(evaluation: Evaluation) -> list[View]:
     """Return the view from above, and the side view if the path is not flat."""
-    across, up, vertical, is_down = PAGE_AXES[score.reference.frame]
-    names = AXES_OF_FRAME[score.reference.frame]
-    extent = np.maximum(np.ptp(score.reference_m, axis=0), np.ptp(score.estimate_m, axis=0))
-    level = across if extent[across] >= extent[up] else up
+    across, up, vertical, is_down = PAGE_AXES[evaluation.reference.frame]
+    names = AXES_OF_FRAME[evaluation.reference.frame]
+    extent = np.maximum(
+        np.ptp(evaluation.reference_m, axis=0), np.ptp(evaluation.estimate_m, axis=0)
+    )
+    horizontal = across if extent[across] >= extent[up] else up
     all_views = [
         View(across, up, False, (names[across], names[up])),
-        View(level, vertical, is_down, (names[level], names[vertical])),
+        View(horizontal, vertical, is_down, (names[horizontal], names[vertical])),
     ]
-    return all_views if extent[vertical] > MAX_FLAT_RATIO * extent[level] else all_views[:1]
+    return all_views if extent[vertical] > MAX_FLAT_RATIO * extent[horizontal] else all_views[:1]
 
 
-def draw(score: Evaluation, _: object) -> Iterator[Page]:
+def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
     """Draw the evaluation: scores, maps and error panels."""
     page = Page(
         "Trajectory error",
@@ -90,45 +102,47 @@ def draw(score: Evaluation, _: object) -> Iterator[Page]:
             "the ATE). RPE: error of the relative motion over a fixed distance or time."
         ),
     )
-    page.write(summary(score), size=9.0, bold=True)
-    write_evaluation(page, score)
-    _draw_maps(page, score)
-    _draw_panels(page, score)
+    page.write(summary(evaluation), size=9.0, bold=True)
+    write_evaluation(page, evaluation)
+    _draw_maps(page, evaluation)
+    _draw_panels(page, evaluation)
     yield page
 
 
-def _draw_maps(page: Page, score: Evaluation) -> None:
+def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     """Draw the paths before alignment, and the aligned path coloured by error in each view."""
-    map_views, is_aligned = path_views(score), score.alignment != "none"
+    map_views, is_aligned = path_views(evaluation), evaluation.alignment != "none"
     count = len(map_views) + is_aligned
     width = (PAGE_WIDTH - MAP_GAP * (count - 1)) / count
-    columns, estimate = [], []
+    columns, estimate_handle = [], []
     if is_aligned:
         columns.append(Page(width=width))
         axes = columns[-1].panel("Before alignment", "", MAP_HEIGHT, left=34.0)
         for position, line_style, label in (
-            (score.reference_m, REFERENCE_LINE, "reference"),
-            (score.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
+            (evaluation.reference_m, REFERENCE_LINE, "reference"),
+            (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
-            plot_path(axes, map_views[0].project(position), score.time_s, label=label, **line_style)
+            plot_path(
+                axes, map_views[0].project(position), evaluation.time_s, label=label, **line_style
+            )
         _set_map_frame(axes, map_views[0])
-        estimate = axes.get_legend_handles_labels()[0][1:]
-        columns[-1].numbers(unaligned_sentence(score))
+        estimate_handle = axes.get_legend_handles_labels()[0][1:]
+        columns[-1].write_small(unaligned_sentence(evaluation))
     for view in map_views:
         columns.append(Page(width=width))
         title = f"{'After alignment, coloured' if is_aligned else 'Coloured'} by error"
         axes = columns[-1].panel(title, "", MAP_HEIGHT, left=34.0, right=40.0)
-        draw_path(axes, score, view)
-        columns[-1].numbers(
-            SHADES_CAPTION if view is map_views[0] else vertical_error_sentence(score, view.up)
+        draw_path(axes, evaluation, view)
+        columns[-1].write_small(
+            SHADES_CAPTION if view is map_views[0] else vertical_error_sentence(evaluation, view.up)
         )
-    page.legend([*axes.get_legend_handles_labels()[0], *estimate])
-    page.beside(*columns, gap=MAP_GAP)
+    page.legend([*axes.get_legend_handles_labels()[0], *estimate_handle])
+    page.add_columns(*columns, gap=MAP_GAP)
 
 
-def draw_path(axes: Axes, score: Evaluation, view: View) -> None:
+def draw_path(axes: Axes, evaluation: Evaluation, view: View) -> None:
     """Draw the aligned path coloured by error, with the reference dashed."""
-    error, path = score.position_error_m, view.project(score.estimate_m)
+    error, path = evaluation.position_error_m, view.project(evaluation.estimate_m)
     stride = max(1, len(error) // MAX_PATH_POINTS)
     scatter_points = axes.scatter(
         path[::stride, 0],
@@ -138,10 +152,14 @@ def draw_path(axes: Axes, score: Evaluation, view: View) -> None:
         cmap=error_colours(),
         linewidths=0,
         vmin=0.0,
-        vmax=max(float(error.max()), MIN_SCALE_M),
+        vmax=max(float(error.max()), MIN_ERROR_RANGE_M),
     )
     plot_path(
-        axes, view.project(score.reference_m), score.time_s, label="reference", **REFERENCE_LINE
+        axes,
+        view.project(evaluation.reference_m),
+        evaluation.time_s,
+        label="reference",
+        **REFERENCE_LINE,
     )
     axes.plot(*path[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     worst_point = path[np.argmax(error)]
@@ -160,29 +178,29 @@ def _set_map_frame(axes: Axes, view: View) -> None:
         axes.invert_yaxis()
 
 
-def _draw_panels(page: Page, score: Evaluation) -> None:
+def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     """Draw the panels: APE over time and distance, RPE per delta."""
     left, right = halves()
     axes = left.panel("APE over time (m)", "", PANEL_HEIGHT)
-    draw_ape(axes, score, *time_from_start(score))
+    draw_ape(axes, evaluation, *time_from_start(evaluation))
     page.legend(axes.get_legend_handles_labels()[0])
-    left.numbers(worst_moments_sentence(score))
+    left.write_small(worst_poses_sentence(evaluation))
     axes = right.panel("APE over distance (m)", "", PANEL_HEIGHT)
-    draw_ape(axes, score, score.distance_m, "distance along the reference (m)")
-    right.numbers(quarters_sentence(score))
-    page.beside(left, right)
-    if _known_rpe(score):
+    draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
+    right.write_small(quarters_sentence(evaluation))
+    page.add_columns(left, right)
+    if _rpe_statistics(evaluation):
         left, right = halves()
-        _draw_rpe(left.panel("RPE per delta (m)", "", PANEL_HEIGHT), score)
-        right.write(rpe_growth_sentence(score.rpe), size=7.0, colour=MUTED_COLOUR, above=24.0)
-        page.beside(left, right)
+        _draw_rpe(left.panel("RPE per delta (m)", "", PANEL_HEIGHT), evaluation)
+        right.write(rpe_growth_sentence(evaluation.rpe), size=7.0, colour=MUTED_COLOUR, above=24.0)
+        page.add_columns(left, right)
 
 
-def draw_ape(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
+def draw_ape(axes: Axes, evaluation: Evaluation, along: Array, label: str) -> None:
     """Draw the APE with its statistics as horizontal lines, interrupted at gaps in time."""
-    error, low, high = score.position_error_m, float(along[0]), float(along[-1])
-    shown_along, values = style.thin_series(along, error, style.MAX_POINTS_NARROW)
-    gap_indices = np.searchsorted(shown_along, along[_gap_indices(score.time_s)])
+    error, low, high = evaluation.position_error_m, float(along[0]), float(along[-1])
+    shown_along, values = style.decimate_series(along, error, style.MAX_POINTS_NARROW)
+    gap_indices = np.searchsorted(shown_along, along[_gap_indices(evaluation.time_s)])
     axes.plot(
         np.insert(shown_along, gap_indices, np.nan),
         np.insert(values, gap_indices, np.nan),
@@ -190,36 +208,36 @@ def draw_ape(axes: Axes, score: Evaluation, along: Array, label: str) -> None:
         lw=0.8,
     )
     for name, title, line_style in STATISTIC_LINES:
-        value = getattr(score.ate.translation_m, name)
+        value = getattr(evaluation.ate.translation_m, name)
         axes.axhline(value, label=f"{title} {format_metres(value)}", zorder=3, **line_style)
     axes.set(xlim=(low, max(high, low + 1e-6)), xlabel=label)
-    axes.set_ylim(0.0, 1.08 * max(float(error.max()), MIN_SCALE_M))
+    axes.set_ylim(0.0, 1.08 * max(float(error.max()), MIN_ERROR_RANGE_M))
     axes.locator_params(axis="x", nbins=6)
     axes.locator_params(axis="y", nbins=4)
 
 
-def _draw_rpe(axes: Axes, score: Evaluation) -> None:
+def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     """Draw the RPE (RMSE) of each delta with its 95 % interval."""
-    for place, (error, statistics) in enumerate(known := _known_rpe(score)):
+    for index, (error, statistics) in enumerate(rpe_statistics := _rpe_statistics(evaluation)):
         if isinstance(error.interval_m, Interval):
-            ends = error.interval_m.low, error.interval_m.high
-            axes.plot([place] * 2, ends, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
-        axes.plot(place, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
-    shown_indices = range(0, len(known), 1 + len(known) // MAX_DELTA_LABELS)
-    axes.set_xticks(shown_indices, [known[place][0].delta_text for place in shown_indices])
-    axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_SCALE_M))
+            interval = error.interval_m.low, error.interval_m.high
+            axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
+        axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
+    shown_indices = range(0, len(rpe_statistics), 1 + len(rpe_statistics) // MAX_DELTA_LABELS)
+    axes.set_xticks(shown_indices, [rpe_statistics[index][0].delta_text for index in shown_indices])
+    axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
     axes.set_xlabel("delta")
 
 
-def _known_rpe(score: Evaluation) -> list[tuple[PairwiseError, Statistics]]:
-    return [(e, e.translation_m) for e in score.rpe if isinstance(e.translation_m, Statistics)]
+def _rpe_statistics(evaluation: Evaluation) -> list[tuple[PairwiseError, Statistics]]:
+    return [(e, e.translation_m) for e in evaluation.rpe if isinstance(e.translation_m, Statistics)]
 
 
-def time_from_start(score: Evaluation) -> tuple[Array, str]:
-    """Return the time of each pose as drawn (s), and the axis label."""
-    zero = time_origin_s(score)
-    return score.time_s - zero, "time from the first pose (s)" if zero else "time (s)"
+def time_from_start(evaluation: Evaluation) -> tuple[Array, str]:
+    """Return the time of each pose since the origin of the time axis (s), and the axis label."""
+    origin_s = time_origin_s(evaluation)
+    return evaluation.time_s - origin_s, "time from the first pose (s)" if origin_s else "time (s)"
 
 
 def _gap_indices(time_s: Array) -> IntArray:
@@ -252,39 +270,40 @@ def format_metres(value: float) -> str:
     return f"{value:.3f} m" if abs(value) < 10.0 else f"{value:.1f} m"
 
 
-def time_origin_s(score: Evaluation) -> float:
+def time_origin_s(evaluation: Evaluation) -> float:
     """Return the origin of the time axes: the first pose if timestamps are UNIX time, else 0 s."""
-    start = float(score.time_s[0])
-    return start if start > SMALLEST_STAMP_S else 0.0
+    start = float(evaluation.time_s[0])
+    return start if start > MIN_UNIX_TIME_S else 0.0
 
 
-def summary(score: Evaluation) -> str:
-    """Summarise ATE and largest error in one line."""
-    worst_index = int(np.argmax(score.position_error_m))
-    aligned = "without" if score.alignment == "none" else "after"
+def summary(evaluation: Evaluation) -> str:
+    """Summarise ATE and largest position error in one line."""
+    worst_index = int(np.argmax(evaluation.position_error_m))
+    preposition = "without" if evaluation.alignment == "none" else "after"
+    error = evaluation.ate.translation_m
     return (
-        f"ATE {format_metres(score.ate.translation_m.rmse)} (RMSE {aligned} alignment). Largest "
-        f"error {format_metres(score.ate.translation_m.max)} at "
-        f"{score.time_s[worst_index] - time_origin_s(score):.1f} s, after "
-        f"{score.distance_m[worst_index]:.1f} m of the path."
+        f"ATE {format_metres(error.rmse)} (RMSE {preposition} alignment). Largest error "
+        f"{format_metres(error.max)} at "
+        f"{evaluation.time_s[worst_index] - time_origin_s(evaluation):.1f} s, after "
+        f"{evaluation.distance_m[worst_index]:.1f} m of the path."
     )
 
 
-def write_evaluation(page: Page, score: Evaluation) -> None:
+def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     """Write estimate, reference, method and the table of error statistics."""
-    page.labelled("Estimate", describe_track(score.estimate))
-    page.labelled("Against", describe_track(score.reference))
-    page.labelled("Method", describe_score(score))
-    for text in score.warnings:
+    page.write_labelled("Estimate", describe_track(evaluation.estimate))
+    page.write_labelled("Against", describe_track(evaluation.reference))
+    page.write_labelled("Method", describe_method(evaluation))
+    for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
-    page.table(SCORE_HEAD, score_rows(score), right=range(1, len(SCORE_HEAD)))
-    page.numbers(" ".join([*missing_reasons(score), *score.notes]))
+    page.table(ERROR_TABLE_HEAD, error_rows(evaluation), right=range(1, len(ERROR_TABLE_HEAD)))
+    page.write_small(" ".join([*missing_reasons(evaluation), *evaluation.notes]))
 
 
-def score_rows(score: Evaluation) -> list[list[str]]:
+def error_rows(evaluation: Evaluation) -> list[list[str]]:
     """Return the table rows of the ATE and each RPE, with the columns of SCORE_HEAD."""
-    errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": score.ate}
-    errors |= {f"RPE {error.delta_text} (m)": error for error in score.rpe}
+    errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": evaluation.ate}
+    errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
     for name, error in errors.items():
         translation, rotation = error.translation_m, error.rotation_deg
@@ -299,12 +318,12 @@ def score_rows(score: Evaluation) -> list[list[str]]:
     return rows
 
 
-def missing_reasons(score: Evaluation) -> list[str]:
-    """Return a sentence per missing quantity with its reason, without repetitions."""
+def missing_reasons(evaluation: Evaluation) -> list[str]:
+    """Return a sentence with the reason for each missing quantity, without repetitions."""
     quantities = [
-        score.ate.interval_m,
-        score.ate.rotation_deg,
-        *(e.translation_m for e in score.rpe),
+        evaluation.ate.interval_m,
+        evaluation.ate.rotation_deg,
+        *(e.translation_m for e in evaluation.rpe),
     ]
     unavailable = [quantity for quantity in quantities if isinstance(quantity, Unavailable)]
     return list(
@@ -312,13 +331,15 @@ def missing_reasons(score: Evaluation) -> list[str]:
     )
 
 
-def unaligned_sentence(score: Evaluation) -> str:
+def unaligned_sentence(evaluation: Evaluation) -> str:
     """Caption of the map before alignment: RMSE, and the transform of the alignment."""
-    x, y = score.unaligned_m, score.reference_m
-    rmse_m = float(np.sqrt(((x - y) ** 2).sum(axis=1).mean()))
-    alignment = score.transform
+    estimate_m, reference_m = evaluation.unaligned_m, evaluation.reference_m
+    rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
+    alignment = evaluation.transform
     scale_text = f", scale {alignment.scale:.3g}" if alignment.degrees_of_freedom == 7 else ""
-    shift_m = float(np.linalg.norm(alignment.apply(x.mean(axis=0)) - x.mean(axis=0)))
+    shift_m = float(
+        np.linalg.norm(alignment.apply(estimate_m.mean(axis=0)) - estimate_m.mean(axis=0))
+    )
     return (
         f"RMSE before alignment {format_metres(rmse_m)}. Alignment: rotation "
         f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)}"
@@ -326,43 +347,45 @@ def unaligned_sentence(score: Evaluation) -> str:
     )
 
 
-def vertical_error_sentence(score: Evaluation, axis: int) -> str:
+def vertical_error_sentence(evaluation: Evaluation, axis: int) -> str:
     """Caption of the side view: RMSE along the vertical axis and its share."""
-    squares = ((score.estimate_m - score.reference_m) ** 2).mean(axis=0)
-    name = AXES_OF_FRAME[score.reference.frame][axis]
+    squares = ((evaluation.estimate_m - evaluation.reference_m) ** 2).mean(axis=0)
+    name = AXES_OF_FRAME[evaluation.reference.frame][axis]
     if not squares.any():
-        return f"The error along {name} is zero."
+        return "Estimate and reference are equal: the RMSE is zero along every axis."
     return (
         f"Along {name} the RMSE is {format_metres(float(np.sqrt(squares[axis])))}: "
         f"{squares[axis] / squares.sum():.0%} of the squared error."
     )
 
 
-def worst_moments_sentence(score: Evaluation) -> str:
+def worst_poses_sentence(evaluation: Evaluation) -> str:
     """Caption of the APE panel: share of the squared error in the worst 10 % of the poses."""
-    squares = np.sort(score.position_error_m**2)
-    worst = squares[-max(1, len(squares) // 10) :].sum() / max(squares.sum(), NEGLIGIBLE_M**2)
+    squared_errors = np.sort(evaluation.position_error_m**2)
+    worst_share = squared_errors[-max(1, len(squared_errors) // 10) :].sum() / max(
+        squared_errors.sum(), NEGLIGIBLE_ERROR_M**2
+    )
     return (
-        f"The worst 10 % of the poses contribute {worst:.0%} of the squared error. "
-        "10 % means a constant error; much more means a few large errors."
+        f"The worst 10 % of the poses contribute {worst_share:.0%} of the squared error. "
+        "A constant error contributes 10 %; a few large errors contribute much more."
     )
 
 
-def quarter_rmse(score: Evaluation) -> list[float]:
+def quarter_rmse(evaluation: Evaluation) -> list[float]:
     """Return the RMSE (m) of each quarter of the reference path that contains poses."""
-    along = score.distance_m
+    along = evaluation.distance_m
     edges = np.linspace(0.0, along[-1], 5)
     quarter_index = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, 3)
-    errors = [score.position_error_m[quarter_index == index] for index in range(4)]
+    errors = [evaluation.position_error_m[quarter_index == index] for index in range(4)]
     return [float(np.sqrt(np.mean(e**2))) for e in errors if len(e)]
 
 
-def quarters_sentence(score: Evaluation) -> str:
+def quarters_sentence(evaluation: Evaluation) -> str:
     """Caption of the APE over distance: RMSE per quarter of the path."""
-    found = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(score))
+    rmse_text = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(evaluation))
     return (
-        f"RMSE per quarter of the path: {found} m. Drift grows along the path; after "
-        "alignment it is large at both ends."
+        f"RMSE per quarter of the path: {rmse_text} m. Drift grows along the path. After "
+        "alignment its error is large at both ends."
     )
 
 
@@ -372,11 +395,12 @@ def rpe_growth_sentence(rpe: tuple[PairwiseError, ...]) -> str:
     rmse: dict[tuple[str, float], float] = {
         (error.unit, error.delta): error.translation_m.rmse
         for error in rpe
-        if isinstance(error.translation_m, Statistics) and error.translation_m.rmse > NEGLIGIBLE_M
+        if isinstance(error.translation_m, Statistics)
+        and error.translation_m.rmse > NEGLIGIBLE_ERROR_M
     }
     units = [unit for unit, _ in rmse]
     unit = max(units, key=units.count, default="")
-    deltas = sorted(delta for one, delta in rmse if one == unit)
+    deltas = sorted(delta for delta_unit, delta in rmse if delta_unit == unit)
     if len(deltas) < 2:
         return f"{interval_note} Give a second distance (--rpe) to distinguish noise from drift."
     low, high = deltas[0], deltas[-1]
@@ -389,7 +413,7 @@ def rpe_growth_sentence(rpe: tuple[PairwiseError, ...]) -> str:
 
 
 def format_interval(interval: Interval | Unavailable) -> str:
-    """Format an interval as "low–high", "" if it is missing."""
+    """Format an interval as "low–high"; "" if it is unavailable."""
     return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, Interval) else ""
 
 
@@ -401,13 +425,13 @@ def describe_track(path: Trajectory) -> str:
     )
 
 
-def describe_score(score: Evaluation) -> str:
-    """Format alignment, association and time offset of a score on one line."""
-    matched = score.association
-    offset = score.time_offset.offset_s
-    clock = "" if not offset else f"; time offset {offset:+.3f} s"
+def describe_method(evaluation: Evaluation) -> str:
+    """Format alignment, association and time offset of an evaluation on one line."""
+    association = evaluation.association
+    offset = evaluation.time_offset.offset_s
+    offset_text = "" if not offset else f"; time offset {offset:+.3f} s"
     return (
-        f"alignment {score.alignment} ({score.alignment_reason.rstrip('.')}); "
-        f"{matched.poses} pose pairs, {matched.coverage_estimate:.0%} of the "
-        f"estimate and {matched.coverage_reference:.0%} of the reference's time{clock}"
+        f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')}); "
+        f"{association.poses} pose pairs, {association.coverage_estimate:.0%} of the "
+        f"estimate and {association.coverage_reference:.0%} of the reference's time{offset_text}"
     )

@@ -11,8 +11,8 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
 from px4fuse.report.style import EKF2_REJECTED, MUTED_COLOUR, Artist, Axes, label_time_axis
 
-# Bands differ in shade and hatching, so they remain distinct in grey. Marks are at the bottom of
-# the axes, resets at the top
+# Bands differ in shade and hatching, so they remain distinct in grey. Markers are at the bottom of
+# the axes, those of resets at the top
 GROUND_BAND: dict[str, Any] = {"facecolor": "#e4e4e4", "edgecolor": "none", "lw": 0.0}
 GAP_BAND: dict[str, Any] = {
     "facecolor": "#fbfbfb",
@@ -33,14 +33,14 @@ OUTLIER_MARK: dict[str, Any] = {
 TAKE_OFF_MARK: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
 LANDING_MARK: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
 REJECTED_HEIGHT, OUTLIER_HEIGHT, RESET_HEIGHT = 0.025, 0.075, 0.92
-STRIP_HEIGHT = 12.0  # points; room for the names of flight modes
-# Share of the segment; of marks that are closer, only the first is drawn
+MODE_NAMES_HEIGHT = 12.0  # points; height above the axes for the names of flight modes
+# Fraction of the segment; of markers closer than this, only the first is drawn
 MIN_MARK_DISTANCE = 1.0 / 300.0
-STRIP_FONT_SIZE, STRIP_LETTER_WIDTH = 6.5, 4.0  # points
+MODE_NAME_SIZE, MODE_LETTER_WIDTH = 6.5, 4.0  # points
 
 
 class Mark(NamedTuple):
-    """Kind of event: bands over the full height (height None), or markers at a height (0 to 1)."""
+    """Kind of event: bands (height None), or markers at a height of the axes (0 to 1)."""
 
     label: str
     spans_or_times: Sequence[Any] | Array
@@ -66,7 +66,7 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
 
 
 def draw_marks(
-    axes: Axes, analysis: Analysis, *, axis: str | None = None, strip: bool = False
+    axes: Axes, analysis: Analysis, *, axis: str | None = None, with_mode_names: bool = False
 ) -> None:
     """Draw the events behind the curves, and set the limits of the time axis to the segment.
 
@@ -101,7 +101,7 @@ def draw_marks(
             mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
             markers = Line2D(visible_times, np.full(len(visible_times), height), **mark_style)
             axes.add_artist(markers)  # unlike add_line this does not change the limits
-    if strip:
+    if with_mode_names:
         _draw_mode_names(axes, analysis)
 
 
@@ -109,25 +109,27 @@ def panel(
     page: Page,
     analysis: Analysis,
     title: str,
-    sentence: str,
+    caption: str,
     height: float,
     *,
     above: float = 4.0,
     axis: str | None = None,
-    strip: bool = False,
-    last: bool = True,
+    with_mode_names: bool = False,
+    with_time_label: bool = True,
 ) -> Axes:
     """Add a panel over time with the marks of :func:`draw_marks`.
 
     Parameters
     ----------
     last : bool
-        Label the time axis; False if a panel below it has the label.
+        False if a panel below this one has the label of the time axis.
     """
-    strip = strip and bool(analysis.events.modes)
-    axes = page.panel(title, sentence, height, above=max(above, STRIP_HEIGHT if strip else 0.0))
-    draw_marks(axes, analysis, axis=axis, strip=strip)
-    label_time_axis(axes, last)
+    with_mode_names = with_mode_names and bool(analysis.events.modes)
+    axes = page.panel(
+        title, caption, height, above=max(above, MODE_NAMES_HEIGHT if with_mode_names else 0.0)
+    )
+    draw_marks(axes, analysis, axis=axis, with_mode_names=with_mode_names)
+    label_time_axis(axes, with_time_label)
     return axes
 
 
@@ -169,7 +171,7 @@ def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:
     width = 72.0 * axes.bbox.width / axes.figure.dpi
     for mode in analysis.events.modes:
         start, end = max(mode.start_s, low), min(mode.end_s, high)
-        if (end - start) / (high - low) * width >= STRIP_LETTER_WIDTH * len(mode.name):
+        if (end - start) / (high - low) * width >= MODE_LETTER_WIDTH * len(mode.name):
             axes.text(
                 (start + end) / 2.0,
                 1.012,
@@ -177,6 +179,6 @@ def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:
                 transform=axes.get_xaxis_transform(),
                 ha="center",
                 va="bottom",
-                size=STRIP_FONT_SIZE,
+                size=MODE_NAME_SIZE,
                 color=MUTED_COLOUR,
             )

@@ -1,6 +1,7 @@
 """Pages on the flight: position, velocity, innovations and σ of KF and EKF2 over time.
 
-The main axis has two pages, with a zoom into prediction and update; the other axes share one.
+The main axis has two pages, with a zoom into single predictions and updates; the other axes share
+one page.
 """
 
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from px4fuse.report.phrases import filters_by_name, format_verdict, verdict_note
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
 
 COLUMN_GAP = 14.0  # points between columns
-ZOOM_UPDATES = 15  # updates in the zoom
+ZOOM_UPDATES = 15
 MIN_ZOOM_S = 1.0
 ZOOM_HEIGHT = 125.0  # points; height of the axes
 
@@ -28,7 +29,7 @@ ZOOM_HEIGHT = 125.0  # points; height of the axes
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the page on position and velocity along the main axis."""
     result = analysis.main
-    page = Page(f"Position and velocity along {result.axis.called}")
+    page = Page(f"Position and velocity along {result.axis.label}")
     _write_legend(page, analysis)
     reference = panels.error_reference(result)
     shown_panels = [panels.POSITION, panels.VELOCITY]
@@ -36,7 +37,11 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         shown_panels.append(panels.ERROR)
     for panel in shown_panels:
         panel.draw_on_page(
-            page, analysis, result, last=panel is shown_panels[-1], strip=panel is shown_panels[0]
+            page,
+            analysis,
+            result,
+            with_time_label=panel is shown_panels[-1],
+            with_mode_names=panel is shown_panels[0],
         )
     page.write(unexplained_note(analysis), above=6.0)
     if isinstance(reference, Unavailable):
@@ -64,13 +69,15 @@ def _write_legend(page: Page, analysis: Analysis) -> None:
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the page on innovations, σ_p and σ_v along the main axis, with a zoom."""
     result = analysis.main
-    page = Page(f"Innovations and variances along {result.axis.called}")
+    page = Page(f"Innovations and variances along {result.axis.label}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
-        last, first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
-        panel.draw_on_page(page, analysis, result, last=last, strip=first)
+        is_last, is_first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
+        panel.draw_on_page(
+            page, analysis, result, with_time_label=is_last, with_mode_names=is_first
+        )
     _draw_zoom(page, analysis)
     for note in verdict_notes(analysis):
-        page.numbers(note)
+        page.write_small(note)
     yield page
 
 
@@ -96,14 +103,14 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
         symbols += ["triangle up before the update", "triangle down after"]
     if isinstance(result.ekf2_variance, pd.DataFrame):
         symbols.append("square as logged")
-    ekf2 = f" EKF2: {', '.join(symbols)}." if symbols else ""
-    page.numbers(f"Line: KF. Grey ticks: measurements.{ekf2}")
+    ekf2_legend = f" EKF2: {', '.join(symbols)}." if symbols else ""
+    page.write_small(f"Line: KF. Grey ticks: measurements.{ekf2_legend}")
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     """Return start and end (s) of the zoom, with about ZOOM_UPDATES updates.
 
-    It is centred on the middle measurement (of EKF2's, if logged), so it avoids gaps.
+    The zoom is centred on the middle measurement (of EKF2, if logged), so it avoids gaps.
     """
     times = result.replay.updates.index.to_numpy()
     if len(times) < 2:
@@ -111,15 +118,15 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     interval = float(np.median(np.diff(times)))
     count = min(max(ZOOM_UPDATES, round(MIN_ZOOM_S / interval)), len(times) - 1)
     spans = times[count:] - times[:-count]
-    middle = float(times[len(times) // 2])
+    middle_s = float(times[len(times) // 2])
     if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
-        middle = float(result.ekf2_innovations.index[len(result.ekf2_innovations) // 2])
-    start = np.argmin(np.abs(times[:-count] + spans / 2.0 - middle))
-    return float(times[start]), float(times[start + count])
+        middle_s = float(result.ekf2_innovations.index[len(result.ekf2_innovations) // 2])
+    nearest = np.argmin(np.abs(times[:-count] + spans / 2.0 - middle_s))
+    return float(times[nearest]), float(times[nearest + count])
 
 
 def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
-    """Draw σ_p with two values per update: before and after it."""
+    """Draw σ_p before and after each update."""
     updates, steps = result.replay.updates, result.replay.steps
     prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
     # a stable sort keeps the prior before the posterior at equal times
@@ -129,10 +136,15 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
     )
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         ekf2 = result.ekf2_innovations.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
-        before, after = np.sqrt(ekf2["prior_variance_m2"]), np.sqrt(ekf2["posterior_variance_m2"])
-        axes.vlines(ekf2.index, after, before, color=EKF2_COLOUR, lw=1.0)
-        axes.plot(before, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2_COLOUR)
-        axes.plot(after, ls="none", marker="v", ms=3.6, mew=0, color=EKF2_COLOUR)
+        prior_sigma, posterior_sigma = (
+            np.sqrt(ekf2["prior_variance_m2"]),
+            np.sqrt(ekf2["posterior_variance_m2"]),
+        )
+        axes.vlines(ekf2.index, posterior_sigma, prior_sigma, color=EKF2_COLOUR, lw=1.0)
+        axes.plot(
+            prior_sigma, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2_COLOUR
+        )
+        axes.plot(posterior_sigma, ls="none", marker="v", ms=3.6, mew=0, color=EKF2_COLOUR)
     if isinstance(result.ekf2_variance, pd.DataFrame):
         logged = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[slice(*window)])
         axes.plot(logged, ls="none", marker="s", ms=3.0, mew=0.7, mfc="white", color=EKF2_COLOUR)
@@ -142,21 +154,24 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
 def zoom_sentence(result: AxisComparison) -> str:
     """Caption of the zoom: σ_p before and after an update, for KF and EKF2."""
     texts = []
-    for name, one in filters_by_name(result).items():
-        before, after = one.sigma_p_before_update_m, one.sigma_p_after_update_m
-        if before is None or after is None:
+    for name, filter_summary in filters_by_name(result).items():
+        prior_m, posterior_m = (
+            filter_summary.sigma_p_before_update_m,
+            filter_summary.sigma_p_after_update_m,
+        )
+        if prior_m is None or posterior_m is None:
             if name == "EKF2":
                 texts.append("EKF2: S or R not logged, so σ before and after the update is unknown")
             continue
-        shrink = 1.0 - after**2 / before**2
-        shrinks = f"{name} {before:.3f} to {after:.3f} m, {shrink:.0%} of the variance"
+        reduction = 1.0 - posterior_m**2 / prior_m**2
+        change_text = f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {reduction:.0%} less variance"
         if name == "KF":
-            shrinks = (
+            change_text = (
                 "σ grows in each prediction (SIGMA_A "
                 f"{result.replay.settings.sigma_a_m_s2:g} m/s²) and decreases with each "
-                f"measurement ({shrinks})"
+                f"measurement ({change_text})"
             )
-        texts.append(shrinks)
+        texts.append(change_text)
     return f"{'; '.join(texts)}." if texts else ""
 
 
@@ -173,13 +188,14 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     columns = [Page(width=width) for _ in others]
     for column, result in zip(columns, others, strict=True):
         verdicts = "; ".join(
-            f"{name} {format_verdict(one)}" for name, one in filters_by_name(result).items()
+            f"{name} {format_verdict(consistency)}"
+            for name, consistency in filters_by_name(result).items()
         )
         if isinstance(result.difference, Difference):
             verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
         column.heading(result.axis.name)
         column.write(f"{verdicts}.", size=7.5)
-    page.beside(*columns, gap=COLUMN_GAP)
+    page.add_columns(*columns, gap=COLUMN_GAP)
     shown_panels = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
     if any(isinstance(panels.error_reference(axis), pd.DataFrame) for axis in others):
         shown_panels.insert(2, panels.ERROR)
@@ -187,7 +203,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         columns = [Page(width=width) for _ in others]
         for column, result in zip(columns, others, strict=True):
             panel.draw_on_page(
-                column, analysis, result, last=panel is shown_panels[-1], narrow=True
+                column, analysis, result, with_time_label=panel is shown_panels[-1], is_narrow=True
             )
-        page.beside(*columns, gap=COLUMN_GAP)
+        page.add_columns(*columns, gap=COLUMN_GAP)
     yield page

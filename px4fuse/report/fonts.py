@@ -1,4 +1,4 @@
-"""Fonts for names and notes in any script: installed fonts for a text, and missing characters.
+"""Fonts for names and notes in any script, and characters that no installed font has.
 
 Typst shapes the text (Arabic, Devanagari, Thai); it only needs fonts with the characters.
 """
@@ -11,10 +11,10 @@ from matplotlib.font_manager import FontEntry, FontPath
 
 # Installed with matplotlib; has Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
-# Parts of the names of fonts that draw a box for every character
+# Words in the names of fonts that draw a box for every character
 BOX_FONTS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
-MAX_SHOWN = 12  # characters listed in the advice
+MAX_LISTED_CHARACTERS = 12  # characters listed in the advice
 
 
 @cache
@@ -47,9 +47,11 @@ def missing_characters(text: str) -> str:
 
 def font_advice(characters: str) -> str:
     """Format the advice to install a font for missing characters."""
-    shown = characters[:MAX_SHOWN] + ("…" if len(characters) > MAX_SHOWN else "")
+    listed = characters[:MAX_LISTED_CHARACTERS] + (
+        "…" if len(characters) > MAX_LISTED_CHARACTERS else ""
+    )
     return (
-        f"No installed font has the characters {shown}; the report shows {NO_GLYPH} "
+        f"No installed font has the characters {listed}; the report shows {NO_GLYPH} "
         "instead. Install a font with them, for example Noto Sans of their script "
         "(fonts.google.com/noto)."
     )
@@ -63,8 +65,8 @@ def _non_ascii(text: str) -> list[str]:
 def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
     """Return names and paths of the other installed fonts, preferred ones first."""
     manager = font_manager.fontManager
-    known = {str(entry.fname) for entry in manager.ttflist}
-    for path in sorted(set(font_manager.findSystemFonts()) - known):
+    known_paths = {str(entry.fname) for entry in manager.ttflist}
+    for path in sorted(set(font_manager.findSystemFonts()) - known_paths):
         try:
             manager.addfont(path)
         except (OSError, RuntimeError, NotImplementedError):
@@ -80,17 +82,17 @@ def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
 
 
 def _sort_key(entry: FontEntry) -> tuple[object, ...]:
-    """Sort key: Noto Sans first, then sans serif, then regular weight; PostScript outlines last.
+    """Return the sort key: Noto Sans first, then sans serif, then regular weight; PostScript last.
 
     PostScript outlines are embedded as TrueType, which some PDF viewers do not display.
     """
     weight = entry.weight if isinstance(entry.weight, int) else 400
-    postscript = str(entry.fname).lower().endswith(".otf")
-    noto, sans = entry.name.startswith("Noto Sans"), "Sans" in entry.name
+    is_postscript = str(entry.fname).lower().endswith(".otf")
+    is_noto, is_sans = entry.name.startswith("Noto Sans"), "Sans" in entry.name
     return (
-        postscript,
-        not noto,
-        not sans,
+        is_postscript,
+        not is_noto,
+        not is_sans,
         abs(weight - 400),
         entry.name,
         str(entry.fname),

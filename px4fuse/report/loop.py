@@ -1,4 +1,4 @@
-"""Page on a loop: closure error, corrected paths, and scores of each correction."""
+"""Page on a loop: closure error, corrected paths, and their errors against references."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings import Finding, by_root
+from px4fuse.findings import Finding, group_by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
-from px4fuse.loop.analysis import SMALLEST_STAMP_S
-from px4fuse.loop.corrections import SINGLE_LOOP
+from px4fuse.loop.analysis import MIN_UNIX_TIME_S
+from px4fuse.loop.corrections import SINGLE_LOOP_REASON
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.report import style
 from px4fuse.report.cover import student_line, write_finding
-from px4fuse.report.evaluation import describe_score, format_interval, plot_path
-from px4fuse.report.page import AXIS_LABEL_HEIGHT, TICKS_HEIGHT, Cell, Page, appendix
+from px4fuse.report.evaluation import describe_method, format_interval, plot_path
+from px4fuse.report.page import AXIS_LABEL_HEIGHT, TICKS_HEIGHT, Cell, Page, appendix_title
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
 from px4fuse.text import capitalise_first, format_p_value
@@ -31,7 +31,7 @@ LEAD = (
     "lesson, or headings too), or by pose graph optimisation. Each closure is tested first: a "
     "false one would deform the whole path."
 )
-MAX_ROWS = 10  # rejected closures listed on the terminal
+MAX_LISTED_CLOSURES = 10  # on the terminal
 GREEN, RED = "#3a7d5c", style.SEVERITY_COLOURS["error"]
 PATH_STYLES: Mapping[str, dict[str, Any]] = {
     corrections.UNCORRECTED: {"color": EKF2_COLOUR, "lw": 1.1, "ls": (0, (4, 1.6))},
@@ -59,14 +59,14 @@ CLOSURE_HEAD = (
     "GNC\nweight",
 )
 TITLE = "Loop closure"
-MAP_POINTS = 2000  # drawn points per path
-MAP_HEIGHT, LEGEND_HEIGHT = 290.0, 38.0  # points; axes, and legend below them
+MAX_MAP_POINTS = 2000  # drawn points per path
+MAP_HEIGHT, LEGEND_HEIGHT = 290.0, 38.0  # points; heights of the axes and of the legend below them
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix page if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(appendix(TITLE), LEAD)
+        page = Page(appendix_title(TITLE), LEAD)
         _write_page(page, analysis.loop)
         yield page
 
@@ -75,14 +75,14 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the page of ``px4fuse loop``, with its findings."""
     page = Page(TITLE, LEAD)
     if student := student_line(results.student, ", "):
-        page.labelled("Student", student)
-    page.labelled("SHA-256", loop.odometry.trajectory.sha256)
+        page.write_labelled("Student", student)
+    page.write_labelled("SHA-256", loop.odometry.trajectory.sha256)
     _write_page(page, loop, results.findings)
     yield page
 
 
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
-    """Write the results, the map, the closures and the scores."""
+    """Write the results, the map, the closures, and the RPE of each path."""
     write_loop(page, loop, findings)
     _draw_map(page, loop)
     page.heading("Closures and scores", 10.5, above=14.0)
@@ -99,7 +99,7 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
 
 def shown_paths(loop: Loop) -> list[CorrectedPath]:
     """Return the corrected paths that the map shows, one per kind of correction."""
-    return [part for part in loop.reported_paths if part.name in PATH_STYLES]
+    return [path for path in loop.reported_paths if path.name in PATH_STYLES]
 
 
 def _draw_map(page: Page, loop: Loop) -> None:
@@ -116,9 +116,16 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _draw_reference(axes, loop)
-    for part in shown_paths(loop):
-        position = part.trajectory.position_m[:: max(1, len(part.trajectory) // MAP_POINTS)]
-        axes.plot(position[:, 1], position[:, 0], label=part.name, **PATH_STYLES[part.name])
+    for corrected_path in shown_paths(loop):
+        position = corrected_path.trajectory.position_m[
+            :: max(1, len(corrected_path.trajectory) // MAX_MAP_POINTS)
+        ]
+        axes.plot(
+            position[:, 1],
+            position[:, 0],
+            label=corrected_path.name,
+            **PATH_STYLES[corrected_path.name],
+        )
     start, end = path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
     axes.plot(
@@ -139,9 +146,14 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
     for reference in loop.references[:1]:
         score = loop.best.scores.get(reference.name)
         if isinstance(score, Evaluation):
-            at = score.transform.apply_inverse(score.reference_m)[:, (1, 0)]
+            reference_m = score.transform.apply_inverse(score.reference_m)[:, (1, 0)]
             plot_path(
-                axes, at, score.time_s, label=reference.name, **LINES["ground truth"], zorder=4
+                axes,
+                reference_m,
+                score.time_s,
+                label=reference.name,
+                **LINES["ground truth"],
+                zorder=4,
             )
 
 
@@ -153,7 +165,7 @@ def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
-    for group in by_root(findings):
+    for group in group_by_root(findings):
         write_finding(page, group)
     return page
 
@@ -165,31 +177,33 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         f"{path.name}: {TRACK_KINDS[path.kind]}, {len(path)} poses, "
         f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m"
     )
-    page.labelled("Track", track_text)
-    page.labelled("Part", f"{_format_span(loop)}, {loop.part_reason}")
-    page.labelled("Closure", describe_closure_error(loop))
-    end = loop.true_end
-    page.labelled("True end", "not used" if isinstance(end, Unavailable) else end.source)
+    page.write_labelled("Track", track_text)
+    page.write_labelled("Segment", f"{_format_span(loop)}, {loop.part_reason}")
+    page.write_labelled("Closure", describe_closure_error(loop))
+    true_end = loop.true_end
+    page.write_labelled(
+        "True end", "not used" if isinstance(true_end, Unavailable) else true_end.source
+    )
     for closure in loop.closures[:1]:
-        page.labelled("Gate", describe_gate(closure))
-    single = SINGLE_LOOP if len(loop.closures) == 1 else ""
-    for text in (by_distance_sentence(loop), single, *missing_corrections(loop)):
+        page.write_labelled("Gate", describe_gate(closure))
+    single_loop_note = SINGLE_LOOP_REASON if len(loop.closures) == 1 else ""
+    for text in (by_distance_sentence(loop), single_loop_note, *missing_corrections(loop)):
         page.write(text, colour=MUTED_COLOUR, above=2.0)
-    for group in by_root(findings):
+    for group in group_by_root(findings):
         write_finding(page, group)
     names = [reference.name for reference in loop.references]
     page.table(
         ["path", "correction\nRMS / max (m)", *(f"ATE against\n{name} (m)" for name in names)],
         [
             [
-                part.name,
-                format_correction(part),
-                *(_format_ate(part.scores[name]) for name in names),
+                corrected_path.name,
+                format_correction(corrected_path),
+                *(_format_ate(corrected_path.scores[name]) for name in names),
             ]
-            for part in loop.reported_paths
+            for corrected_path in loop.reported_paths
         ],
     )
-    page.numbers(
+    page.write_small(
         (
             "ATE: position RMSE after alignment, with its 95 % interval (block "
             "bootstrap) if the flight is long enough."
@@ -221,16 +235,23 @@ def write_scores(page: Page, loop: Loop) -> None:
     if rows:
         page.table(CLOSURE_HEAD, rows, right=(1, 2, 3, 4, 6, 7))
     for reference in loop.references:
-        scores = {part.name: part.scores[reference.name] for part in loop.reported_paths}
-        known = {name: score for name, score in scores.items() if isinstance(score, Evaluation)}
+        scores = {
+            corrected_path.name: corrected_path.scores[reference.name]
+            for corrected_path in loop.reported_paths
+        }
+        evaluations = {
+            name: score for name, score in scores.items() if isinstance(score, Evaluation)
+        }
         page.heading(f"RPE against {reference.name}", 10.5, above=14.0)
-        missing = (score.reason for score in scores.values() if isinstance(score, Unavailable))
-        for reason in dict.fromkeys(missing):
+        missing_reasons = (
+            score.reason for score in scores.values() if isinstance(score, Unavailable)
+        )
+        for reason in dict.fromkeys(missing_reasons):
             page.write(reason, size=7.5)
-        if not known:
+        if not evaluations:
             continue
-        first = next(iter(known.values()))
-        head = ["path", *(f"{e.delta_text} (m)" for e in first.rpe), "rotation (°)"]
+        first_evaluation = next(iter(evaluations.values()))
+        head = ["path", *(f"{e.delta_text} (m)" for e in first_evaluation.rpe), "rotation (°)"]
         page.table(
             head,
             [
@@ -239,24 +260,28 @@ def write_scores(page: Page, loop: Loop) -> None:
                     *(_format_error(e.translation_m, e.interval_m) for e in score.rpe),
                     _format_rmse(score.ate.rotation_deg, 2),
                 ]
-                for name, score in known.items()
+                for name, score in evaluations.items()
             ],
         )
-        for text in (describe_score(first), *first.notes, *first.warnings):
-            page.numbers(capitalise_first(text))
+        for text in (
+            describe_method(first_evaluation),
+            *first_evaluation.notes,
+            *first_evaluation.warnings,
+        ):
+            page.write_small(capitalise_first(text))
 
 
-def _format_span(part: Loop) -> str:
-    if part.start_s > SMALLEST_STAMP_S:
-        return f"{part.end_s - part.start_s:.1f} s from timestamp {part.start_s:.2f} s"
-    return f"{part.start_s:.1f} s to {part.end_s:.1f} s"
+def _format_span(loop: Loop) -> str:
+    if loop.start_s > MIN_UNIX_TIME_S:
+        return f"{loop.end_s - loop.start_s:.1f} s from timestamp {loop.start_s:.2f} s"
+    return f"{loop.start_s:.1f} s to {loop.end_s:.1f} s"
 
 
 def describe_closure_error(loop: Loop) -> str:
     """Format the closure error in m, in percent of the path, per axis and in heading."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
-        return f"path {loop.path_length_m:.1f} m; no closure error: the loop is open (--open)"
+        return f"path {loop.path_length_m:.1f} m; the loop is open (--open): no closure error"
     text = (
         f"{error:.2f} m after {loop.path_length_m:.1f} m ({error / loop.path_length_m:.2%}): "
         f"{format_vector(misclosure)}"
@@ -282,8 +307,8 @@ def closure_name(closure: Closure, loop: Loop) -> str:
     """Format the two times of a closure; UNIX timestamps are counted from the first pose."""
     if closure.source == LANDING:
         return "take-off and landing"
-    zero = loop.start_s if loop.start_s > SMALLEST_STAMP_S else 0.0
-    return f"{closure.time_1_s - zero:.2f} s and {closure.time_2_s - zero:.2f} s"
+    origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
+    return f"{closure.time_1_s - origin_s:.2f} s and {closure.time_2_s - origin_s:.2f} s"
 
 
 def by_distance_sentence(loop: Loop) -> str:
@@ -301,10 +326,14 @@ def by_distance_sentence(loop: Loop) -> str:
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    """Return the missing corrections with their reasons, without repetitions."""
-    unavailable = [p for p in loop.corrections.values() if isinstance(p, Unavailable)]
-    reasons = [f"{p.what}: {p.reason}" for p in unavailable]
-    return [r for r in dict.fromkeys(reasons) if SINGLE_LOOP not in r]
+    """Return the corrections that were not computed with the reasons, without repetitions."""
+    unavailable = [
+        correction
+        for correction in loop.corrections.values()
+        if isinstance(correction, Unavailable)
+    ]
+    reasons = [f"{correction.what}: {correction.reason}" for correction in unavailable]
+    return [reason for reason in dict.fromkeys(reasons) if SINGLE_LOOP_REASON not in reason]
 
 
 def _format_ate(score: Evaluation | Unavailable) -> str:
@@ -333,7 +362,7 @@ def format_correction(correction: CorrectedPath) -> str:
 def graph_summary(solved: SolvedGraph) -> Page:
     """Make the terminal page of a pose graph: gate, solver and costs."""
     page = Page()
-    page.labelled(
+    page.write_labelled(
         "Graph",
         (
             f"{solved.name}: {solved.dimension}-D, {solved.poses} poses, {solved.edges} "
@@ -342,22 +371,31 @@ def graph_summary(solved: SolvedGraph) -> Page:
     )
     gates = solved.gates
     if isinstance(gates, Unavailable):
-        page.labelled("Gate", f"not applied: {gates.reason}")
+        page.write_labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:
-        page.labelled("Gate", "no closures to test: every edge is odometry")
+        page.write_labelled("Gate", "no closures to test: every edge is odometry")
     else:
         rejected = [gate for gate in gates if not gate.accepted]
-        lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected[:MAX_ROWS]]
-        lines += [f"and {len(rejected) - MAX_ROWS} more"] if len(rejected) > MAX_ROWS else []
-        page.labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *lines)
-    if len(solved.solutions) == 1 and (~solved.graph.successive).sum() > MAX_ROBUST_CLOSURES:
-        page.labelled(
+        lines = [
+            f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
+            for gate in rejected[:MAX_LISTED_CLOSURES]
+        ]
+        lines += (
+            [f"and {len(rejected) - MAX_LISTED_CLOSURES} more"]
+            if len(rejected) > MAX_LISTED_CLOSURES
+            else []
+        )
+        page.write_labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *lines)
+    if len(solved.solutions) == 1 and (~solved.graph.is_successive).sum() > MAX_ROBUST_CLOSURES:
+        page.write_labelled(
             "Robust", "not solved for this many closures; add --robust (takes some minutes)"
         )
-    unsolved = [SOLUTIONS[key] for key, one in solved.solutions.items() if not one.converged]
-    if unsolved:
-        page.labelled(
-            "Solver", f"not converged: {', '.join(unsolved)}. The cost is not at its minimum."
+    unconverged = [
+        SOLUTIONS[key] for key, solution in solved.solutions.items() if not solution.converged
+    ]
+    if unconverged:
+        page.write_labelled(
+            "Solver", f"not converged: {', '.join(unconverged)}. The cost is not at its minimum."
         )
     rows = [
         [

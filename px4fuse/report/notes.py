@@ -1,4 +1,4 @@
-"""Answer form and student notes: Markdown set as plain text, lists, code and tables.
+"""Page with the answer form and the student's notes (Markdown as plain text, lists and tables).
 
 Mathematics in dollar signs becomes Unicode text (σ, ≤, √), a picture becomes its description, and
 HTML tags are removed. Nothing is loaded or executed.
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from px4fuse.analysis import Analysis
 from px4fuse.answer_form import Answers, form_rows
 from px4fuse.errors import SettingsError
-from px4fuse.report.page import Page, appendix
+from px4fuse.report.page import Page, appendix_title
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
@@ -28,8 +28,8 @@ BODY_SIZE = 8.5
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # points
 MAX_INDENTS = 8
-# Levels of nesting; each takes three levels of Python's stack, which has 1000
-MOST_NESTED = 100
+# Each level takes three levels of Python's call stack, which is limited to 1000
+MAX_NESTING = 100
 TABLE_SIZE = 8.0
 # An opening $ has no space after it, a closing $ no space before and no digit after it, so prices
 # such as $5 and $10 are not mathematics
@@ -65,11 +65,11 @@ SYMBOLS = {
 def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
     """Draw the answer form and the notes; no page if the report has neither."""
     title, answers = "Student notes", results.student.answers
-    page = Page(appendix(title) if isinstance(subject, Analysis) else title)
+    page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):
         page.heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]
-        page.table(("Question", "Answer"), rows, shares=[3.0, 4.0], size=TABLE_SIZE)
+        page.table(("Question", "Answer"), rows, column_widths=[3.0, 4.0], size=TABLE_SIZE)
     write(page, results.student.notes)
     if len(page.blocks) > 1:
         yield page
@@ -100,7 +100,7 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
     Raises
     ------
     SettingsError
-        Emphasis, lists and quotes are nested deeper than :data:`MOST_NESTED`.
+        Emphasis, lists and quotes are nested deeper than :data:`MAX_NESTING`.
     """
     # imported here because it takes 20 ms, which reports without notes save
     from markdown_it import MarkdownIt  # noqa: PLC0415
@@ -108,19 +108,22 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
     markdown = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
     markdown.inline.ruler.before("escape", "maths", _parse_maths)
     tokens = markdown.parse(notes)
-    every = (part for token in tokens for part in (token, *(token.children or ())))
-    depth = max(accumulate(token.nesting for token in every), default=0)
-    if depth > MOST_NESTED:
+    all_tokens = (
+        nested_token for token in tokens for nested_token in (token, *(token.children or ()))
+    )
+    depth = max(accumulate(token.nesting for token in all_tokens), default=0)
+    if depth > MAX_NESTING:
         raise SettingsError(
-            f"{name}: {depth} levels of nesting, at most {MOST_NESTED} are allowed",
+            f"{name}: emphasis, lists and quotes are nested {depth} levels deep; at most "
+            f"{MAX_NESTING} levels are allowed",
             "Remove repeated * and _.",
         )
     return tokens
 
 
-def _write_blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = "") -> None:
+def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str = "") -> None:
     """Write the children of a node, with the list mark before the first line."""
-    indent = INDENT * min(indents, MAX_INDENTS)
+    indent = INDENT * min(indent_level, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
         page.write("", size=BODY_SIZE, indent=indent, mark=mark)
@@ -131,19 +134,21 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indents: int, mark: str = ""
                 size = HEADING_SIZES.get(child.tag, BODY_SIZE)
                 page.write(_inline_text(child), size=size, bold=True, indent=indent, above=6.0)
             case "bullet_list" | "ordered_list":
-                first = int(child.attrs.get("start", 1))
-                for number, item in enumerate(child.children, first):
+                first_number = int(child.attrs.get("start", 1))
+                for number, item in enumerate(child.children, first_number):
                     is_numbered = child.type == "ordered_list"
-                    _write_blocks(page, item, indents + 1, f"{number}." if is_numbered else "•")
+                    _write_blocks(
+                        page, item, indent_level + 1, f"{number}." if is_numbered else "•"
+                    )
             case "blockquote":
-                _write_blocks(page, child, indents + 1)
+                _write_blocks(page, child, indent_level + 1)
             case "fence" | "code_block":
                 code = child.content.rstrip("\n").expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
                 page.write(code, size=7.5, colour=MUTED_COLOUR, indent=indent + INDENT)
             case "table":
                 rows = [row.children for section in child.children for row in section.children]
                 head, *body = ([_inline_text(cell) for cell in row] for row in rows)
-                page.table(head, body, shares=[1.0] * len(head), size=TABLE_SIZE)
+                page.table(head, body, column_widths=[1.0] * len(head), size=TABLE_SIZE)
             case "html_block":
                 page.write(
                     TAG_PATTERN.sub("", child.content).strip(), size=BODY_SIZE, indent=indent

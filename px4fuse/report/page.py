@@ -13,12 +13,12 @@ from typing import Any
 
 from px4fuse.report.style import MUTED_COLOUR, Artist, Axes
 
-# points; width of the text, of the tick labels left of axes, of the labels before texts
+# points; widths of the text, of the tick labels left of axes, of the labels before texts
 PAGE_WIDTH, AXIS_LEFT, LABEL_WIDTH = 512.0, 26.0, 52.0
-# points; room below axes for tick labels, for the axis label, and without both
-TICKS_HEIGHT, AXIS_LABEL_HEIGHT, BARE_HEIGHT = 12.0, 11.0, 3.0
-ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"  # kept, although str.isprintable is False
-# Words without a possible line break are split: PDF/A limits strings to 32,767 characters
+# points; heights below axes for tick labels, for the axis label, and without tick labels
+TICKS_HEIGHT, AXIS_LABEL_HEIGHT, UNLABELLED_HEIGHT = 12.0, 11.0, 3.0
+ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"  # printed, although str.isprintable is False
+# Words this long are split, because PDF/A limits strings to 32,767 characters
 LONG_WORD = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
 Block = dict[str, Any]
 Cell = str | tuple[str, str]
@@ -30,7 +30,7 @@ class Page:
     Attributes
     ----------
     blocks : list of Block
-        Content in order; panels contain their figures until :func:`data` converts them.
+        Content in order; panels contain their figures until :func:`to_typst_data` converts them.
     """
 
     def __init__(self, title: str = "", lead: str = "", *, width: float = PAGE_WIDTH) -> None:
@@ -64,11 +64,11 @@ class Page:
         """Write a heading within the page."""
         self.add("heading", above=above, **styled_text(text, size, bold=True))
 
-    def numbers(self, text: str) -> None:
-        """Write the numbers of the panel above in small print."""
+    def write_small(self, text: str) -> None:
+        """Write a text in small print, such as the numbers of the panel above."""
         self.write(text, size=7.0, colour=MUTED_COLOUR, above=-1.0)
 
-    def labelled(
+    def write_labelled(
         self,
         label: str,
         *texts: str | Block,
@@ -85,17 +85,17 @@ class Page:
         styled_label = styled_text(label, size, colour, bold)
         self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=above)
 
-    def advice(self, texts: Mapping[str, str], size: float = 8.0) -> None:
-        """Write labelled texts."""
+    def write_labelled_texts(self, texts: Mapping[str, str], size: float = 8.0) -> None:
+        """Write a text for each label."""
         for label, text in texts.items():
-            self.labelled(label, text, size=size)
+            self.write_labelled(label, text, size=size)
 
     def table(
         self,
         head: Sequence[str],
         rows: Sequence[Sequence[Cell]],
         *,
-        shares: Sequence[float] | None = None,
+        column_widths: Sequence[float] | None = None,
         right: Sequence[int] = (),
         size: float = 7.4,
     ) -> None:
@@ -110,12 +110,12 @@ class Page:
         right : sequence of int
             Right-aligned columns (numbers).
         """
-        self.add("table", head=head, rows=rows, shares=shares, right=right, size=size)
+        self.add("table", head=head, rows=rows, column_widths=column_widths, right=right, size=size)
 
     def panel(
         self,
         title: str,
-        say: str,
+        caption: str,
         height: float,
         *,
         above: float = 4.0,
@@ -132,7 +132,7 @@ class Page:
         height : float
             Height of the axes alone (points).
         above, left, right, below : float
-            Margins of the axes (points); room for tick labels and axis label is added below.
+            Margins of the axes (points); the height of tick and axis labels is added below.
         """
         # imported here because matplotlib takes 0.3 s, which text-only commands save
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -140,15 +140,15 @@ class Page:
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
         axes.locator_params(axis="x", nbins=8)
         axes.locator_params(axis="y", nbins=4)
-        around = left, right, below, above
-        alt = ": ".join(filter(None, (title, say)))
+        margins = left, right, below, above
+        alt = ": ".join(filter(None, (title, caption)))
         block = self.add(
             "panel",
             title=title,
-            say=say,
+            caption=caption,
             alt=alt,
             axes=axes,
-            around=around,
+            margins=margins,
             height=height,
             width=self.width,
             figure=axes.figure,
@@ -175,21 +175,21 @@ class Page:
             )
         labels = ", ".join(str(artist.get_label()) for row in visible_rows for artist in row)
         alt = f"Legend: {labels}"
-        self.add("panel", title="", say="", alt=alt, width=self.width, figure=figure)
+        self.add("panel", title="", caption="", alt=alt, width=self.width, figure=figure)
 
-    def beside(self, *columns: Page, gap: float = 14.0, above: float = 6.0) -> None:
-        """Set columns side by side; `gap` and `above` in points."""
+    def add_columns(self, *columns: Page, gap: float = 14.0, above: float = 6.0) -> None:
+        """Add columns side by side; `gap` between and space `above` them in points."""
         blocks, widths = [c.blocks for c in columns], [c.width for c in columns]
-        self.add("beside", columns=blocks, widths=widths, gap=gap, above=above)
+        self.add("columns", columns=blocks, widths=widths, gap=gap, above=above)
 
-    def foot(self, part: Page) -> None:
-        """Set a part at the foot of this page; text that does not fit above it goes to the next."""
-        self.add("foot", blocks=part.blocks)
+    def add_foot(self, content: Page) -> None:
+        """Set content at the foot of this page; other text continues on the next page."""
+        self.add("foot", blocks=content.blocks)
 
 
-def halves(first: float = 0.5, gap: float = 14.0) -> tuple[Page, Page]:
-    """Return two columns that share the width of a page; `first` is the share of the left one."""
-    left = first * (PAGE_WIDTH - gap)
+def halves(left_fraction: float = 0.5, gap: float = 14.0) -> tuple[Page, Page]:
+    """Return two columns that fill the page width; `left_fraction` belongs to the left column."""
+    left = left_fraction * (PAGE_WIDTH - gap)
     return Page(width=left), Page(width=PAGE_WIDTH - gap - left)
 
 
@@ -198,21 +198,21 @@ def styled_text(text: str, size: float, colour: str = "black", bold: bool = Fals
     return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
 
 
-def appendix(title: str) -> str:
-    """Title of a page that stands after the core.
+def appendix_title(title: str) -> str:
+    """Return the title of an appendix page.
 
-    >>> appendix("Notes by the student")
+    >>> appendix_title("Notes by the student")
     'Appendix: notes by the student'
     """
     return f"Appendix: {title[0].lower()}{title[1:]}"
 
 
-def legend_above(axes: Axes, columns: int = 9, **options: Any) -> None:
+def draw_legend_above(axes: Axes, column_count: int = 9, **options: Any) -> None:
     """Draw the legend of a panel above its axes, at the right."""
     axes.legend(
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
-        ncols=columns,
+        ncols=column_count,
         borderaxespad=0.0,
         borderpad=0.1,
         columnspacing=1.2,
@@ -231,17 +231,19 @@ def replace_unprintable(text: str) -> str:
     )
 
 
-def data(block: Any) -> Any:
+def to_typst_data(block: Any) -> Any:
     """Convert blocks for Typst: printable text, and figures as SVG."""
     if isinstance(block, str):
         return replace_unprintable(block)
     if isinstance(block, Mapping):
         fields = {
-            name: data(value) for name, value in block.items() if name not in ("figure", "axes")
+            name: to_typst_data(value)
+            for name, value in block.items()
+            if name not in ("figure", "axes")
         }
         return fields | ({"svg": _figure_svg(block)} if "figure" in block else {})
     if isinstance(block, Sequence):
-        return [data(item) for item in block]
+        return [to_typst_data(item) for item in block]
     return block
 
 
@@ -256,11 +258,13 @@ def _figure_svg(block: Mapping[str, Any]) -> str:
 def _place_axes(block: Mapping[str, Any]) -> None:
     """Set figure height and axes position, with room for existing tick labels and axis label."""
     axes, width, height = block["axes"], block["width"], block["height"]
-    left, right, below, above = block["around"]
+    left, right, below, above = block["margins"]
     has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]
-    below += (TICKS_HEIGHT if has_tick_labels else BARE_HEIGHT) + (
+    below += (TICKS_HEIGHT if has_tick_labels else UNLABELLED_HEIGHT) + (
         AXIS_LABEL_HEIGHT if axes.get_xlabel() else 0.0
     )
-    total = above + height + below
-    block["figure"].set_size_inches(width / 72.0, total / 72.0)
-    axes.set_position((left / width, below / total, (width - left - right) / width, height / total))
+    total_height = above + height + below
+    block["figure"].set_size_inches(width / 72.0, total_height / 72.0)
+    axes.set_position(
+        (left / width, below / total_height, (width - left - right) / width, height / total_height)
+    )

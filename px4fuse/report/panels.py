@@ -1,4 +1,4 @@
-"""Panels over time for one axis, used by all pages: curves, caption and numbers."""
+"""Panels over time for one axis, used by all pages: curves, caption, and numbers below."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from px4fuse.report.phrases import filters_by_name, format_verdict
 from px4fuse.report.style import DOTS, LINES, Axes, draw_curve, draw_sigma_band, set_log_scale
 
 NARROW_HEIGHT = 72.0  # points; height of the axes in the three-column appendix
-# Half height of the innovation axes: EDGE_FACTOR times the larger of 2√S and the 99 % quantile,
-# the latter at most MAX_EDGE_SIGMAS √S. Innovations outside are drawn at the edge and counted
+# Half height of the innovation axes: EDGE_FACTOR times the larger of 2√S and the 99 % quantile of
+# |ν|, which counts up to MAX_EDGE_SIGMAS √S. Innovations outside are drawn at the edge and counted
 EDGE_FACTOR, MAX_EDGE_SIGMAS = 1.3, 5.0
 
 
 class Quantity(NamedTuple):
-    """Estimated quantity: its unit, and the columns and fields that contain it."""
+    """Position or velocity: its unit, and the columns and fields that contain its values."""
 
     unit: str
     column: str
@@ -48,7 +48,7 @@ class Panel(NamedTuple):
     title: str
     height: float
     draw: Callable[[Axes, AxisComparison], None]
-    sentence: Callable[[Analysis, AxisComparison], str]
+    caption: Callable[[Analysis, AxisComparison], str]
     numbers: Callable[[AxisComparison], str]
 
     def full_title(self, result: AxisComparison) -> str:
@@ -62,23 +62,23 @@ class Panel(NamedTuple):
         analysis: Analysis,
         result: AxisComparison,
         *,
-        last: bool,
-        strip: bool = False,
-        narrow: bool = False,
+        with_time_label: bool,
+        with_mode_names: bool = False,
+        is_narrow: bool = False,
     ) -> None:
         """Draw the panel on a page.
 
         Parameters
         ----------
         last : bool
-            Label the time axis, which the panels above share.
+            Label the time axis, which all panels above share.
         strip : bool
             Write the names of the flight modes above it.
         narrow : bool
             Draw it for a narrow column, without caption.
         """
-        sentence, height = (
-            ("", NARROW_HEIGHT) if narrow else (self.sentence(analysis, result), self.height)
+        caption, height = (
+            ("", NARROW_HEIGHT) if is_narrow else (self.caption(analysis, result), self.height)
         )
         # this panel already shows the rejected innovations as hollow dots
         rejected = "" if self is INNOVATIONS else result.axis.name
@@ -86,16 +86,16 @@ class Panel(NamedTuple):
             page,
             analysis,
             self.full_title(result),
-            sentence,
+            caption,
             height,
             axis=rejected,
-            strip=strip,
-            last=last,
+            with_mode_names=with_mode_names,
+            with_time_label=with_time_label,
         )
-        if narrow:
+        if is_narrow:
             axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result)
-        page.numbers(self.numbers(result))
+        page.write_small(self.numbers(result))
 
 
 # ------------------------------------------------------------------------------ position, velocity
@@ -114,7 +114,7 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
             draw_curve(axes, frame[quantity.column], **LINES[name], zorder=2.5)
             drawn_series.append(frame[quantity.column])
     draw_curve(axes, kf_values, **LINES["KF"])
-    # scaled to the tracks, because the band is very wide in the first second
+    # The axis is scaled to the tracks, because the ±2σ band is very wide in the first second
     all_values = pd.concat(drawn_series)
     pad = 0.08 * (all_values.max() - all_values.min()) + 1e-3
     axes.set_ylim(all_values.min() - pad, all_values.max() + pad)
@@ -126,11 +126,13 @@ def error_reference(result: AxisComparison) -> pd.DataFrame | Unavailable:
 
 
 def position_difference(frame: pd.DataFrame, reference: pd.DataFrame) -> pd.Series[float]:
-    """Return the position difference (m) of two tracks at the times of the first."""
-    times, known = frame.index, reference["position_m"]
-    at = np.interp(times, known.index, known, left=np.nan, right=np.nan)
-    distance: pd.Series[float] = (frame["position_m"] - at).dropna()
-    return distance
+    """Return frame minus reference position (m) at the times of the frame."""
+    times, reference_position = frame.index, reference["position_m"]
+    reference_m = np.interp(
+        times, reference_position.index, reference_position, left=np.nan, right=np.nan
+    )
+    difference_m: pd.Series[float] = (frame["position_m"] - reference_m).dropna()
+    return difference_m
 
 
 def draw_error(axes: Axes, result: AxisComparison) -> None:
@@ -141,24 +143,24 @@ def draw_error(axes: Axes, result: AxisComparison) -> None:
     draw_sigma_band(axes, 0.0 * sigma, sigma)
     axes.axhline(0.0, color="black", lw=0.5)
     error = position_difference(steps, reference)
-    highest = [error.abs().max(), 2.2 * sigma.median()]
+    largest_values = [error.abs().max(), 2.2 * sigma.median()]
     if reference is result.truth and isinstance(result.ekf2_state, pd.DataFrame):
         ekf2_error = position_difference(result.ekf2_state, reference)
         draw_curve(axes, ekf2_error, **LINES["EKF2"], zorder=2.5)
-        highest.append(ekf2_error.abs().max())
+        largest_values.append(ekf2_error.abs().max())
     draw_curve(axes, error, **LINES["KF"])
-    axes.set_ylim(-1.1 * max(highest), 1.1 * max(highest))
+    axes.set_ylim(-1.1 * max(largest_values), 1.1 * max(largest_values))
 
 
 def _position_sentence(_: Analysis, result: AxisComparison) -> str:
-    travelled = float(np.ptp(result.axis.measurement_m))
-    text = f"{len(result.replay.updates)} measurements over {travelled:.3g} m"
+    extent_m = float(np.ptp(result.axis.measurement_m))
+    text = f"{len(result.replay.updates)} measurements over {extent_m:.3g} m"
     if isinstance(result.ekf2_state, Unavailable) or isinstance(result.difference, Unavailable):
         return f"{text}."
-    distance = position_difference(result.ekf2_state, result.replay.steps).abs()
+    difference_m = position_difference(result.ekf2_state, result.replay.steps).abs()
     return (
-        f"{text}; the largest difference between KF and EKF2 is {distance.max():.2g} m at "
-        f"{distance.idxmax():.1f} s."
+        f"{text}; the largest difference between KF and EKF2 is {difference_m.max():.2g} m at "
+        f"{difference_m.idxmax():.1f} s."
     )
 
 
@@ -168,13 +170,13 @@ def _velocity_sentence(_: Analysis, result: AxisComparison) -> str:
 
 
 def _error_sentence(_: Analysis, result: AxisComparison) -> str:
-    share = fraction_inside_two_sigma(result)
+    fraction = fraction_inside_two_sigma(result)
     if isinstance(result.truth, pd.DataFrame):
-        coverage_text = f"{share:.0%} of the KF errors are within ±2σ (blue; expected 95 %)."
+        coverage_text = f"{fraction:.0%} of the KF errors are within ±2σ (blue; expected 95 %)."
         return f"{compare_rmse(result, POSITIONS)} {coverage_text}".lstrip()
     return (
         "No ground truth in the log: this is the difference KF - EKF2, not an "
-        f"error. {share:.0%} of it is within ±2σ of KF (blue)."
+        f"error. {fraction:.0%} of it is within ±2σ of KF (blue)."
     )
 
 
@@ -183,10 +185,10 @@ def compare_rmse(result: AxisComparison, quantity: Quantity) -> str:
     errors = _rmse_by_filter(result, quantity)
     if len(errors) < 2:
         return ""
-    (low, first), (high, second) = sorted((error, name) for name, error in errors.items())
-    if high < 1.1 * low:
+    (smaller_m, better), (larger_m, worse) = sorted((error, name) for name, error in errors.items())
+    if larger_m < 1.1 * smaller_m:
         return "KF and EKF2 have the same RMSE (within 10 %)."
-    return f"{first} has a {high / low:.2g} times smaller RMSE than {second}."
+    return f"{better} has a {larger_m / smaller_m:.2g} times smaller RMSE than {worse}."
 
 
 def fraction_inside_two_sigma(result: AxisComparison) -> float:
@@ -200,8 +202,8 @@ def fraction_inside_two_sigma(result: AxisComparison) -> float:
 def _rmse_by_filter(result: AxisComparison, quantity: Quantity) -> dict[str, float]:
     """Return the RMSE against ground truth of each filter for which it is known."""
     values = {
-        name: getattr(one.truth, quantity.rmse, None)
-        for name, one in filters_by_name(result).items()
+        name: getattr(filter_summary.truth, quantity.rmse, None)
+        for name, filter_summary in filters_by_name(result).items()
     }
     return {name: error for name, error in values.items() if error is not None}
 
@@ -214,12 +216,12 @@ def _error_numbers(result: AxisComparison, quantity: Quantity = POSITIONS) -> st
 
 
 def _position_numbers(result: AxisComparison) -> str:
-    part = result.difference
-    if isinstance(part, Unavailable):
-        return f"{part.what}: {part.reason}"
+    difference = result.difference
+    if isinstance(difference, Unavailable):
+        return f"{difference.what}: {difference.reason}"
     return (
-        f"KF - EKF2: RMS {part.position_rms_m:.3f} m, mean {part.position_mean_m:+.3f} m, "
-        f"maximum {part.position_maximum_m:.2f} m"
+        f"KF - EKF2: RMS {difference.position_rms_m:.3f} m, mean "
+        f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
     )
 
 
@@ -234,7 +236,7 @@ def _velocity_numbers(result: AxisComparison) -> str:
 
 
 def _axis_half_height(result: AxisComparison) -> float:
-    """Return the half height (m) of the innovation axes, limited despite outliers and gaps."""
+    """Return the half height (m) of the innovation axes; outliers and gaps do not enlarge it."""
     limits = []
     for frame in (result.replay.updates, result.ekf2_innovations):
         if isinstance(frame, pd.DataFrame):
@@ -248,7 +250,11 @@ def _axis_half_height(result: AxisComparison) -> float:
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected ones are hollow."""
-    edge, updates, frame = _axis_half_height(result), result.replay.updates, result.ekf2_innovations
+    half_height, updates, frame = (
+        _axis_half_height(result),
+        result.replay.updates,
+        result.ekf2_innovations,
+    )
     kf_innovations = updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     axes.axhline(0.0, color="black", lw=0.5)
@@ -265,9 +271,9 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
             *dots,
         ]
     for values, marker_style in dots:
-        draw_curve(axes, values[values.abs() <= edge], **marker_style)
+        draw_curve(axes, values[values.abs() <= half_height], **marker_style)
         for sign, marker in ((1.0, "^"), (-1.0, "v")):
-            outside_times = values.index[sign * values > edge]
+            outside_times = values.index[sign * values > half_height]
             edge_style: dict[str, Any] = {
                 **marker_style,
                 "marker": marker,
@@ -276,21 +282,23 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
             }
             if len(outside_times):
                 axes.plot(
-                    outside_times, np.full(len(outside_times), sign * 0.96 * edge), **edge_style
+                    outside_times,
+                    np.full(len(outside_times), sign * 0.96 * half_height),
+                    **edge_style,
                 )
-    axes.set_ylim(-edge, edge)
+    axes.set_ylim(-half_height, half_height)
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
     """Caption of the innovations: fraction outside ±2√S, verdict and rejections."""
     sentences = []
-    for name, one in filters_by_name(result).items():
-        if isinstance(one, Unavailable):
-            sentences.append(f"{name}: {one.reason}.")
+    for name, consistency in filters_by_name(result).items():
+        if isinstance(consistency, Unavailable):
+            sentences.append(f"{name}: {consistency.reason}.")
         else:
             sentences.append(
-                f"{name}: {one.fraction_outside_two_sigma:.1%} of {one.count} innovations outside "
-                f"±2√S (expected 5 %): {format_verdict(one)}."
+                f"{name}: {consistency.fraction_outside_two_sigma:.1%} of {consistency.count} "
+                f"innovations outside ±2√S (expected 5 %): {format_verdict(consistency)}."
             )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
@@ -301,16 +309,17 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
 
 
 def _innovation_numbers(result: AxisComparison) -> str:
-    edge, texts = _axis_half_height(result), []
-    frames = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
-    for name, one in filters_by_name(result).items():
-        frame = frames[name]
-        if isinstance(one, Consistency) and isinstance(frame, pd.DataFrame):
-            outside_count = int((frame["innovation_m"].abs() > edge).sum())
+    half_height, texts = _axis_half_height(result), []
+    innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
+    for name, consistency in filters_by_name(result).items():
+        table = innovation_tables[name]
+        if isinstance(consistency, Consistency) and isinstance(table, pd.DataFrame):
+            outside_count = int((table["innovation_m"].abs() > half_height).sum())
             texts.append(
                 (
-                    f"{name}: mean {one.innovation_mean_m:+.3f} m, standard deviation "
-                    f"{one.innovation_std_m:.3f} m, median √S {one.sqrt_s_median_m:.3f} m"
+                    f"{name}: mean {consistency.innovation_mean_m:+.3f} m, standard deviation "
+                    f"{consistency.innovation_std_m:.3f} m, median √S "
+                    f"{consistency.sqrt_s_median_m:.3f} m"
                 )
                 + (f", {outside_count} outside the plot (triangles)" if outside_count else "")
             )
@@ -334,12 +343,17 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
         for name, frame in (("KF", result.replay.steps), ("EKF2", result.ekf2_variance))
         if isinstance(frame, pd.DataFrame)
     }
-    growth = " and ".join(f"{to:.2g} m ({name})" for name, to in largest.items() if np.isfinite(to))
+    growth = " and ".join(
+        f"{sigma:.2g} m ({name})" for name, sigma in largest.items() if np.isfinite(sigma)
+    )
     return f"In the {end - start:.1f} s gap from {start:.0f} s, σ grew to {growth}."
 
 
 def _medians(result: AxisComparison, quantity: Quantity) -> str:
-    medians = {name: getattr(one, quantity.sigma) for name, one in filters_by_name(result).items()}
+    medians = {
+        name: getattr(filter_summary, quantity.sigma)
+        for name, filter_summary in filters_by_name(result).items()
+    }
     texts = [
         f"{name} not logged" if median is None else f"{name} {median:.3f} {quantity.unit}"
         for name, median in medians.items()

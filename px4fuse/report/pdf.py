@@ -1,4 +1,4 @@
-"""PDF report: pages set by Typst, with the results attached.
+"""PDF report: pages typeset by Typst, with the results attached.
 
 Standards PDF/A-3a (archives) and PDF/UA-1 (screen readers). Typst reads the template and the data
 only: its root is an empty folder, and its fonts are those of :mod:`px4fuse.report.fonts`.
@@ -29,7 +29,7 @@ from px4fuse.report import (
     sensitivity,
 )
 from px4fuse.report.cover import student_line
-from px4fuse.report.page import Page, data, replace_unprintable
+from px4fuse.report.page import Page, replace_unprintable, to_typst_data
 from px4fuse.report.style import report_style
 from px4fuse.results import contract
 from px4fuse.results.model import NO_STUDENT
@@ -52,7 +52,7 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
         notes.draw,
         provenance.draw,
     ),
-    contract.AidsResults: (aids.draw_alone, notes.draw, provenance.draw_aids),
+    contract.AidsResults: (aids.draw_aids_only, notes.draw, provenance.draw_aids),
     contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
     contract.EvaluationResults: (evaluation.draw,),
 }
@@ -63,14 +63,18 @@ def _title_name_hash(results: Any) -> tuple[str, str, str]:
     match results:
         case contract.LoopResults(track=track):
             return f"px4fuse loop {track.name}", track.name, track.sha256
-        case contract.EvaluationResults(estimate=one, reference=other):
-            return f"px4fuse evaluate {one.name} {other.name}", one.name, one.sha256
+        case contract.EvaluationResults(estimate=estimate, reference=reference):
+            return (
+                f"px4fuse evaluate {estimate.name} {reference.name}",
+                estimate.name,
+                estimate.sha256,
+            )
     log = results.log
     return f"px4fuse compare {log.name}", log.name, log.sha256
 
 
 def render(content: Any, results: Any, results_json: str) -> bytes:
-    """Draw all pages and set them as PDF.
+    """Draw all pages and typeset them as PDF.
 
     Parameters
     ----------
@@ -88,23 +92,23 @@ def render(content: Any, results: Any, results_json: str) -> bytes:
     """
     blocks, written_text = list[Any](), ""
     with report_style():
-        # convert page by page, because the figures of all pages would take much memory
+        # each page is converted at once, because the figures of all pages need much memory
         for page in (page for draw in PAGES[type(results)] for page in draw(content, results)):
             written_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
-            blocks += data(page.blocks)
+            blocks += to_typst_data(page.blocks)
     title, name, sha256 = _title_name_hash(results)
-    made_by = f"px4fuse {metadata.version('px4fuse')}"
+    producer = f"px4fuse {metadata.version('px4fuse')}"
     student = student_line(getattr(results, "student", NO_STUDENT), " · ")
     release_free_memory()  # free the memory of the figures before Typst starts
-    # figures contain no text from outside
+    # figures contain no names and notes, so they need no further fonts
     all_text = title + name + student + written_text
     return compile_pdf(
         {
             "title": title,
-            "author": made_by,
+            "author": producer,
             "head": _shorten(f"px4fuse · {name} · SHA-256 {sha256[:12]}", 90),
             "student": _shorten(student, 40),
-            "foot": made_by,
+            "foot": producer,
             "fonts": fonts.font_names(all_text),
             "blocks": blocks,
             "results": results_json,
@@ -119,7 +123,7 @@ def _shorten(text: str, max_length: int) -> str:
 
 
 def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
-    """Set data with a Typst template, by default ``report.typ``.
+    """Typeset data with a Typst template, by default ``report.typ``.
 
     Raises
     ------

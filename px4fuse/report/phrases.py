@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from px4fuse.comparison.model import AxisComparison, Comparison, Difference, FilterSummary
-from px4fuse.comparison.model import UnjudgedFilter as Unjudged
-from px4fuse.filter.consistency import SIGMA_FACTOR_FINDING, Consistency
+from px4fuse.comparison.model import (
+    AxisComparison,
+    Comparison,
+    Difference,
+    FilterSummary,
+    UntestedFilter,
+)
+from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
@@ -20,8 +25,8 @@ if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
     from px4fuse.report.page import Cell, Page
 
-# p value of the Ljung-Box test below which innovations are reported as not white. It keeps the
-# false alarm rate of a flight's eight tests below 1 %
+# p value of the Ljung-Box test below which innovations are reported as not white; so a flight with
+# eight tests has a false alarm in less than 1 % of cases
 MIN_WHITE_P = 0.001
 # Error of the reported σ, by verdict
 SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
@@ -38,11 +43,11 @@ def format_settings(settings: Settings) -> str:
     )
 
 
-def format_verdict(statement: Consistency | Unavailable) -> str:
-    """Format the verdict on a filter, "not logged" if its innovations are missing."""
-    if isinstance(statement, Unavailable):
+def format_verdict(consistency: Consistency | Unavailable) -> str:
+    """Format the verdict on a filter; "not logged" if the log has no innovations of it."""
+    if isinstance(consistency, Unavailable):
         return "not logged"
-    return format_sigma_verdict(statement.verdict, statement.sigma_error_factor)
+    return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
 def format_sigma_verdict(verdict: str, factor: float) -> str:
@@ -56,12 +61,12 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     return f"{verdict}, σ {format_factor(factor)}× {SIGMA_VERDICTS[verdict]}"
 
 
-def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | Unjudged]:
+def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
     """Return KF and EKF2 of an axis by their display names; KF only if EKF2 is not logged."""
-    known = {"KF": result.filters["kf"]}
+    filters = {"KF": result.filters["kf"]}
     if not isinstance(result.ekf2_state, Unavailable):
-        known["EKF2"] = result.filters["ekf2"]
-    return known
+        filters["EKF2"] = result.filters["ekf2"]
+    return filters
 
 
 VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
@@ -69,19 +74,32 @@ VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 def verdict_rows(
     axes: Iterable[AxisComparison],
-    extra_cells: Callable[[AxisComparison, str, FilterSummary | Unjudged], Sequence[str]],
+    extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
 ) -> list[list[Cell]]:
     """Return a table row per axis and filter: the cells of VERDICT_HEAD, then the extra cells."""
     rows: list[list[Cell]] = []
     for result in axes:
-        for name, one in filters_by_name(result).items():
+        for name, consistency in filters_by_name(result).items():
             label = result.axis.name if name == "KF" else ""
             nis, colour = ("", ""), MUTED_COLOUR
-            if isinstance(one, Consistency):
-                nis = (format_number(one.nis_mean), "{:.2f} – {:.2f}".format(*one.nis_band))
-                colour = GOOD_COLOUR if one.verdict == "consistent" else SEVERITY_COLOURS["warning"]
+            if isinstance(consistency, Consistency):
+                nis = (
+                    format_number(consistency.nis_mean),
+                    "{:.2f} – {:.2f}".format(*consistency.nis_band),
+                )
+                colour = (
+                    GOOD_COLOUR
+                    if consistency.verdict == "consistent"
+                    else SEVERITY_COLOURS["warning"]
+                )
             rows.append(
-                [label, name, *nis, (format_verdict(one), colour), *extra_cells(result, name, one)]
+                [
+                    label,
+                    name,
+                    *nis,
+                    (format_verdict(consistency), colour),
+                    *extra_cells(result, name, consistency),
+                ]
             )
     return rows
 
@@ -95,10 +113,12 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 
-    def rms_cells(result: AxisComparison, name: str, one: FilterSummary | Unjudged) -> list[str]:
+    def rms_cells(
+        result: AxisComparison, name: str, consistency: FilterSummary | UntestedFilter
+    ) -> list[str]:
         difference = result.difference if name == "KF" else None
         cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
-        return cells + [_format_rms(one.truth, field) for field in RMSE_FIELDS if has_truth]
+        return cells + [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
 
     head = [*VERDICT_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
@@ -106,22 +126,22 @@ def write_errors(page: Page, analysis: Analysis) -> None:
 
 
 def _format_rms(statistic: object, field: str) -> str:
-    """Format a field of a statistic with three decimals, "" if it is missing."""
+    """Format a field of a record with three decimals; "" if the record does not have it."""
     value = getattr(statistic, field, None)
     return "" if value is None else f"{value:.3f}"
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Explain verdicts that could be misread.
+    """Return notes on verdicts that could be misread.
 
-    Notes on a source that may drift, on deviations too small for a finding, and on innovations
-    that are consistent but not white.
+    They concern a source that may drift, deviations too small for a finding, and innovations that
+    are consistent but not white.
     """
-    statements = [
-        (result.axis.name, filter_name, statement)
+    consistencies = [
+        (result.axis.name, filter_name, consistency)
         for result in comparison.axes.values()
-        for filter_name, statement in filters_by_name(result).items()
-        if isinstance(statement, Consistency)
+        for filter_name, consistency in filters_by_name(result).items()
+        if isinstance(consistency, Consistency)
     ]
     notes = []
     if comparison.source.origin.may_drift:
@@ -130,19 +150,21 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "not with the true position. Check the error with ground truth or a loop."
         )
     small_deviations = [
-        f"{filter_name} {axis} ({format_factor(statement.sigma_error_factor)}×)"
-        for axis, filter_name, statement in statements
-        if statement.verdict != "consistent" and statement.sigma_error_factor < SIGMA_FACTOR_FINDING
+        f"{filter_name} {axis} (σ {format_factor(consistency.sigma_error_factor)} times too "
+        f"{'large' if consistency.sigma_ratio < 1.0 else 'small'})"
+        for axis, filter_name, consistency in consistencies
+        if consistency.verdict != "consistent"
+        and consistency.sigma_error_factor < MIN_FINDING_SIGMA_FACTOR
     ]
     if small_deviations:
         notes.append(
-            f"Significant, but below the limit of {SIGMA_FACTOR_FINDING:g}× for a finding: "
+            f"Inconsistent, but below the limit of a finding ({MIN_FINDING_SIGMA_FACTOR:g} times): "
             f"{', '.join(small_deviations)}."
         )
     correlated = [
-        f"{filter_name} {axis}, lag-1 autocorrelation {statement.lag1_autocorrelation:+.2f}"
-        for axis, filter_name, statement in statements
-        if statement.verdict == "consistent" and statement.ljung_box_p < MIN_WHITE_P
+        f"{filter_name} {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
+        for axis, filter_name, consistency in consistencies
+        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P
     ]
     if correlated:
         notes.append(
@@ -154,9 +176,11 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     return notes
 
 
-def format_consequences(followers: Sequence[Finding]) -> str:
-    """Format findings that follow from the same cause, with their ids."""
-    return "Consequences: " + " ".join(f"{one.title} [{one.id}]." for one in followers)
+def format_consequences(consequences: Sequence[Finding]) -> str:
+    """Format the findings that are consequences of another finding, with their ids."""
+    return "Consequences: " + " ".join(
+        f"{finding.title} [{finding.id}]." for finding in consequences
+    )
 
 
 def format_clock_map(clock: ClockMap) -> str:
@@ -176,19 +200,19 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
     north, east, down = alignment.origin_m
     yaw = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
     sigma, residual = alignment.clock_offset_sigma_s, alignment.residual_rms_m
-    clock = "" if sigma is None else f" ± {sigma:.3f} s"
-    lines = {
+    clock_sigma = "" if sigma is None else f" ± {sigma:.3f} s"
+    texts = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
         "yaw": f"{alignment.yaw_deg:.2f}°{yaw} ({alignment.yaw_reason})",
         "origin": f"north {north:.3f} m, east {east:.3f} m, down {down:.3f} m",
-        "clock": f"{alignment.clock_offset_s:+.3f} s{clock} to the boot clock "
+        "clock": f"{alignment.clock_offset_s:+.3f} s{clock_sigma} to the boot clock "
         f"({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
         residual_text = "" if residual is None else f", {residual:.3f} m RMS per axis"
         correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
-        lines["match"] = correlation_text + residual_text
-    return lines
+        texts["match"] = correlation_text + residual_text
+    return texts
 
 
 def tuning_advice(
@@ -200,10 +224,10 @@ def tuning_advice(
     """
     names = (HORIZONTAL, "aisle", *tuned)
     name = next((name for name in names if isinstance(tuned.get(name), AxisTuning)), "")
-    found = tuned.get(name)
-    if not isinstance(found, AxisTuning):
+    tuning = tuned.get(name)
+    if not isinstance(tuning, AxisTuning):
         return {}
-    advice, sigma_a, sigma_z = {}, found.sigma_a_two_state, found.sigma_z
+    advice, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
     drifts, log = comparison.source.origin.may_drift, comparison.flight.log
     if drifts:
         advice["Drift"] = (
@@ -220,7 +244,9 @@ def tuning_advice(
         command = f"px4fuse compare LOG{''.join(options)}"
         advice["Action"] = f"Re-run with the estimates of {name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
-        advice["SIGMA_Z"] = f"at least {sigma_z.low:.2g} m. Check that this is a position source."
+        advice["SIGMA_Z"] = (
+            f"at least {sigma_z.low:.2g} m. Check that the source measures positions."
+        )
     elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = (
@@ -235,18 +261,21 @@ def tuning_advice(
         advice["SIGMA_A"] = (
             "cannot be estimated: too little motion, or the flight is too short."
             if sigma_a.low is None
-            else f"at least {sigma_a.low:.2g} m/s²: the acceleration in the log is wrong."
+            else f"at least {sigma_a.low:.2g} m/s²: logged acceleration and positions disagree."
         )
-    elif found.biases_fitted and (alone := found.sigma_a.value or found.sigma_a.high) is not None:
-        bound = "" if found.sigma_a.value is not None else "at most "
+    elif (
+        tuning.biases_fitted
+        and (accelerometer_noise := tuning.sigma_a.value or tuning.sigma_a.high) is not None
+    ):
+        bound = "" if tuning.sigma_a.value is not None else "at most "
         advice["SIGMA_A"] = (
-            f"Accelerometer noise alone is {bound}{alone:.2g} m/s². KF has no state for "
-            "accelerometer bias and tilt error. To cover them SIGMA_A must be "
+            f"Accelerometer noise alone is {bound}{accelerometer_noise:.2g} m/s². KF has no state "
+            "for accelerometer bias and tilt error. To cover them SIGMA_A must be "
             f"{sigma_a.value:.2g} m/s²."
         )
-    if len(found.outlier_time_s):
+    if len(tuning.outlier_time_s):
         advice["Outliers"] = (
-            f"{len(found.outlier_time_s)} of {found.count} measurements ({name}), first "
-            f"at {found.outlier_time_s[0]:.1f} s; excluded from the noise estimates"
+            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({name}), first "
+            f"at {tuning.outlier_time_s[0]:.1f} s; excluded from the noise estimates"
         )
     return advice

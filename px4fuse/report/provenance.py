@@ -14,55 +14,61 @@ from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
-INDENT, SIZE = 140.0, 7.5
+LABEL_WIDTH, TEXT_SIZE = 140.0, 7.5  # points
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the provenance of a comparison."""
     flight, source = analysis.flight, analysis.source
-    placement = source.alignment
+    alignment = source.alignment
     page = _start_page("Appendix: provenance", results)
     _write_log(page, flight, source)
     clocks = map(format_clock_map, flight.clocks)
-    _write_section(page, "Clocks, mapped to the autopilot's boot clock", plain=clocks)
+    _write_section(page, "Clocks, mapped to the autopilot's boot clock", plain_texts=clocks)
     _write_section(
         page,
         f"Time offset of {source.name} (against the IMU)",
-        plain=[clock.summary_line(analysis, results.findings)],
+        plain_texts=[clock.summary_line(analysis, results.findings)],
     )
-    if placement is not None:
-        _write_section(page, f"Alignment of {source.name}", describe_alignment(placement).items())
-    _write_section(page, "Automatic choices", plain=analysis.notes or ["none"])
+    if alignment is not None:
+        _write_section(page, f"Alignment of {source.name}", describe_alignment(alignment).items())
+    _write_section(page, "Automatic choices", plain_texts=analysis.notes or ["none"])
     _write_missing(page, analysis.missing)
     _write_methods(page, "methods.md")
     yield page
 
 
-def draw_aids(alone: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
+def draw_aids(analysis: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
     """Draw the provenance of a flight without a position source."""
-    flight, page = alone.flight, _start_page("Provenance", results)
+    flight, page = analysis.flight, _start_page("Provenance", results)
     _write_log(page, flight)
-    _write_section(page, "Automatic choices", plain=flight.log.notes or ["none"])
-    _write_missing(page, (alone.missing_data, *flight.missing))
+    _write_section(page, "Automatic choices", plain_texts=flight.log.notes or ["none"])
+    _write_missing(page, (analysis.missing_data, *flight.missing))
     yield page
 
 
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
-    """Write log, position source and parameters, without those of position aids not used."""
+    """Write log, position source and parameters, without those of unused position aids."""
     log, facts = flight.log, dict[str, str]()
-    others = (f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source)
-    other_parameters = set[str]()
+    other_positions = (
+        f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source
+    )
+    unused_parameters = set[str]()
     if source is not None:
         aid = source.origin.aid or EV_POS
-        other_parameters = other_parameters.union(
-            *(one.own_parameters for one in (EV_POS, GNSS_POS) if one != aid)
+        unused_parameters = unused_parameters.union(
+            *(
+                position_aid.own_parameters
+                for position_aid in (EV_POS, GNSS_POS)
+                if position_aid != aid
+            )
         )
         facts["position source"] = (
             f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
     parameters = (
-        f"{n} {value:g}" for n, value in log.parameters.items() if n not in other_parameters
+        f"{n} {value:g}" for n, value in log.parameters.items() if n not in unused_parameters
     )
     facts = {
         "file": f"{log.name}, {log.bytes} bytes, {log.format}",
@@ -71,7 +77,7 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
         "firmware": f"{log.firmware}, git {log.firmware_hash}",
         "time zero": f"{log.boot_time_s:.6f} s after boot (first data sample)",
         **facts,
-        "other positions": ", ".join(others) or "none",
+        "other positions": ", ".join(other_positions) or "none",
         "parameters": ", ".join(parameters) or "none",
     }
     _write_section(page, "Log", facts.items())
@@ -79,8 +85,11 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
 
 def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
     missing = [
-        (part.source or part.what, f"{part.reason}. {with_options(part.remedy)}")
-        for part in unavailable_parts
+        (
+            missing_data.source or missing_data.what,
+            f"{missing_data.reason}. {with_options(missing_data.remedy)}",
+        )
+        for missing_data in unavailable_parts
     ]
     none = [] if missing else ["none"]
     _write_section(page, "Missing data", missing, none)
@@ -99,7 +108,7 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
         for label, track in tracks
     ]
     _write_section(page, "Files", file_facts)
-    _write_section(page, "Automatic choices", plain=loop.notes or ["none"])
+    _write_section(page, "Automatic choices", plain_texts=loop.notes or ["none"])
     _write_methods(page, "methods_loop.md")
     yield page
 
@@ -123,20 +132,29 @@ def _start_page(title: str, results: ComparisonResults | AidsResults | LoopResul
 
 
 def _write_section(
-    page: Page, title: str, labelled: Iterable[tuple[str, str]] = (), plain: Iterable[str] = ()
+    page: Page,
+    title: str,
+    labelled_texts: Iterable[tuple[str, str]] = (),
+    plain_texts: Iterable[str] = (),
 ) -> None:
-    """Write a heading with labelled and plain texts in small print; nothing without texts."""
-    labelled, plain = list(labelled), list(plain)
-    if labelled or plain:
+    """Write a heading, then labelled and plain texts in small print; nothing without texts."""
+    labelled_texts, plain_texts = list(labelled_texts), list(plain_texts)
+    if labelled_texts or plain_texts:
         page.heading(title, 9.5, above=9.0)
-    for label, text in labelled:
-        page.labelled(
-            label, text, size=SIZE, width=INDENT, above=-1.0, colour=MUTED_COLOUR, bold=False
+    for label, text in labelled_texts:
+        page.write_labelled(
+            label,
+            text,
+            size=TEXT_SIZE,
+            width=LABEL_WIDTH,
+            above=-1.0,
+            colour=MUTED_COLOUR,
+            bold=False,
         )
-    for text in plain:
-        page.write(text, size=SIZE)
+    for text in plain_texts:
+        page.write(text, size=TEXT_SIZE)
 
 
 def _write_methods(page: Page, name: str) -> None:
     text = Path(__file__).with_name(name).read_text(encoding="utf-8")
-    _write_section(page, "Methods", plain=text.split("\n\n"))
+    _write_section(page, "Methods", plain_texts=text.split("\n\n"))

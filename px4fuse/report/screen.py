@@ -2,8 +2,8 @@
 
 In a pipe each paragraph is one line, so other programs can search it.
 
-Reports contain no paths, so actions are written ``px4fuse compare LOG --sigma-z 0.2``. The
-terminal replaces LOG by the typed path and options.
+Texts contain no paths: an action is written ``px4fuse compare LOG --sigma-z 0.2``. The terminal
+prints the command with the path and the options that the user typed.
 """
 
 import re
@@ -19,7 +19,7 @@ from rich.text import Text
 from px4fuse.report.page import Block, Cell
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import (
-    OPTIONS,
+    COMPARISON_OPTIONS,
     ComparisonRequest,
     LoopRequest,
     Request,
@@ -27,7 +27,7 @@ from px4fuse.request import (
     command_line,
 )
 
-INDENT = 9  # columns
+INDENT = 9  # columns; width of the labels
 COLUMN_POINTS = 6.0  # points of an indent on paper per terminal column
 # Terminal styles of text colours; the other colours belong to plots
 STYLES = {
@@ -37,9 +37,9 @@ STYLES = {
     SEVERITY_COLOURS["note"]: "cyan",
     GOOD_COLOUR: "green",
 }
-# The pattern of a value excludes the full stop at the end of a sentence
+# A value does not end in a full stop: that ends the sentence
 _COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
-_FIELDS = {option.name: field for field, option in OPTIONS.items()}
+_FIELD_OF_OPTION = {option: field for field, option in COMPARISON_OPTIONS.items()}
 
 
 def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
@@ -50,7 +50,7 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
     console : Console
     blocks : iterable of Block
     request : Request, optional
-        Request as typed; with it, commands in labelled texts are printed ready to run.
+        Request of the user; with it, commands in labelled texts are printed ready to run.
     """
     for block in blocks:
         match block["kind"]:
@@ -68,7 +68,7 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
                 print_line(console, block["label"], block["text"])
             case "blank":
                 console.print()
-            case "beside":
+            case "columns":
                 for column in block["columns"]:
                     show(console, column, request)
 
@@ -76,12 +76,12 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
 def _show_labelled(console: Console, block: Block, request: Request | None) -> None:
     lines = block["label"]["text"].split("\n")
     labels = [line for line in lines if len(line) < INDENT]
-    aside = "".join(f" ({line})" for line in lines if len(line) >= INDENT)
-    for place, (label, part) in enumerate(zip_longest(labels, block["texts"])):
-        text, commands = Text() if part is None else _styled_text(part), list[str]()
+    label_note = "".join(f" ({line})" for line in lines if len(line) >= INDENT)
+    for index, (label, text_block) in enumerate(zip_longest(labels, block["texts"])):
+        text, commands = Text() if text_block is None else _styled_text(text_block), list[str]()
         if request is not None:
             text.plain, commands = expand_commands(text.plain, request)
-        text.append("" if place else aside)
+        text.append("" if index else label_note)
         print_paragraph(
             console, text, _styled_text({**block["label"], "text": label or ""}), INDENT
         )
@@ -90,13 +90,13 @@ def _show_labelled(console: Console, block: Block, request: Request | None) -> N
 
 
 def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
-    """Shorten the commands in a text to the changed options; return it and the full commands.
+    """Shorten each command in a text to its options; return the text and the complete commands.
 
     Parameters
     ----------
     text : str
     request : Request
-        Request as typed; its files and options complete the commands.
+        Request of the user; its files and options complete the commands.
 
     Examples
     --------
@@ -108,14 +108,14 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     for name, options in _COMMAND.findall(text):
         parts_of_options = options.split()
         values = zip(parts_of_options[::2], parts_of_options[1::2], strict=True)
-        changes = {_FIELDS[option]: float(value) for option, value in values}
-        commands.append(rerun(request, name, changes))
-    short_text = _COMMAND.sub(lambda found: found[2].strip() or f"px4fuse {found[1]}", text)
+        changes = {_FIELD_OF_OPTION[option]: float(value) for option, value in values}
+        commands.append(rerun_command(request, name, changes))
+    short_text = _COMMAND.sub(lambda match: match[2].strip() or f"px4fuse {match[1]}", text)
     return short_text, list(dict.fromkeys(commands))
 
 
-def rerun(request: Request, command: str, changes: Mapping[str, float]) -> str:
-    """Return a command on the files of a request, with some options changed."""
+def rerun_command(request: Request, command: str, changes: Mapping[str, float]) -> str:
+    """Return the command line of a command on the files of a request, with changed options."""
     new_request = request
     if isinstance(request, ComparisonRequest):
         if command == "loop":
@@ -129,7 +129,7 @@ def rerun(request: Request, command: str, changes: Mapping[str, float]) -> str:
             new_request = WhatIfRequest(
                 log=request.log, mavlink=request.mavlink, system=request.system
             )
-    return command_line(replace(new_request, **changes), command, typed=True)
+    return command_line(replace(new_request, **changes), command, for_shell=True)
 
 
 def _styled_text(block: Block) -> Text:

@@ -8,11 +8,11 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.filter.fitting import FIRST_WIDTH
+from px4fuse.filter.fitting import START_OUTLIER_WIDTH
 from px4fuse.filter.likelihood import FilterStates, filter_states, preintegrate, score_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
-from px4fuse.report.page import Page, legend_above
+from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_COLOUR, set_plain_ticks
 from px4fuse.text import format_factor, format_number
 
@@ -25,16 +25,16 @@ SETTINGS = (
     ("SIGMA_A / 4", 1.0 / NOISE_FACTOR, 1.0),
     ("SIGMA_Z × 4", 1.0, NOISE_FACTOR),
 )
-# Pairs of SETTINGS (indices) with the same gain
+# Label, and indices of the two SETTINGS with the same gain
 GAIN_GROUPS = (("larger gain", (1, 2)), ("smaller gain", (3, 4)))
-# nats below the maximum of the log-likelihood: joint 95 % region of both noises, then decades
-REGION_95 = float(-np.log(0.05))
-LEVELS = (0.0, REGION_95, 10.0, 100.0, 1000.0, 10_000.0)
+# Contours below the maximum: joint 95 % region of both noises, then decades
+REGION_95_NATS = float(-np.log(0.05))
+LEVELS_NATS = (0.0, REGION_95_NATS, 10.0, 100.0, 1000.0, 10_000.0)
 SHADES = ("#0b2a55", "#3f6aa8", "#86a7d3", "#c3d4ea", "#e6edf6")
 SHADE_LABELS = ("95 % region", "10 below", "100", "1,000", "10,000")
 COARSE_POINTS, FINE_POINTS = 14, 11
-# Margin of the map (factor), and range of the fine grid as a multiple of the 95 % interval
-MAP_MARGIN, FINE_REACH = 1.3, 2.3
+# Margin of the map (factor), and reach of the fine grid in half 95 % intervals (log scale)
+MAP_MARGIN_FACTOR, FINE_GRID_REACH = 1.3, 2.3
 MAP_HEIGHT, MAP_LEFT = 140.0, 40.0  # points; height of the axes, margin left of them
 
 
@@ -54,9 +54,9 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     chosen = np.array([settings.sigma_a_m_s2, settings.sigma_z_m])
     factors = np.array([(a, z) for _, a, z in SETTINGS]).T
-    run = filter_states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
+    states = filter_states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
     _draw_map(page, analysis)
-    _write_table(page, result, run, chosen)
+    _write_table(page, result, states, chosen)
     yield page
 
 
@@ -77,15 +77,18 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     noises = tuned_noises.sigma_a_two_state, tuned_noises.sigma_z
     (a, a_limits), (z, z_limits) = map(_noise_grid, chosen, noises)
     axes.contourf(
-        z, a, _log_likelihood_drop(analysis, name, tuned_noises, a, z), LEVELS, colors=SHADES
+        z, a, _log_likelihood_drop(analysis, name, tuned_noises, a, z), LEVELS_NATS, colors=SHADES
     )
     for factor in (1.0 / NOISE_FACTOR, 1.0, NOISE_FACTOR):
-        same_gain = factor * chosen[0] / chosen[1] * z[[0, -1]]
-        axes.plot(z[[0, -1]], same_gain, color="black", lw=0.7, ls=(0, (1, 1.5)))
-    scaled = {label: (chosen[1] * of_z, chosen[0] * of_a) for label, of_a, of_z in SETTINGS}
+        sigma_a_of_gain = factor * chosen[0] / chosen[1] * z[[0, -1]]
+        axes.plot(z[[0, -1]], sigma_a_of_gain, color="black", lw=0.7, ls=(0, (1, 1.5)))
+    scaled = {
+        label: (chosen[1] * z_factor, chosen[0] * a_factor)
+        for label, a_factor, z_factor in SETTINGS
+    }
     for (label, pair), marker in zip(GAIN_GROUPS, "^v", strict=True):
-        at = [scaled[SETTINGS[column][0]] for column in pair]
-        axes.plot(*zip(*at, strict=True), marker, color=KF_COLOUR, ms=4.0, label=label)
+        pairs = [scaled[SETTINGS[column][0]] for column in pair]
+        axes.plot(*zip(*pairs, strict=True), marker, color=KF_COLOUR, ms=4.0, label=label)
     best = [_best_value(noise) for noise in noises]
     axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="maximum")
     axes.plot(chosen[1], chosen[0], "X", color="black", mec="white", ms=8.0, label="chosen")
@@ -104,17 +107,19 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
         Patch(facecolor=shade, label=label)
         for shade, label in zip(SHADES, SHADE_LABELS, strict=True)
     ]
-    legend_above(axes, handles=[*shades, *axes.get_legend_handles_labels()[0]], handlelength=1.2)
+    draw_legend_above(
+        axes, handles=[*shades, *axes.get_legend_handles_labels()[0]], handlelength=1.2
+    )
 
 
 def _noise_grid(chosen: float, noise: Noise) -> tuple[Array, tuple[float, float]]:
-    """Return a grid of a noise, fine near its estimate, and the limits of the map."""
+    """Return grid values of a noise, fine near its estimate, and the limits of its map axis."""
     best = _best_value(noise)
     least, most = noise.low or best, noise.high or best
-    needed = (chosen / NOISE_FACTOR, chosen * NOISE_FACTOR, best, least, most)
-    low, high = min(needed) / MAP_MARGIN, max(needed) * MAP_MARGIN
+    shown_values = (chosen / NOISE_FACTOR, chosen * NOISE_FACTOR, best, least, most)
+    low, high = min(shown_values) / MAP_MARGIN_FACTOR, max(shown_values) * MAP_MARGIN_FACTOR
     spread = max(most / best, best / least, 1.02)
-    fine = best * spread ** np.linspace(-FINE_REACH, FINE_REACH, FINE_POINTS)
+    fine = best * spread ** np.linspace(-FINE_GRID_REACH, FINE_GRID_REACH, FINE_POINTS)
     grid = np.concatenate([np.geomspace(low, high, COARSE_POINTS), fine])
     return np.unique(grid[(low <= grid) & (grid <= high)]), (low, high)
 
@@ -123,7 +128,7 @@ def _map_sentence(tuned_noises: AxisTuning) -> str:
     drop = format_number(
         max(tuned_noises.log_likelihood_gain_per_measurement * tuned_noises.count, 0.0), 2
     )
-    has_random_walk = tuned_noises.noises.walk_m > tuned_noises.noises.sigma_z_m
+    has_random_walk = tuned_noises.noises.random_walk_m > tuned_noises.noises.sigma_z_m
     walk_note = " The random walk of the source is not included." if has_random_walk else ""
     return (
         "Maximum-likelihood estimate: SIGMA_A "
@@ -137,11 +142,11 @@ def format_noise(noise: Noise, unit: str) -> str:
     """Format a noise with its 95 % interval, or the bounds if it has no estimate."""
     if noise.value is None:
         ends = (("at least", noise.low), ("at most", noise.high))
-        known = [f"{word} {format_number(end)} {unit}" for word, end in ends if end is not None]
-        return " and ".join(known) or "unknown"
+        bounds = [f"{word} {format_number(end)} {unit}" for word, end in ends if end is not None]
+        return " and ".join(bounds) or "unknown"
     low, high = (format_number(end or 0.0) for end in (noise.low, noise.high))
-    within = "or more" if noise.high is None else f"({low} to {high})"
-    return f"{format_number(noise.value)} {unit} {within}"
+    interval = "or more" if noise.high is None else f"({low} to {high})"
+    return f"{format_number(noise.value)} {unit} {interval}"
 
 
 def _best_value(noise: Noise) -> float:
@@ -151,53 +156,57 @@ def _best_value(noise: Noise) -> float:
 def _log_likelihood_drop(
     comparison: Comparison, name: str, tuned_noises: AxisTuning, a: Array, z: Array
 ) -> Array:
-    """Log-likelihood of each pair below the maximum (nats), shape (n, m)."""
+    """Return the log-likelihood below its maximum (nats); rows: SIGMA_A, columns: SIGMA_Z."""
     axes = [
-        one.axis
-        for one in comparison.axes.values()
-        if one.axis.name == name or (name == HORIZONTAL and one.axis.name in ("north", "east"))
+        axis_comparison.axis
+        for axis_comparison in comparison.axes.values()
+        if axis_comparison.axis.name == name
+        or (name == HORIZONTAL and axis_comparison.axis.name in ("north", "east"))
     ]
-    legs = [preintegrate(axis, comparison.settings) for axis in axes]
-    time = axes[0].measurement_time_s[-len(legs[0].measurement_m) :]
-    weight = np.where(np.isin(time, tuned_noises.outlier_time_s), FIRST_WIDTH**-2.0, 1.0)
-    total = score_grid(legs, a[:, None], z[None, :], weight)
+    preintegrated = [preintegrate(axis, comparison.settings) for axis in axes]
+    time = axes[0].measurement_time_s[-len(preintegrated[0].measurement_m) :]
+    weight = np.where(np.isin(time, tuned_noises.outlier_time_s), START_OUTLIER_WIDTH**-2.0, 1.0)
+    total = score_grid(preintegrated, a[:, None], z[None, :], weight)
     return np.asarray(total - total.min())
 
 
 def _second_half_median(values: Array) -> Array:
-    """Median over the second half, after the initial transient."""
+    """Return the median over the second half, which has no initial transient."""
     return np.asarray(np.median(values[len(values) // 2 :], axis=0))
 
 
-def _write_table(page: Page, result: AxisComparison, run: FilterStates, chosen: Array) -> None:
+def _write_table(page: Page, result: AxisComparison, states: FilterStates, chosen: Array) -> None:
     """Write the table of gain, reported σ, mean NIS and velocity RMSE per setting."""
-    half = slice(len(run.gain) // 2, None)
+    second_half = slice(len(states.gain) // 2, None)
     gains, sigmas, nis = (
-        _second_half_median(run.gain),
-        _second_half_median(run.sigma_p_m),
-        run.nis[half].mean(axis=0),
+        _second_half_median(states.gain),
+        _second_half_median(states.sigma_p_m),
+        states.nis[second_half].mean(axis=0),
     )
     head = ["", "SIGMA_A (m/s²)", "SIGMA_Z (m)", "gain", "σ_p (m)", "mean NIS"]
     rows = []
-    for at, (label, *scale) in enumerate(SETTINGS):
+    for index, (label, *scale) in enumerate(SETTINGS):
         noises = [format_number(value) for value in chosen * scale]
-        reported = [format_number(value) for value in (sigmas[at], nis[at])]
-        rows.append([label, *noises, f"{gains[at]:.2f}", *reported])
+        reported = [format_number(value) for value in (sigmas[index], nis[index])]
+        rows.append([label, *noises, f"{gains[index]:.2f}", *reported])
     if isinstance(result.truth, pd.DataFrame):
-        true = result.truth["velocity_m_s"].dropna()
-        if len(true):
-            time = result.axis.measurement_time_s[-len(run.gain) :][half]
-            error = run.velocity_m_s[half] - np.interp(time, true.index, true)[:, np.newaxis]
+        true_velocity = result.truth["velocity_m_s"].dropna()
+        if len(true_velocity):
+            time = result.axis.measurement_time_s[-len(states.gain) :][second_half]
+            error = (
+                states.velocity_m_s[second_half]
+                - np.interp(time, true_velocity.index, true_velocity)[:, np.newaxis]
+            )
             head.append("v RMSE (m/s)")
             for row, rmse in zip(rows, np.sqrt((error**2).mean(axis=0)), strict=True):
                 row.append(f"{rmse:.3f}")
-    smaller = ""
+    nis_text = ""
     if nis[1] > 0.0:  # zero if the positions never change
-        smaller = f", and the NIS {format_factor(nis[2] / nis[1])} times smaller"
+        nis_text = f", and the NIS {format_factor(nis[2] / nis[1])} times smaller"
     page.heading("Same track, different σ", above=10.0)
     page.write(
         f"With SIGMA_A × 4, σ_p is {format_factor(sigmas[1] / sigmas[2])} times larger than with "
-        f"SIGMA_Z / 4{smaller}; the track is nearly the same. All numbers are of the second half "
+        f"SIGMA_Z / 4{nis_text}; the track is nearly the same. All numbers are of the second half "
         "of the flight."
     )
     page.table(head, rows, right=range(1, len(head)))

@@ -64,8 +64,7 @@ MEASUREMENT_DOTS: dict[str, Any] = {
 LINES = {"KF": KF_LINE, "EKF2": EKF2_LINE, "ground truth": TRUTH_LINE}
 DOTS = {"KF": KF_DOTS, "EKF2": EKF2_DOTS}
 
-# Drawn points of a series in wide and in narrow axes (limit in inches); longer series are reduced
-# to the extremes of each bucket
+# Most drawn points of a series in wide and in narrow axes, and the smallest width of wide axes
 MAX_POINTS, MAX_POINTS_NARROW, MIN_WIDE_INCHES = 1500, 500, 3.0
 
 
@@ -81,18 +80,20 @@ def report_style() -> Iterator[None]:
 def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
     """Draw a series over its index, reduced to as many points as the axes can show."""
     axes.plot(
-        *thin_series(values.index.to_numpy(), np.asarray(values, np.float64), _max_points(axes)),
+        *decimate_series(
+            values.index.to_numpy(), np.asarray(values, np.float64), _max_points(axes)
+        ),
         **style,
     )
 
 
-def draw_sigma_band(axes: Axes, middle: pd.Series[float], sigma: pd.Series[float]) -> None:
+def draw_sigma_band(axes: Axes, centre: pd.Series[float], sigma: pd.Series[float]) -> None:
     """Draw the ±2σ band of KF about a series."""
-    time = middle.index.to_numpy()
-    drawn_time, upper = thin_series(
-        time, np.asarray(middle + 2.0 * sigma, np.float64), _max_points(axes)
+    time = centre.index.to_numpy()
+    drawn_time, upper = decimate_series(
+        time, np.asarray(centre + 2.0 * sigma, np.float64), _max_points(axes)
     )
-    lower = np.interp(drawn_time, time, (middle - 2.0 * sigma).to_numpy())
+    lower = np.interp(drawn_time, time, (centre - 2.0 * sigma).to_numpy())
     axes.fill_between(drawn_time, lower, upper, color=KF_BAND_COLOUR, lw=0)
 
 
@@ -109,7 +110,7 @@ def set_log_scale(axes: Axes) -> None:
 
 
 def set_plain_ticks(axis: Axis) -> None:
-    """Set plain numbers on a log axis: at 1, 2, 5 or 1, 3 of a decade, at 1 for many decades."""
+    """Label a log axis with plain numbers: 1, 2 and 5 of each decade, or fewer for many decades."""
     from matplotlib.ticker import LogLocator, NullLocator  # noqa: PLC0415
 
     low, high = axis.get_view_interval()
@@ -119,9 +120,9 @@ def set_plain_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def label_time_axis(axes: Axes, last: bool) -> None:
+def label_time_axis(axes: Axes, with_time_label: bool) -> None:
     """Label the time axis of the last panel; hide the tick labels of the panels above it."""
-    if last:
+    if with_time_label:
         axes.set_xlabel(TIME_LABEL)
     else:
         axes.tick_params(axis="x", labelbottom=False)
@@ -134,8 +135,8 @@ def set_map_axes(axes: Axes, right: str, up: str) -> None:
     axes.set(xlabel=f"{right} (m)", ylabel=f"{up} (m)")
 
 
-def thin_series(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:
-    """Reduce a series to at most ``limit`` points: the extremes of equal buckets."""
+def decimate_series(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:
+    """Reduce a series to at most ``limit`` points: minimum and maximum of equal intervals."""
     if len(time) <= limit:
         return time, value
     bucket_size, larger_bucket_count = divmod(len(time), limit // 2)

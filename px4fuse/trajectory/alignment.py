@@ -1,4 +1,4 @@
-"""Alignment of an estimate with its reference: the transform that is not counted as error.
+"""Alignment of an estimate with a reference: the transform that does not count as error.
 
 Estimators that use gravity are aligned in yaw and position (4 degrees of freedom), so tilt counts
 as error (Zhang & Scaramuzza 2018). SLAM with the frame of its first key frame is aligned in
@@ -17,10 +17,11 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# fraction of the extent, and m (RMS); smaller motion does not determine a rotation
-MIN_SHARE, MIN_SPREAD_M = 1e-6, 1e-6
-# ratios of residual to extent above which the rotation is not determined. Its standard deviation is
-# residual / (extent · √n); pure noise has a ratio of √2 in the plane, and √6 around a line
+# fraction of the extent, and RMS in m; smaller motion does not determine a rotation
+MIN_EXTENT_FRACTION, MIN_EXTENT_M = 1e-6, 1e-6
+# ratios of residual to extent above which the rotation is not determined. The standard deviation of
+# the rotation is residual / (extent · √n); pure noise has a ratio of √2 in the plane, √6 around a
+# line
 MAX_PLANE_RATIO, MAX_LINE_RATIO = 1.0, 2.0
 
 
@@ -63,15 +64,15 @@ class Transform(Record, frozen=True):
 def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform:
     """Fit the transform of the estimate with the least squared distance to the reference.
 
-    Umeyama (1991), eqs. 40 to 43, for "se3" and "sim3"; for "yaw" the closed form of Zhang &
-    Scaramuzza (2018), section III-C, about z.
+    "se3" and "sim3" are fitted by Umeyama (1991), eqs. 40 to 43; "yaw" by the closed form of Zhang
+    & Scaramuzza (2018), section III-C, about z.
 
     Parameters
     ----------
     estimate_m, reference_m : ndarray, shape (n, 3)
         Positions at the same times.
     kind : {"none", "yaw", "se3", "sim3"}
-        For "yaw" z must be vertical in both frames, with the same direction.
+        For "yaw" z must be vertical in both frames and have the same direction.
 
     Raises
     ------
@@ -90,46 +91,46 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
     if kind == "yaw":
         x, y = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
         heading = float(np.angle(np.vdot(x - x.mean(), y - y.mean())))
-        transform = _similarity(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
+        transform = _align_means(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
         _require_determined(transform, estimate_m, reference_m, kind)
         return transform
-    # test with scale, because a scale factor error does not make the rotation uncertain
+    # the test includes a scale, because a scale factor error does not make the rotation uncertain
     similarity = umeyama(estimate_m, reference_m, with_scale=True)
     _require_determined(similarity, estimate_m, reference_m, kind)
     return similarity if kind == "sim3" else umeyama(estimate_m, reference_m, with_scale=False)
 
 
 def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Transform:
-    """Fit SE(3) or Sim(3) by least squares, without testing that the motion determines it.
+    """Fit SE(3) or Sim(3) by least squares, without testing that the motion determines the result.
 
-    For motion along a line the result is one of many with equal residual.
+    For motion along a line the result is one of many transforms with equal residual.
 
     Parameters
     ----------
     estimate_m, reference_m : ndarray, shape (n, 3)
     with_scale : bool
-        Sim(3); scale 1 if the estimate does not move.
+        True for Sim(3); the scale is 1 if the estimate does not move.
     """
     x, y = estimate_m - estimate_m.mean(axis=0), reference_m - reference_m.mean(axis=0)
     u, d, vt = np.linalg.svd(y.T @ x / len(x))  # eq. 38
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # eq. 43
     variance = float((x * x).sum() / len(x))  # eq. 36
     # eq. 42; a tiny variance would give an infinite scale
-    scale = float(d @ s / variance) if with_scale and variance > MIN_SPREAD_M**2 else 1.0
-    turn = Rotation.from_matrix((u * s) @ vt)  # eq. 40
-    return _similarity(turn, estimate_m, reference_m, scale, 7 if with_scale else 6)
+    scale = float(d @ s / variance) if with_scale and variance > MIN_EXTENT_M**2 else 1.0
+    rotation = Rotation.from_matrix((u * s) @ vt)  # eq. 40
+    return _align_means(rotation, estimate_m, reference_m, scale, 7 if with_scale else 6)
 
 
-def _similarity(
-    turn: Rotation, estimate_m: Array, reference_m: Array, scale: float, freedom: int
+def _align_means(
+    rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
     """Return the similarity with given rotation and scale that aligns the means (eq. 41)."""
-    shift = reference_m.mean(axis=0) - scale * turn.apply(estimate_m.mean(axis=0))
-    w, x, y, z = turn.as_quat(scalar_first=True).tolist()
-    return Transform((w, x, y, z), tuple(shift.tolist()), scale, freedom)
+    shift = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
+    w, x, y, z = rotation.as_quat(scalar_first=True).tolist()
+    return Transform((w, x, y, z), tuple(shift.tolist()), scale, degrees_of_freedom)
 
 
-def _spread(position_m: Array) -> Array:
+def _principal_extents(position_m: Array) -> Array:
     """Return the RMS (m) about the mean along the principal directions, descending."""
     centred = position_m - position_m.mean(axis=0)
     return np.asarray(np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred)))
@@ -145,25 +146,30 @@ def _require_determined(
 ) -> None:
     """Raise TrajectoryError if the motion does not determine the rotation.
 
-    Yaw is determined by horizontal motion, other rotations by the extent across a line (the second
-    singular value).
+    Horizontal motion determines yaw; the extent across a line (the second singular value)
+    determines other rotations.
     """
-    spread, target = _spread(estimate_m), _spread(reference_m)
+    estimate_extents, reference_extents = (
+        _principal_extents(estimate_m),
+        _principal_extents(reference_m),
+    )
     if kind == "yaw":
-        extent_m = min(float(np.hypot(*_spread(m[:, :2]))) for m in (estimate_m, reference_m))
+        extent_m = min(
+            float(np.hypot(*_principal_extents(m[:, :2]))) for m in (estimate_m, reference_m)
+        )
         residual_m = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
-        length, limit = float(np.linalg.norm(target)), MAX_PLANE_RATIO
-        motion, instead = "horizontal motion (RMS) is", "`alignment` none"
+        length, limit = float(np.linalg.norm(reference_extents)), MAX_PLANE_RATIO
+        motion_text, alternative = "horizontal motion (RMS) is", "`alignment` none"
     else:
-        length, extent_m, _ = np.minimum(transform.scale * spread, target)
+        length, extent_m, _ = np.minimum(transform.scale * estimate_extents, reference_extents)
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
         limit = MAX_LINE_RATIO
-        motion = f"motion is along a line: {length:.2g} m (RMS), across it"
-        instead = "`alignment` yaw if z is vertical in both, or `alignment` none"
-    if extent_m < max(MIN_SPREAD_M, MIN_SHARE * length) or residual_m > limit * extent_m:
+        motion_text = f"motion is along a line: {length:.2g} m (RMS), across it"
+        alternative = "`alignment` yaw if z is vertical in both, or `alignment` none"
+    if extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * length) or residual_m > limit * extent_m:
         raise TrajectoryError(
-            f"Alignment {kind} cannot be estimated: the {motion} {extent_m:.2g} m, and the "
+            f"Alignment {kind} cannot be estimated: the {motion_text} {extent_m:.2g} m, and the "
             f"residual is {residual_m:.2g} m. The vehicle moved too little, or the estimate does "
             "not follow its motion.",
-            f"Use {instead}.",
+            f"Use {alternative}.",
         )

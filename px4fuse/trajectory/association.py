@@ -13,13 +13,13 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# longest interpolated interval: multiple of the median interval, and at least this (s)
-GAP_INTERVALS, GAP_S = 3.0, 0.1
-NEAREST_S = 0.01  # largest time difference; same default as the evo package
+# longest interpolated interval: multiple of the median interval, and lower limit (s)
+MAX_GAP_INTERVALS, MIN_GAP_LIMIT_S = 3.0, 0.1
+MAX_NEAREST_DIFFERENCE_S = 0.01  # largest time difference; same default as the evo package
 
 
 class Association(Record, frozen=True):
-    """Pairing of poses by time, with the numbers of unused poses.
+    """Association of poses by time, with the numbers of unused poses.
 
     Attributes
     ----------
@@ -35,8 +35,8 @@ class Association(Record, frozen=True):
     coverage_estimate : float
         Fraction of the poses of the estimate that are used.
     coverage_reference : float
-        Fraction of the time of the reference that the used poses cover. Intervals between them are
-        not counted if they are longer than five median intervals and 0.5 s.
+        Fraction of the time of the reference that the used poses cover. Intervals between used
+        poses do not count if they are longer than five median intervals and 0.5 s.
     """
 
     method: Method
@@ -63,8 +63,8 @@ def associate(
     method : {"interpolate", "nearest"}
         "interpolate": interpolate the reference at the times of the estimate, positions linearly
         and rotations by slerp. "nearest": pair each pose of the trajectory with fewer poses with
-        the nearest of the other, as the evo package does; a pose of the longer one may be used
-        twice.
+        the nearest pose of the other trajectory, as the evo package does; poses of the other
+        trajectory may be used twice.
     max_gap_s : float, optional
         See :class:`Association`; by default three median intervals of the reference and at least
         0.1 s, and 0.01 s for "nearest".
@@ -76,56 +76,60 @@ def associate(
     TrajectoryError
         Fewer than three poses match; the message contains both time spans.
     """
-    time, (first, last) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
+    time_s, (first_s, last_s) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
     if method == "nearest":
-        limit = end_tolerance_s = NEAREST_S if max_gap_s is None else max_gap_s
-        pose_indices, other = _pair_nearest(estimate.time_s, reference.time_s, limit, time_offset_s)
-        matched_reference = reference[other]
+        limit_s = end_tolerance_s = MAX_NEAREST_DIFFERENCE_S if max_gap_s is None else max_gap_s
+        pose_indices, reference_indices = _pair_nearest(
+            estimate.time_s, reference.time_s, limit_s, time_offset_s
+        )
+        matched_reference = reference[reference_indices]
     else:
-        limit, end_tolerance_s = (
+        limit_s, end_tolerance_s = (
             gap_limit(reference.time_s) if max_gap_s is None else max_gap_s,
             0.0,
         )
-        pose_indices = np.flatnonzero(is_bracketed(time, reference.time_s, limit))
-        matched_reference = _interpolate_poses(reference, time[pose_indices])
+        pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, limit_s))
+        matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
-        count = f"only {len(pose_indices)}" if len(pose_indices) else "no"
-        added = f" (with the time offset {time_offset_s:.12g} s)" if time_offset_s else ""
+        count_text = f"only {len(pose_indices)}" if len(pose_indices) else "no"
+        offset_text = f" (with the time offset {time_offset_s:.12g} s)" if time_offset_s else ""
         raise TrajectoryError(
-            f"{estimate.name}: {count} poses match in time. The estimate is from {time[0]:.3f} to "
-            f"{time[-1]:.3f} s{added}, the reference {reference.name} from {first:.3f} to "
-            f"{last:.3f} s.",
+            f"{estimate.name}: {count_text} poses match in time. The estimate is from "
+            f"{time_s[0]:.3f} to {time_s[-1]:.3f} s{offset_text}, the reference {reference.name} "
+            f"from {first_s:.3f} to {last_s:.3f} s.",
             "Check that both are of the same flight. If their clocks differ, give "
             "`time_offset_s` auto.",
         )
-    outside = int(((time < first - end_tolerance_s) | (time > last + end_tolerance_s)).sum())
-    steps = np.diff(time[pose_indices])
-    longest = max(5.0 * float(np.median(np.diff(estimate.time_s))), 0.5)
-    covered_share = float(steps[steps <= longest].sum() / (last - first))
+    outside = int(
+        ((time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)).sum()
+    )
+    steps_s = np.diff(time_s[pose_indices])
+    max_step_s = max(5.0 * float(np.median(np.diff(estimate.time_s))), 0.5)
+    covered_fraction = float(steps_s[steps_s <= max_step_s].sum() / (last_s - first_s))
     used_count, all_poses = len(np.unique(pose_indices)), len(estimate)
-    found = Association(
+    association = Association(
         method=method,
         poses=len(pose_indices),
-        max_gap_s=limit,
+        max_gap_s=limit_s,
         outside=outside,
         in_gaps=all_poses - outside - used_count,
         coverage_estimate=used_count / all_poses,
-        coverage_reference=min(covered_share, 1.0),
+        coverage_reference=min(covered_fraction, 1.0),
     )
-    return estimate[pose_indices], matched_reference, found
+    return estimate[pose_indices], matched_reference, association
 
 
-def gap_limit(time_s: Array, least_s: float = GAP_S) -> float:
+def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
     """Return the longest interval (s) between timestamps that is interpolated."""
-    return max(GAP_INTERVALS * float(np.median(np.diff(time_s))), least_s)
+    return max(MAX_GAP_INTERVALS * float(np.median(np.diff(time_s))), min_limit_s)
 
 
-def is_bracketed(time_s: Array, reference_s: Array, limit: float) -> BoolArray:
-    """Return True for times at a reference time, or between two within ``limit`` (s)."""
+def is_bracketed(time_s: Array, reference_s: Array, limit_s: float) -> BoolArray:
+    """Return a mask of the times at a reference time, or between two with at most ``limit_s``."""
     right = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
-    before, after = reference_s[right - 1], reference_s[right]
-    between = (before <= time_s) & (time_s <= after) & (after - before <= limit)
-    return np.asarray(between | (before == time_s) | (after == time_s))
+    previous_s, next_s = reference_s[right - 1], reference_s[right]
+    is_between = (previous_s <= time_s) & (time_s <= next_s) & (next_s - previous_s <= limit_s)
+    return np.asarray(is_between | (previous_s == time_s) | (next_s == time_s))
 
 
 def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
@@ -133,7 +137,7 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    interpolated = trajectory.moved(positions_at(trajectory, time_s))
+    interpolated = trajectory.with_positions(positions_at(trajectory, time_s))
     return replace(interpolated, rotation=rotation, time_s=time_s)
 
 
@@ -144,19 +148,20 @@ def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
 
 
 def _pair_nearest(
-    estimate_s: Array, reference_s: Array, limit: float, offset_s: float
+    estimate_s: Array, reference_s: Array, limit_s: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
-    """Return indices of pairs: each time of the shorter with the nearest of the longer one."""
-    # add the offset to the longer one, so that rounding is the same as in evo
-    is_longer = len(estimate_s) > len(reference_s)
-    short = reference_s if is_longer else estimate_s
-    long = estimate_s + offset_s if is_longer else reference_s - offset_s
-    right = np.minimum(np.searchsorted(long, short, side="right"), len(long) - 1)
+    """Pair each time of the series with fewer times with the nearest of the other; return indices.
+
+    Pairs with a distance above ``limit_s`` are omitted.
+    """
+    # the offset is added to the series with more times, for the same rounding as in evo
+    has_more = len(estimate_s) > len(reference_s)
+    fewer_s = reference_s if has_more else estimate_s
+    more_s = estimate_s + offset_s if has_more else reference_s - offset_s
+    right = np.minimum(np.searchsorted(more_s, fewer_s, side="right"), len(more_s) - 1)
     left = np.maximum(right - 1, 0)
-    nearest = np.where(np.abs(long[right] - short) < np.abs(short - long[left]), right, left)
-    within_limit = np.flatnonzero(np.abs(long[nearest] - short) <= limit)
-    return (
-        (nearest[within_limit], within_limit)
-        if is_longer
-        else (within_limit, nearest[within_limit])
+    nearest = np.where(
+        np.abs(more_s[right] - fewer_s) < np.abs(fewer_s - more_s[left]), right, left
     )
+    pair_rows = np.flatnonzero(np.abs(more_s[nearest] - fewer_s) <= limit_s)
+    return (nearest[pair_rows], pair_rows) if has_more else (pair_rows, nearest[pair_rows])

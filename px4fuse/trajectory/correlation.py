@@ -12,10 +12,10 @@ Series = TypeVar("Series", Array, Complex)
 
 @dataclass(frozen=True)
 class Moments:
-    """Second moments of two series over their common samples, for each lag.
+    """Second moments of two series a and b over their common samples, for each lag.
 
-    Shape (n + m - 1,); at index k sample 0 of the first series coincides with sample k - (n - 1) of
-    the second.
+    Arrays have shape (n + m - 1,). At index k sample 0 of a coincides with sample k - (n - 1) of b.
+    The sums are over the common samples, and ā and b̄ are the means over these.
 
     Attributes
     ----------
@@ -33,28 +33,29 @@ class Moments:
     power_b: Array
 
 
-def moments(a: Series, b: Series, a_known: BoolArray, b_known: BoolArray) -> Moments:
+def moments(a: Series, b: Series, is_known_a: BoolArray, is_known_b: BoolArray) -> Moments:
     """Compute the moments of two series on one grid at all lags (Padfield 2012, eqs. 3 to 9).
 
     Parameters
     ----------
     a, b : ndarray, shapes (n,) and (m,)
         Real or complex.
-    a_known, b_known : ndarray of bool, shapes (n,) and (m,)
+    is_known_a, is_known_b : ndarray of bool, shapes (n,) and (m,)
         Mask of known samples, at least one of each.
     """
-    # subtract the means for numerical precision
-    masked_series = (a, a_known), (b, b_known)
+    # subtracting the means first improves the numerical precision
+    masked_series = (a, is_known_a), (b, is_known_b)
     a, b = (
-        np.where(known, values - np.mean(values[known]), 0.0) for values, known in masked_series
+        np.where(is_known, values - np.mean(values[is_known]), 0.0)
+        for values, is_known in masked_series
     )
-    m, n = a_known.astype(float), b_known.astype(float)
-    count = np.rint(_correlate(n, m).real)
+    mask_a, mask_b = is_known_a.astype(float), is_known_b.astype(float)
+    count = np.rint(_correlate(mask_b, mask_a).real)
     weight = 1.0 / np.maximum(count, 1.0)
-    sum_a, sum_b = _correlate(n, a), _correlate(b, m)  # conjugate of Σ a
+    sum_a, sum_b = _correlate(mask_b, a), _correlate(b, mask_a)  # conjugate of Σ a
     covariance = _correlate(b, a) - sum_a * sum_b * weight
-    power_a = _correlate(n, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * weight
-    power_b = _correlate(np.abs(b) ** 2, m).real - np.abs(sum_b) ** 2 * weight
+    power_a = _correlate(mask_b, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * weight
+    power_b = _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * weight
     return Moments(count, covariance, power_a, power_b)
 
 
@@ -68,7 +69,7 @@ def autocovariance(values: Array | Complex) -> Array:
 
 def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
     """Compute Σ a conj(b) over the overlap, at each lag."""
-    # imported here: the import takes 0.1 s, and most flights need no correlation
+    # the import is local because it takes 0.1 s, and most flights need no correlation
     from scipy.signal import correlate  # noqa: PLC0415
 
     return np.asarray(correlate(a, b, mode="full", method="fft"))

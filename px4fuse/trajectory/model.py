@@ -14,9 +14,9 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, Record
 
-# source; "slam": SLAM whose frame is that of its first key frame (such as ORB-SLAM3)
+# source of a trajectory; "slam": SLAM with the frame of the first key frame (such as ORB-SLAM3)
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
-# frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
+# world frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 MIN_POSES = 3
 AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
@@ -29,11 +29,11 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 
 
 # components of a vector by the names of the axes
-AxisLengths = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
+AxisComponents = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
 # names of the negative directions
-OPPOSITE = {
+OPPOSITE_DIRECTIONS = {
     "north": "south",
     "east": "west",
     "up": "down",
@@ -44,21 +44,21 @@ OPPOSITE = {
 
 
 def format_vector(vector_m: Mapping[str, float]) -> str:
-    """Format a vector with the names of its directions.
+    """Format the components of a vector with the names of their directions.
 
     >>> format_vector({"forward": 1.0, "right": -0.5}), format_vector({"x": -1.0})
     ('1.00 m forward, 0.50 m left', '-1.00 m along x')
     """
     return ", ".join(
         f"{value:.2f} m along {name}"
-        if name not in OPPOSITE
-        else f"{abs(value):.2f} m {OPPOSITE[name] if value < 0.0 else name}"
+        if name not in OPPOSITE_DIRECTIONS
+        else f"{abs(value):.2f} m {OPPOSITE_DIRECTIONS[name] if value < 0.0 else name}"
         for name, value in vector_m.items()
     )
 
 
-def by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
-    """Return the components of a vector by the names of the frame's axes."""
+def components_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
+    """Return the components of a vector by the names of the axes of its frame."""
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
@@ -84,7 +84,7 @@ class Trajectory:
     Attributes
     ----------
     name : str
-        File name without folder; with the track for a log ("log.ulg:vio").
+        File name without folder; for a log with the name of the track ("log.ulg:vio").
     kind : Kind
     time_s : ndarray, shape (n,)
         Strictly increasing times (s): timestamps of the file, or time since the first data of a
@@ -97,13 +97,14 @@ class Trajectory:
     unix_offset_s : float or None
         UNIX time minus ``time_s``; None if unknown.
     position_variance_m2, rotation_variance_rad2 : ndarray, shape (n, 3), or None
-        Reported variances, of rotation about the body axes; None without report.
+        Variances that the estimator reports, of rotation about the body axes; None if it reports
+        none.
     sha256 : str
         SHA-256 of the file.
     size_bytes : int
         Size of the file.
     notes : tuple of str
-        Remarks of the reader, sentences.
+        Sentences on the detected format and on dropped or missing data.
     """
 
     name: str
@@ -138,18 +139,20 @@ class Trajectory:
             "position_variance_m2",
             "rotation_variance_rad2",
         )
-        known_arrays: dict[str, Any] = {name: getattr(self, name) for name in array_fields}
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in array_fields}
         selected = {
-            name: values[selection] for name, values in known_arrays.items() if values is not None
+            name: values[selection] for name, values in arrays.items() if values is not None
         }
         return replace(self, **selected)
 
-    def moved(self, position_m: Array, world_rotation: Rotation | None = None) -> Trajectory:
-        """Return the poses with other positions, and rotated; reported variances are dropped.
+    def with_positions(
+        self, position_m: Array, world_rotation: Rotation | None = None
+    ) -> Trajectory:
+        """Return the poses with other positions, rotated, and without reported variances.
 
-        ``world_rotation``: one rotation of the frame, or one for each pose.
+        ``world_rotation`` is one rotation of the frame, or one rotation for each pose.
         """
-        rotated = (
+        rotation = (
             self.rotation
             if self.rotation is None or world_rotation is None
             else world_rotation * self.rotation
@@ -158,7 +161,7 @@ class Trajectory:
             "position_variance_m2": None,
             "rotation_variance_rad2": None,
         }
-        return replace(self, position_m=position_m, rotation=rotated, **no_variances)
+        return replace(self, position_m=position_m, rotation=rotation, **no_variances)
 
     def track(self) -> Track:
         """Return the description for the results."""

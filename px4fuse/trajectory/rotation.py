@@ -49,7 +49,7 @@ def from_elements(*rows: tuple[Array | float, ...]) -> Array:
     return matrices
 
 
-def matrix(q: Array) -> Array:
+def to_matrix(q: Array) -> Array:
     """Convert quaternions to rotation matrices, shape (..., 3, 3)."""
     w, x, y, z = np.moveaxis(q, -1, 0)
     return from_elements(
@@ -65,10 +65,11 @@ def skew(v: Array) -> Array:
     return from_elements((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
 
 
-def running_product(quaternions: Array) -> Array:
+def cumulative_product(quaternions: Array) -> Array:
     """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ..., shape (n, 4).
 
-    The quaternions are arranged in about √n columns, so n products need about 2√n vectorised steps.
+    The quaternions are arranged in about √n columns and rows, so about 2√n vectorised steps are
+    needed.
     """
     n = len(quaternions)
     width = max(1, int(np.sqrt(n)))
@@ -76,20 +77,20 @@ def running_product(quaternions: Array) -> Array:
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     padded = np.concatenate([quaternions, np.tile(identity, (rows * width - n, 1))])
     # row r contains quaternions r·width to (r+1)·width
-    blocks = padded.reshape(rows, width, 4).copy()
+    row_products = padded.reshape(rows, width, 4).copy()
     for column in range(1, width):
-        blocks[:, column] = multiply(blocks[:, column - 1], blocks[:, column])
-    before = np.tile(identity, (rows, 1))
+        row_products[:, column] = multiply(row_products[:, column - 1], row_products[:, column])
+    previous_products = np.tile(identity, (rows, 1))
     for row in range(1, rows):
-        before[row] = multiply(before[row - 1], blocks[row - 1, -1])
-    product = multiply(before[:, None, :], blocks).reshape(-1, 4)[:n]
+        previous_products[row] = multiply(previous_products[row - 1], row_products[row - 1, -1])
+    product = multiply(previous_products[:, None, :], row_products).reshape(-1, 4)[:n]
     return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))
 
 
-def interpolate(times: Array, known_times: Array, known: Array) -> Array:
-    """Interpolate quaternions that differ little: linearly, then normalised."""
-    signs_between = np.sign(np.sum(known[1:] * known[:-1], axis=1))
+def interpolate(times: Array, known_times: Array, quaternions: Array) -> Array:
+    """Interpolate quaternions with small differences: linearly, then normalised."""
+    signs_between = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
     signs = np.concatenate([[1.0], np.cumprod(np.where(signs_between == 0.0, 1.0, signs_between))])
-    continuous = known * signs[:, None]
-    q = np.stack([np.interp(times, known_times, part) for part in continuous.T], axis=-1)
+    continuous = quaternions * signs[:, None]
+    q = np.stack([np.interp(times, known_times, component) for component in continuous.T], axis=-1)
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

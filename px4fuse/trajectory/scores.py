@@ -20,13 +20,14 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 Unit = Literal["frames", "m", "s"]
 
-RELATIVE_TOLERANCE = 0.1  # of a delta if all pairs are used; same default as the evo package
-# default deltas of the RPE, if they are between these fractions of path length or time
-DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
-TIMES_S = (1.0, 10.0, 60.0)
-MAX_DISTANCES, MAX_TIMES = 3, 2
-MIN_DELTA_SHARE, MAX_DELTA_SHARE = 1 / 200, 1 / 5
-RESAMPLES, SEED, LEVEL = 2000, 20120101, 0.95
+# relative tolerance of the distance of a pair if all pairs are used; default of the evo package
+DELTA_TOLERANCE = 0.1
+# default deltas of the RPE; used if between the given fractions of path length or duration
+DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
+DEFAULT_TIMES_S = (1.0, 10.0, 60.0)
+MAX_DEFAULT_DISTANCES, MAX_DEFAULT_TIMES = 3, 2
+MIN_DELTA_FRACTION, MAX_DELTA_FRACTION = 1 / 200, 1 / 5
+BOOTSTRAP_RESAMPLES, BOOTSTRAP_SEED, CONFIDENCE_LEVEL = 2000, 20120101, 0.95
 BLOCK_TIMES = 3.0  # block length, in autocorrelation times
 WINDOW_TIMES = 5.0  # summation window, in autocorrelation times (Sokal 1997)
 MIN_BLOCKS = 5.0  # smallest number of blocks for an interval
@@ -34,7 +35,7 @@ MIN_BLOCKS = 5.0  # smallest number of blocks for an interval
 
 @dataclass(frozen=True)
 class Delta:
-    """Distance between the two poses of an RPE pair, with unit."""
+    """Distance between the two poses of an RPE pair in frames, metres or seconds."""
 
     value: float
     unit: Unit
@@ -44,7 +45,7 @@ class Delta:
 
 
 class Statistics(Record, frozen=True):
-    """Statistics of ``count`` errors, in their unit; ``std`` divides by n, as in evo."""
+    """Statistics of ``count`` errors in the unit of the errors; ``std`` divides by n, as in evo."""
 
     count: Count
     rmse: NotNegative
@@ -81,7 +82,7 @@ class RelativeError(Record, frozen=True):
     delta : float
         In ``unit``.
     all_pairs : bool
-        Pairs start at every pose; else each pair starts at the end of the previous one.
+        True if a pair starts at every pose; False if each pair starts at the end of the last pair.
     pairs_from : str
         Path along which distances are measured: always the reference.
     translation_m, rotation_deg : Statistics or Unavailable
@@ -111,7 +112,7 @@ class PairwiseError(RelativeError, frozen=True, kw_only=True, eq=False):
     start, end : ndarray of int, shape (k,)
         Poses of each pair, as indices into the arrays of the evaluation.
     translation_error_m, rotation_error_deg : ndarray, shape (k,)
-        Empty if unavailable.
+        Empty if the RPE is unavailable.
     """
 
     schema_type = RelativeError
@@ -137,17 +138,27 @@ def statistics(errors: Array) -> Statistics:
 
 
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
-    """Choose distances and times of the RPE by path length and duration of the flight."""
-    length, span = float(distance_m[-1]), float(time_s[-1] - time_s[0])
+    """Choose distances and times for the RPE that fit path length and duration of the flight."""
+    length_m, span_s = float(distance_m[-1]), float(time_s[-1] - time_s[0])
     # a delta must contain at least two steps
-    step, interval = float(np.median(np.diff(distance_m))), float(np.median(np.diff(time_s)))
-    low, high = max(MIN_DELTA_SHARE * length, 2.0 * step), MAX_DELTA_SHARE * length
-    distances = [value for value in DISTANCES_M if low <= value <= high][-MAX_DISTANCES:]
-    times = [t for t in TIMES_S if 2.0 * interval <= t <= MAX_DELTA_SHARE * span][-MAX_TIMES:]
+    median_step_m, median_interval_s = (
+        float(np.median(np.diff(distance_m))),
+        float(np.median(np.diff(time_s))),
+    )
+    min_distance_m, max_distance_m = (
+        max(MIN_DELTA_FRACTION * length_m, 2.0 * median_step_m),
+        MAX_DELTA_FRACTION * length_m,
+    )
+    distances = [
+        value for value in DEFAULT_DISTANCES_M if min_distance_m <= value <= max_distance_m
+    ][-MAX_DEFAULT_DISTANCES:]
+    times = [
+        t for t in DEFAULT_TIMES_S if 2.0 * median_interval_s <= t <= MAX_DELTA_FRACTION * span_s
+    ][-MAX_DEFAULT_TIMES:]
     return (*(Delta(value, "m") for value in distances), *(Delta(value, "s") for value in times))
 
 
-def pairs(
+def find_pairs(
     position_m: Array,
     time_s: Array,
     delta: Delta,
@@ -163,8 +174,8 @@ def pairs(
     delta : Delta
         A distance is measured along the path.
     all_pairs : bool
-        From every pose to that with the nearest distance, if within a tenth of delta; else from the
-        end of each pair to the first pose at least delta further.
+        True: from every pose to the pose whose distance is nearest to delta, if within a tenth of
+        delta. False: from the end of the last pair to the first pose that is at least delta away.
 
     Returns
     -------
@@ -184,24 +195,24 @@ def pairs(
             raise SettingsError(f"RPE delta {delta}: the number of frames must be an integer.")
         start = np.arange(0, max(n - step, 0), 1 if all_pairs else step)
         return start, start + step
-    path_position = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
+    travelled = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
     if not all_pairs:
-        return _consecutive_pairs(np.diff(path_position), delta.value)
+        return _consecutive_pairs(np.diff(travelled), delta.value)
     start = np.arange(n - 1)
-    # also test the neighbours, because of rounding
-    nearest_guess = np.searchsorted(path_position, path_position + delta.value)[:-1]
+    # the neighbours are tested, too, because of rounding
+    nearest_guess = np.searchsorted(travelled, travelled + delta.value)[:-1]
     candidates = np.clip(nearest_guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
-    distance_error = np.abs(path_position[candidates] - path_position[start, None] - delta.value)
-    best = np.argmin(distance_error, axis=1)
-    # the first of several poses at rest with equal distance
-    first = np.searchsorted(path_position, path_position[candidates[start, best]])
-    is_near = distance_error[start, best] <= RELATIVE_TOLERANCE * delta.value
-    return start[is_near], np.maximum(first, start + 1)[is_near]
+    distance_error = np.abs(travelled[candidates] - travelled[start, None] - delta.value)
+    best_candidate = np.argmin(distance_error, axis=1)
+    # of several poses at rest with equal distance the first is used
+    first_equal = np.searchsorted(travelled, travelled[candidates[start, best_candidate]])
+    is_near = distance_error[start, best_candidate] <= DELTA_TOLERANCE * delta.value
+    return start[is_near], np.maximum(first_equal, start + 1)[is_near]
 
 
 def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
     """Return consecutive pairs, each the shortest of at least ``delta``."""
-    # sum each pair from zero, for the same rounding as in evo
+    # the distance of each pair is summed from zero, for the same rounding as in evo
     ends, travelled = [0], 0.0
     for index, step in enumerate(steps.tolist(), 1):
         travelled += step
@@ -224,40 +235,51 @@ def relative_error(
     Parameters
     ----------
     aligned, reference : Trajectory
-        P and Q, with the same number of poses at the same times. Of an alignment only the scale
-        affects the error.
+        P and Q, with the same number of poses at the same times. Only the scale of an alignment
+        affects the RPE.
     delta, all_pairs
-        See :func:`pairs`; measured along the reference.
+        See :func:`find_pairs`; distances are measured along the reference.
     """
-    start, end = pairs(reference.position_m, reference.time_s, delta, all_pairs=all_pairs)
-    what = f"RPE over {delta}"
-    rotations = rotations_of(aligned, reference, what)
+    start, end = find_pairs(reference.position_m, reference.time_s, delta, all_pairs=all_pairs)
+    analysis_name = f"RPE over {delta}"
+    rotations = get_rotations(aligned, reference, analysis_name)
     if not isinstance(rotations, Unavailable) and not len(start):
         rotations = Unavailable(
-            what, f"no pair of poses with a distance of {delta}", "Use another delta."
+            analysis_name, f"no pair of poses with a distance of {delta}", "Use another delta."
         )
-    scores: tuple[OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]]
+    result_fields: tuple[
+        OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]
+    ]
     if isinstance(rotations, Unavailable):
         start = end = np.empty(0, dtype=np.intp)
         translation = rotation = np.empty(0)
-        scores = rotations, rotations, rotations
+        result_fields = rotations, rotations, rotations
     else:
-        p, q = (rotation_series[start].inv() for rotation_series in rotations)
-        p_move = p.apply(aligned.position_m[end] - aligned.position_m[start])
-        q_move = q.apply(reference.position_m[end] - reference.position_m[start])
-        # the outer rotation of E does not change the length of the translation
-        translation = np.linalg.norm(p_move - q_move, axis=1)
-        p_turn, q_turn = p * rotations[0][end], q * rotations[1][end]
-        rotation = np.degrees((q_turn.inv() * p_turn).magnitude())
+        estimate_inverse, reference_inverse = (
+            rotation_series[start].inv() for rotation_series in rotations
+        )
+        estimate_motion = estimate_inverse.apply(
+            aligned.position_m[end] - aligned.position_m[start]
+        )
+        reference_motion = reference_inverse.apply(
+            reference.position_m[end] - reference.position_m[start]
+        )
+        # the rotation Q_j⁻¹ Q_i in E does not change the length of the translation
+        translation = np.linalg.norm(estimate_motion - reference_motion, axis=1)
+        estimate_rotation, reference_rotation = (
+            estimate_inverse * rotations[0][end],
+            reference_inverse * rotations[1][end],
+        )
+        rotation = np.degrees((reference_rotation.inv() * estimate_rotation).magnitude())
         overlap = int(np.median(end - start)) if all_pairs else 1
-        interval = rmse_interval(translation, what, min_block=overlap)
-        scores = statistics(translation), interval, statistics(rotation)
+        interval = rmse_interval(translation, analysis_name, min_block=overlap)
+        result_fields = statistics(translation), interval, statistics(rotation)
     return PairwiseError(
         delta.value,
         delta.unit,
         all_pairs,
         "reference",
-        *scores,
+        *result_fields,
         start=start,
         end=end,
         translation_error_m=translation,
@@ -265,30 +287,30 @@ def relative_error(
     )
 
 
-def rotations_of(
-    aligned: Trajectory, reference: Trajectory, what: str
+def get_rotations(
+    aligned: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return the rotations of both, or Unavailable with the name of the analysis ``what``."""
+    """Return the rotations of both trajectories, or Unavailable with the name of the analysis."""
     if aligned.rotation is not None and reference.rotation is not None:
         return aligned.rotation, reference.rotation
     reason = f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation"
-    return Unavailable(what, reason, "Give a trajectory with orientation.")
+    return Unavailable(analysis_name, reason, "Give a trajectory with orientation.")
 
 
 def rmse_interval(
-    errors: Array, what: str, *, min_block: int = 1, resamples: int = RESAMPLES
+    errors: Array, analysis_name: str, *, min_block: int = 1, resamples: int = BOOTSTRAP_RESAMPLES
 ) -> Interval | Unavailable:
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
-    Politis & Romano (1992), with blocks of three integrated autocorrelation times of the squared
-    errors. Percentiles are widened according to Student's t for the number of blocks (Hesterberg
-    2015, section 5.3).
+    The method is that of Politis & Romano (1992), with blocks of three integrated autocorrelation
+    times of the squared errors. Percentiles are widened according to Student's t for the number of
+    blocks (Hesterberg 2015, section 5.3).
 
     Parameters
     ----------
     errors : ndarray, shape (n,)
         In order of time.
-    what : str
+    analysis_name : str
         Name of the score, for Unavailable.
     min_block : int
         Smallest block length: number of overlapping pairs.
@@ -303,7 +325,7 @@ def rmse_interval(
     length = max(int(np.ceil(BLOCK_TIMES * autocorrelation_time(squares))), min_block, 1)
     if n < MIN_BLOCKS * length:
         return Unavailable(
-            f"interval of the {what} RMSE",
+            f"interval of the {analysis_name} RMSE",
             f"errors are correlated over {length} of {n} samples, so fewer than "
             f"{MIN_BLOCKS:.0f} independent blocks remain",
             "Use a longer flight.",
@@ -311,16 +333,16 @@ def rmse_interval(
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
     block_means = (sums[length:] - sums[:-length]) / length  # one per start, circular
     blocks = n / length
-    block_starts = np.random.default_rng(SEED).integers(0, n, (resamples, round(blocks)))
+    block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (resamples, round(blocks)))
     means = block_means[block_starts].mean(axis=1)
-    quantile = float(stdtrit(blocks - 1.0, 0.5 + LEVEL / 2.0))
+    quantile = float(stdtrit(blocks - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
     tail = float(ndtr(-quantile * np.sqrt(blocks / (blocks - 1.0))))
     low, high = np.sqrt(np.maximum(np.quantile(means, [tail, 1.0 - tail]), 0.0))
     return Interval(float(low), float(high), length, blocks)
 
 
 def autocorrelation_time(values: Array) -> float:
-    """Compute the integrated autocorrelation time in samples, shape (n,): 1 + 2 Σ ρ, at least 1.
+    """Compute the integrated autocorrelation time (samples) of a series: 1 + 2 Σ ρ, at least 1.
 
     The sum ends at five autocorrelation times (Sokal 1997, section 3).
     """
@@ -330,5 +352,5 @@ def autocorrelation_time(values: Array) -> float:
     n = len(centred)
     covariance = autocovariance(centred)
     times = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
-    enough = np.flatnonzero(np.arange(n) >= WINDOW_TIMES * times)
-    return max(1.0, float(times[enough[0]] if len(enough) else n))
+    long_windows = np.flatnonzero(np.arange(n) >= WINDOW_TIMES * times)
+    return max(1.0, float(times[long_windows[0]] if len(long_windows) else n))

@@ -1,12 +1,12 @@
 """Time offset between two recordings of the same motion: search over all lags, then least squares.
 
-The same method is used for trajectories here, and for a position file against EKF2 or the IMU in
-:mod:`px4fuse.alignment.time_and_pose_fit`. Two series are correlated at all lags
-(:mod:`correlation`). The best lag is refined by least squares, and is rejected if another lag has a
-residual within the factor :data:`MIN_SECOND_PEAK_RATIO`. Trajectories may have any frame and scale:
-their speeds are correlated, and a similarity transform is refined. A position file is in metres
-with z vertical, and has outliers: horizontal positions are correlated, and yaw and origin are
-refined robustly.
+Two series are correlated at all lags (:mod:`~px4fuse.trajectory.correlation`). The best lag is
+refined by least squares, and rejected if another lag has a residual within the factor
+:data:`MIN_SECOND_PEAK_RATIO`. This method is used for trajectories here, and for a position file
+against EKF2 or the IMU in :mod:`px4fuse.alignment.time_and_pose_fit`. Trajectories may have any
+frame and scale: their speeds are correlated, and a similarity transform is fitted. A position file
+is in metres with z vertical, and has outliers: horizontal positions are correlated, and yaw and
+origin are fitted robustly.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
-STEP_S, MAX_SAMPLES = 0.05, 200_000  # step and size of the search grid
+GRID_STEP_S, MAX_GRID_SAMPLES = 0.05, 200_000  # step and size of the search grid
 SMOOTHING_S = 0.25  # smoothing time of speeds; differentiated positions are noisy
-MIN_OVERLAP_S, MIN_OVERLAP_SHARE = 5.0, 0.5  # overlap: s, and fraction of the shorter one
-MIN_POSES_SHARE = 0.3  # fraction of the poses in the time of the shorter one, outside of gaps
-CANDIDATES = 12  # number of correlation peaks whose ATE is computed
+MIN_OVERLAP_S, MIN_OVERLAP_FRACTION = 5.0, 0.5  # overlap: s, and fraction of the shorter trajectory
+MIN_POSES_FRACTION = 0.3  # fraction of the poses in the time of the shorter trajectory
+MAX_CANDIDATES = 12  # number of correlation peaks whose ATE is computed
 # s; half-width of the least-squares search around a peak, and around its result
-WINDOW_S, FINE_WINDOW_S = 0.5, 0.1
-MIN_SEPARATION_S = 1.0  # smallest distance of two peaks
+SEARCH_WINDOW_S, FINE_SEARCH_WINDOW_S = 0.5, 0.1
+MIN_PEAK_DISTANCE_S = 1.0  # smallest distance of two peaks
 MIN_CORRELATION = 0.3
 # ratio of residuals (RMS) below which another offset fits equally well: 95 % limit for two sets of
 # 80 independent residuals, half a minute of flight (F-test, F = 1.2², 80 and 80 degrees of freedom)
 MIN_SECOND_PEAK_RATIO = 1.2
-MAX_POSES = 2000  # number of poses in the least squares
-# residual over extent: above the first the fit is rejected; below the second fits count as equal
+MAX_FITTED_POSES = 2000  # number of poses in the least squares
+# residual over extent: a fit above the first is rejected; fits below the second are equally good
 MAX_MISFIT, MIN_MISFIT = 0.5, 1e-3
-# velocity that a similarity transform cannot absorb: smallest fraction of the speed (RMS), and
+# velocity that a similarity transform cannot explain: smallest fraction of the speed (RMS), and
 # smallest correlation between the two trajectories, which excludes noise
-MIN_FREE_SHARE, MIN_FREE_CORRELATION = 0.05, 0.5
-WINDOW_LENGTHS = 4  # window of the variance of the score, in correlation lengths
+MIN_FREE_SPEED_FRACTION, MIN_FREE_CORRELATION = 0.05, 0.5
+WINDOW_CORRELATION_LENGTHS = 4  # window of the variance of the score, in correlation lengths
 MAX_HALF_INTERVAL_S = 0.5  # half-width of the 95 % interval above which the offset is rejected
-LEVEL = 0.95
+CONFIDENCE_LEVEL = 0.95
 
 
 class TimeOffset(Record, frozen=True, kw_only=True):
@@ -71,7 +71,7 @@ class TimeOffset(Record, frozen=True, kw_only=True):
 
 
 def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | None:
-    """Return the offset (s) of the estimate by UNIX time; None if one lacks UNIX time."""
+    """Return the time offset (s) to the estimate by UNIX time; None if one has no UNIX time."""
     if estimate.unix_offset_s is None or reference.unix_offset_s is None:
         return None
     return estimate.unix_offset_s - reference.unix_offset_s
@@ -80,8 +80,8 @@ def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | Non
 def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOffset:
     """Estimate the time offset between two trajectories of the same motion.
 
-    Speeds, and angular speeds if both have orientations, do not depend on the frame. Their masked
-    correlation at all lags (Padfield 2012; Furrer 2017) gives candidates for any offset. The
+    Speeds, and angular speeds if both have orientations, do not depend on the frame. The peaks of
+    their masked correlation over all lags (Padfield 2012; Furrer 2017) are the candidates. The
     candidate with the smallest ATE after a similarity alignment is refined by minimising the ATE.
     The interval is that of the linearised least squares, with the long-run variance of the score
     (Newey & West 1987), because pose errors are correlated.
@@ -89,74 +89,82 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     Returns
     -------
     TimeOffset
-        Not determinable without motion, with constant speed along a line or circle (a time offset
-        then equals a position offset), or if other offsets fit equally well.
+        Not determined without motion, with constant speed along a line or circle (a time offset is
+        then equivalent to a position offset), or if other offsets fit equally well.
     """
-    # interpolate the denser trajectory
+    # the trajectory with the shorter intervals is interpolated
     if _median_step(estimate) >= _median_step(reference):
-        return _search(estimate, reference)
-    found = _search(reference, estimate)
-    if found.offset_s is None or found.interval_s is None:
-        return found
-    low, high = found.interval_s
-    return structs.replace(found, offset_s=-found.offset_s, interval_s=(-high, -low))
+        return _search_offset(estimate, reference)
+    reversed_offset = _search_offset(reference, estimate)
+    if reversed_offset.offset_s is None or reversed_offset.interval_s is None:
+        return reversed_offset
+    low_s, high_s = reversed_offset.interval_s
+    return structs.replace(
+        reversed_offset, offset_s=-reversed_offset.offset_s, interval_s=(-high_s, -low_s)
+    )
 
 
 def _median_step(trajectory: Trajectory) -> float:
     return float(np.median(np.diff(trajectory.time_s)))
 
 
-def _search(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
+def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
     """Estimate the offset to add to the timestamps of the sparse trajectory."""
-    start_s = clock_difference(sparse, dense)
-    candidates = ([] if start_s is None else [start_s]) + _candidates(sparse, dense)
+    clock_offset_s = clock_difference(sparse, dense)
+    candidates = ([] if clock_offset_s is None else [clock_offset_s]) + _find_candidates(
+        sparse, dense
+    )
     if not candidates:
         return _not_determinable(
             "the speeds are not correlated at any offset (no motion, constant speed, or different "
             "flights)"
         )
-    coarse = [_refine_offset(sparse, dense, lag, WINDOW_S) for lag in candidates]
-    fits = [fit for fit in coarse if fit is not None and fit.misfit <= MAX_MISFIT]
-    fits.sort(key=lambda fit: fit.misfit)
-    if not fits:
+    coarse_fits = [_refine_offset(sparse, dense, lag, SEARCH_WINDOW_S) for lag in candidates]
+    accepted_fits = [fit for fit in coarse_fits if fit is not None and fit.misfit <= MAX_MISFIT]
+    accepted_fits.sort(key=lambda fit: fit.misfit)
+    if not accepted_fits:
         return _not_determinable(
             "the offsets with correlated speeds do not fit the positions, or the overlap is "
             "too short"
         )
-    best = fits[0]
-    similar_fits = [fit for fit in fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best.misfit]
-    distant_fits = [
-        fit for fit in similar_fits if abs(fit.offset_s - best.offset_s) > MIN_SEPARATION_S
+    best_fit = accepted_fits[0]
+    similar_fits = [
+        fit for fit in accepted_fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best_fit.misfit
     ]
-    if start_s is not None:
+    distant_fits = [
+        fit for fit in similar_fits if abs(fit.offset_s - best_fit.offset_s) > MIN_PEAK_DISTANCE_S
+    ]
+    if clock_offset_s is not None:
         # UNIX time decides between offsets that fit equally well
-        best = min(similar_fits, key=lambda fit: abs(fit.offset_s - start_s))
+        best_fit = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     elif distant_fits:
         return _not_determinable(
             "the motion is periodic: with an offset that differs by "
-            f"{abs(distant_fits[0].offset_s - best.offset_s):.1f} s the ATE is "
-            f"{distant_fits[0].rms_m:.3g} m instead of {best.rms_m:.3g} m"
+            f"{abs(distant_fits[0].offset_s - best_fit.offset_s):.1f} s the ATE is "
+            f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
         )
-    # repeat with the poses available around the result, not around the candidate
-    best = _refine_offset(sparse, dense, best.offset_s, FINE_WINDOW_S) or best
-    half_interval_s = _half_interval(sparse, dense, best)
+    # the fit is repeated with the poses that overlap around the result
+    best_fit = _refine_offset(sparse, dense, best_fit.offset_s, FINE_SEARCH_WINDOW_S) or best_fit
+    half_interval_s = _half_interval(sparse, dense, best_fit)
     if not half_interval_s <= MAX_HALF_INTERVAL_S:
-        width = f" (95 %: ±{half_interval_s:.2g} s)" if np.isfinite(half_interval_s) else ""
+        interval_text = f" (95 %: ±{half_interval_s:.2g} s)" if np.isfinite(half_interval_s) else ""
         return _not_determinable(
             "the speed is nearly constant, so a time offset cannot be distinguished from a "
-            f"position offset{width}"
+            f"position offset{interval_text}"
         )
     return TimeOffset(
-        offset_s=best.offset_s,
-        interval_s=(best.offset_s - half_interval_s, best.offset_s + half_interval_s),
+        offset_s=best_fit.offset_s,
+        interval_s=(best_fit.offset_s - half_interval_s, best_fit.offset_s + half_interval_s),
         is_determinable=True,
         reason="Maximum speed correlation over all lags, refined by minimum ATE "
-        f"({best.rms_m:.3g} m after a similarity alignment, {len(best.time_s)} poses).",
+        f"({best_fit.rms_m:.3g} m after a similarity alignment, {len(best_fit.time_s)} poses).",
     )
 
 
-def _not_determinable(why: str) -> TimeOffset:
-    return TimeOffset(is_determinable=False, reason=f"The time offset cannot be estimated: {why}.")
+def _not_determinable(reason: str) -> TimeOffset:
+    return TimeOffset(
+        is_determinable=False, reason=f"The time offset cannot be estimated: {reason}."
+    )
 
 
 def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
@@ -171,7 +179,7 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
 def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
     """Return the smoothed velocity at times within the trajectory, shape (n, 3)."""
     span = float(trajectory.time_s[-1] - trajectory.time_s[0])
-    grid, velocity = _grid_velocity(trajectory, max(STEP_S, span / MAX_SAMPLES))
+    grid, velocity = _grid_velocity(trajectory, max(GRID_STEP_S, span / MAX_GRID_SAMPLES))
     columns = [np.interp(time_s, grid, column) for column in velocity.T]
     return np.stack(columns, axis=1)
 
@@ -181,7 +189,7 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
     # interpolate between key frames, but not across lost tracking
-    known = is_bracketed(grid, time, max(10.0 * _median_step(trajectory), 0.5))
+    is_known = is_bracketed(grid, time, max(10.0 * _median_step(trajectory), 0.5))
     speeds = [np.linalg.norm(velocity, axis=1)]
     if trajectory.rotation is not None:
         rotations = Slerp(time, trajectory.rotation)(grid)
@@ -189,35 +197,46 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
         rates = np.concatenate((rates, rates[-1:]))
         sigma = max(SMOOTHING_S, _median_step(trajectory)) / step_s
         speeds.append(np.linalg.norm(gaussian_filter1d(rates, sigma, axis=0), axis=1))
-    return speeds, known
+    return speeds, is_known
 
 
-def _candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
+def _find_candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
     """Return offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
-    spans = [float(track.time_s[-1] - track.time_s[0]) for track in (sparse, dense)]
-    step = max(STEP_S, max(spans) / MAX_SAMPLES)
-    if min(spans) < 10 * step:
+    spans_s = [float(track.time_s[-1] - track.time_s[0]) for track in (sparse, dense)]
+    step_s = max(GRID_STEP_S, max(spans_s) / MAX_GRID_SAMPLES)
+    if min(spans_s) < 10 * step_s:
         return []
-    (x, x_known), (y, y_known) = (_speeds(track, step) for track in (sparse, dense))
-    min_count = max(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * min(spans)) / step
-    min_count = min(min_count, 0.5 * min(spans) / step)
+    (sparse_speeds, is_known_sparse), (dense_speeds, is_known_dense) = (
+        _speeds(track, step_s) for track in (sparse, dense)
+    )
+    min_count = max(MIN_OVERLAP_S, MIN_OVERLAP_FRACTION * min(spans_s)) / step_s
+    min_count = min(min_count, 0.5 * min(spans_s) / step_s)
     correlations = []
-    for a, b in zip(x, y, strict=False):  # angular speeds if both have them
-        found = moments(a, b, x_known, y_known)
-        # exclude parts at rest, where the variance is only rounding
-        is_usable = found.count >= min_count
-        for values, known, power in ((a, x_known, found.power_a), (b, y_known, found.power_b)):
-            total_power = float(np.var(values[known])) * np.count_nonzero(known)
-            is_usable &= power > 1e-3 * total_power / len(values) * found.count
-        scale = np.sqrt(np.where(is_usable, found.power_a * found.power_b, 1.0))
-        correlations.append(np.where(is_usable, found.covariance.real / scale, 0.0))
-    total = np.mean(correlations, axis=0)
-    highest = maximum_filter1d(total, round(2 * MIN_SEPARATION_S / step) + 1)
-    order = np.flatnonzero((total == highest) & (total > MIN_CORRELATION))
-    order = order[np.argsort(-total[order])][:CANDIDATES]
-    # index k: the first sample of sparse is at sample k - (n - 1) of dense
-    lags = (order - (len(x_known) - 1)) * step + float(dense.time_s[0]) - float(sparse.time_s[0])
-    return list(lags.tolist())
+    for a, b in zip(sparse_speeds, dense_speeds, strict=False):  # angular speeds if both have them
+        speed_moments = moments(a, b, is_known_sparse, is_known_dense)
+        # exclude parts at rest, in which the variance is only rounding
+        is_usable = speed_moments.count >= min_count
+        for values, is_known, power in (
+            (a, is_known_sparse, speed_moments.power_a),
+            (b, is_known_dense, speed_moments.power_b),
+        ):
+            total_power = float(np.var(values[is_known])) * np.count_nonzero(is_known)
+            is_usable &= power > 1e-3 * total_power / len(values) * speed_moments.count
+        scale = np.sqrt(np.where(is_usable, speed_moments.power_a * speed_moments.power_b, 1.0))
+        correlations.append(np.where(is_usable, speed_moments.covariance.real / scale, 0.0))
+    mean_correlation = np.mean(correlations, axis=0)
+    local_maximum = maximum_filter1d(mean_correlation, round(2 * MIN_PEAK_DISTANCE_S / step_s) + 1)
+    order = np.flatnonzero(
+        (mean_correlation == local_maximum) & (mean_correlation > MIN_CORRELATION)
+    )
+    order = order[np.argsort(-mean_correlation[order])][:MAX_CANDIDATES]
+    # at index k the first sample of sparse is at sample k - (n - 1) of dense
+    lags_s = (
+        (order - (len(is_known_sparse) - 1)) * step_s
+        + float(dense.time_s[0])
+        - float(sparse.time_s[0])
+    )
+    return list(lags_s.tolist())
 
 
 @dataclass(frozen=True)
@@ -248,77 +267,83 @@ class _OffsetFit:
 
     @property
     def misfit(self) -> float:
-        """RMS of the residuals over that of the motion, so short parts have no advantage."""
-        # extent of the target, because a bad fit scales the estimate to a point
+        """RMS of the residuals over RMS extent of the motion, comparable between fits."""
+        # extent of the target, because a bad fit shrinks the estimate to a point
         extent = float(np.sqrt(self.target_m.var(axis=0).sum()))
         return max(self.rms_m / extent, MIN_MISFIT) if extent > 0.0 else float("inf")
 
 
 def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> float:
-    """Return half of the 95 % interval (s); infinite if a position offset fits equally well."""
-    n, centred = len(fit.time_s), fit.aligned_m - fit.aligned_m.mean(axis=0)
-    velocity = _velocity(dense, fit.time_s + fit.offset_s)
-    other = fit.transform.rotation.apply(fit.transform.scale * _velocity(sparse, fit.time_s))
-    # remove the part of a time offset that equals a translation, small rotation or scale
+    """Return half of the 95 % interval (s); infinite if a position offset explains as much."""
+    n, centred_m = len(fit.time_s), fit.aligned_m - fit.aligned_m.mean(axis=0)
+    dense_velocity = _velocity(dense, fit.time_s + fit.offset_s)
+    sparse_velocity = fit.transform.rotation.apply(
+        fit.transform.scale * _velocity(sparse, fit.time_s)
+    )
+    # remove the effect of a time offset that equals a translation, small rotation or scale
     columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
-    columns += [np.cross(axis, centred) for axis in np.eye(3)]
-    similarity_columns = np.stack([*columns, centred], axis=-1).reshape(3 * n, 7)
-    both = np.stack((velocity, other), axis=-1).reshape(3 * n, 2)
-    both = both - similarity_columns @ np.linalg.lstsq(similarity_columns, both, rcond=None)[0]
-    (information, cross_information), (_, other_information) = (both.T @ both).tolist()
+    columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
+    similarity_columns = np.stack([*columns, centred_m], axis=-1).reshape(3 * n, 7)
+    velocities = np.stack((dense_velocity, sparse_velocity), axis=-1).reshape(3 * n, 2)
+    velocities = (
+        velocities
+        - similarity_columns @ np.linalg.lstsq(similarity_columns, velocities, rcond=None)[0]
+    )
+    (information, cross_information), (_, other_information) = (velocities.T @ velocities).tolist()
     if (
-        information <= MIN_FREE_SHARE**2 * float((velocity**2).sum())
+        information <= MIN_FREE_SPEED_FRACTION**2 * float((dense_velocity**2).sum())
         or cross_information <= MIN_FREE_CORRELATION * (information * other_information) ** 0.5
     ):
         return float("inf")
-    score = (both[:, 0].reshape(n, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
+    score = (velocities[:, 0].reshape(n, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
     # the window of the weights must be longer than the correlation
-    lags = min(max(1, WINDOW_LENGTHS * _correlation_length(score)), n // 4)
+    lags = min(max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(score)), n // 4)
     weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
     products = [float(score[k:] @ score[:-k]) for k in range(1, lags + 1)]
     own_variance = float(score @ score)
     variance = max(own_variance + 2.0 * float(weights @ products), own_variance)
-    quantile = float(stdtrit(max(n / lags - 1.0, 1.0), 0.5 + LEVEL / 2.0))
+    quantile = float(stdtrit(max(n / lags - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
     return float(quantile * np.sqrt(variance) / information)
 
 
 def _correlation_length(values: Array) -> int:
     """Return the first lag with autocorrelation below 1/e, at most n / 4."""
-    full = autocovariance(values - values.mean())
-    below = np.flatnonzero(full < full[0] / np.e)
-    return int(below[0]) if len(below) else len(values) // 4
+    covariance = autocovariance(values - values.mean())
+    low_lags = np.flatnonzero(covariance < covariance[0] / np.e)
+    return int(low_lags[0]) if len(low_lags) else len(values) // 4
 
 
 def _refine_offset(
     sparse: Trajectory, dense: Trajectory, lag_s: float, window_s: float
 ) -> _OffsetFit | None:
     """Minimise the ATE over offsets around a candidate; None if too few poses overlap."""
-    time, limit = sparse.time_s, max(gap_limit(dense.time_s), 0.5 * gap_limit(sparse.time_s))
-    # the same poses at every offset, so that the objective is continuous
-    window_offsets = (lag_s + edge for edge in (-window_s, 0.0, window_s))
-    known = np.all(
-        [is_bracketed(time + offset, dense.time_s, limit) for offset in window_offsets], axis=0
+    time, gap_limit_s = sparse.time_s, max(gap_limit(dense.time_s), 0.5 * gap_limit(sparse.time_s))
+    # the same poses are used at every offset, so that the objective is continuous
+    window_offsets = (lag_s + shift for shift in (-window_s, 0.0, window_s))
+    is_known = np.all(
+        [is_bracketed(time + offset, dense.time_s, gap_limit_s) for offset in window_offsets],
+        axis=0,
     )
-    chosen = np.flatnonzero(known)
-    span = float(time[-1] - time[0])
-    shorter = min(1.0, float(dense.time_s[-1] - dense.time_s[0]) / span)
-    if len(chosen) < max(2 * MIN_POSES, MIN_POSES_SHARE * shorter * len(time)):
+    pose_indices = np.flatnonzero(is_known)
+    span_s = float(time[-1] - time[0])
+    time_fraction = min(1.0, float(dense.time_s[-1] - dense.time_s[0]) / span_s)
+    if len(pose_indices) < max(2 * MIN_POSES, MIN_POSES_FRACTION * time_fraction * len(time)):
         return None
-    chosen = chosen[:: -(-len(chosen) // MAX_POSES)]
-    time, position = time[chosen], sparse.position_m[chosen]
+    pose_indices = pose_indices[:: -(-len(pose_indices) // MAX_FITTED_POSES)]
+    time, position = time[pose_indices], sparse.position_m[pose_indices]
 
-    def at(shift_s: float) -> _OffsetFit:
+    def fit_at(shift_s: float) -> _OffsetFit:
         target = positions_at(dense, time + (lag_s + shift_s))
-        # transform the sparse trajectory: the scale of a transformed target could become zero
+        # the sparse trajectory is transformed: a transformed target could get the scale zero
         transform = umeyama(position, target, with_scale=True)
         return _OffsetFit(lag_s + shift_s, transform, time, transform.apply(position), target)
 
     def cost(shift_s: float) -> float:
-        fit = at(shift_s)
+        fit = fit_at(shift_s)
         return float(((fit.target_m - fit.aligned_m) ** 2).sum())
 
-    # minimise over the shift: relative to an offset of 50 years the tolerance would be seconds
-    grid = window_s * np.linspace(-1.0, 1.0, 21)
-    best = int(np.argmin([cost(shift) for shift in grid]))
-    bracket = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
-    return at(float(minimize_scalar(cost, bounds=bracket, method="bounded").x))
+    # the shift is optimised, because the tolerance relative to an offset of 50 years is seconds
+    shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
+    best_index = int(np.argmin([cost(shift) for shift in shifts_s]))
+    bracket = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
+    return fit_at(float(minimize_scalar(cost, bounds=bracket, method="bounded").x))

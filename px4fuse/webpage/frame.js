@@ -1,7 +1,7 @@
 "use strict";
 (() => {
-  const at = (id) => document.getElementById(id);
-  const { columns, rows, size, nouns } = JSON.parse(at("content").textContent);
+  const byId = (id) => document.getElementById(id);
+  const { columns, rows, size, nouns } = JSON.parse(byId("content").textContent);
   const collator = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
   const fold = (text) => text.normalize("NFD").replace(/\p{M}/gu, "").toLowerCase();
   const frame = document.querySelector(".frame");
@@ -15,18 +15,18 @@
     if (kind) node.className = kind;
     return node;
   };
-  const isolated = (tag, text, kind = "") => {
+  const makeIsolated = (tag, text, kind = "") => {
     const node = make(tag, text, kind);
     node.dir = "auto";
     return node;
   };
-  const pressable = (kind, ...content) => {
+  const makeButton = (kind, ...content) => {
     const button = make("button", "", kind);
     button.type = "button";
     button.append(...content);
     return button;
   };
-  const drawn = (tag, attributes) => {
+  const makeSvg = (tag, attributes) => {
     const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
     for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
     return node;
@@ -39,21 +39,21 @@
       (value === "" ? null : value === true ? text : value)),
   }));
   let order = entries;
-  let fitting = entries;
-  let first = 0;
+  let matches = entries;
+  let firstShown = 0;
   let current = null;
 
-  // ------------------------------------------------------------ parts of an unfolded row
+  // ------------------------------------------------------------ sections of an unfolded row
 
   const list = (texts, warn) => {
     const made = make("ul", "", warn ? "warn" : "");
-    made.append(...texts.map((text) => isolated("li", text)));
+    made.append(...texts.map((text) => makeIsolated("li", text)));
     return made;
   };
-  const prose = (text) => isolated("p", text, "notes");
+  const prose = (text) => makeIsolated("p", text, "notes");
   const pairs = (lines) => {
     const made = make("dl");
-    for (const [title, value] of lines) made.append(make("dt", title), isolated("dd", value));
+    for (const [title, value] of lines) made.append(make("dt", title), makeIsolated("dd", value));
     return made;
   };
   const table = (heads, lines, numeric) => {
@@ -67,7 +67,7 @@
     const rest = made.createTBody();
     for (const texts of lines) {
       rest.insertRow().append(...texts.map((text, column) =>
-        isolated("td", text, numeric.includes(column) ? "n" : "")));
+        makeIsolated("td", text, numeric.includes(column) ? "n" : "")));
     }
     const box = make("div", "", "scroll");
     box.append(made);
@@ -84,9 +84,9 @@
     }
     return made;
   };
-  // input of the boxes by owner and name; it is exported only by the download
-  const typed = new Map();
-  let unsaved = false;
+  // points and comments typed into boxes, by owner and name; only the download stores them
+  const enteredRows = new Map();
+  let hasUnsavedInput = false;
   const boxes = (owner, lines, kept) => {
     const made = make("div", "", "boxes");
     for (const [name, maximum, points, comment] of lines) {
@@ -96,13 +96,13 @@
       Object.assign(text, { rows: 2, value: comment, dir: "auto" });
       for (const [title, field] of [["Points of " + maximum + " for " + name, number],
         ["Comment", text]]) {
-        const label = isolated("label", title);
+        const label = makeIsolated("label", title);
         label.append(field);
         made.append(label);
         field.addEventListener("input", () => {
-          typed.set(owner + "\u0000" + name, [owner, name, number.value, text.value]);
-          at("save").hidden = false;
-          unsaved = true;
+          enteredRows.set(owner + "\u0000" + name, [owner, name, number.value, text.value]);
+          byId("save").hidden = false;
+          hasUnsavedInput = true;
         });
       }
     }
@@ -123,7 +123,7 @@
         }
       }
     }
-    for (const [key, line] of typed) lines.set(key, line);
+    for (const [key, line] of enteredRows) lines.set(key, line);
     const quoted = (cell) => {
       const text = String(cell);
       // prevent formulas in spreadsheets
@@ -153,24 +153,24 @@
   // ------------------------------------------------------------ the table
 
   const bar = (share) => {
-    const made = drawn("svg", { width: 72, height: 10, "aria-hidden": "true", class: "bar" });
-    made.append(drawn("rect", { x: 2, y: 3, width: 68, height: 4, class: "all" }),
-      drawn("rect", { x: 2, y: 3, width: 68 * share, height: 4 }));
+    const made = makeSvg("svg", { width: 72, height: 10, "aria-hidden": "true", class: "bar" });
+    made.append(makeSvg("rect", { x: 2, y: 3, width: 68, height: 4, class: "all" }),
+      makeSvg("rect", { x: 2, y: 3, width: 68 * share, height: 4 }));
     return made;
   };
 
-  const classes = (kind, narrow, group) =>
-    [{ number: "n", line: "line" }[kind], narrow, group && "g-" + group].filter(Boolean);
-  const cell = ([text = "", , below = "", look = "", share = ""], column) => {
-    const [, kind, group, narrow] = columns[column];
+  const classes = (kind, visibleFrom, group) =>
+    [{ number: "n", line: "line" }[kind], visibleFrom, group && "g-" + group].filter(Boolean);
+  const cell = ([text = "", , below = "", style = "", share = ""], column) => {
+    const [, kind, group, visibleFrom] = columns[column];
     const made = make(column ? "td" : "th", "",
-      [...classes(kind, narrow, group), look === "flags" ? look : ""].join(" "));
-    if (look === "flags") {
+      [...classes(kind, visibleFrom, group), style === "flags" ? style : ""].join(" "));
+    if (style === "flags") {
       made.append(list(text ? text.split("\n") : [], false));
-    } else if (look) made.append(make("span", text, "chip " + look));
-    else if (text) made.append(isolated("span", text));
+    } else if (style) made.append(make("span", text, "chip " + style));
+    else if (text) made.append(makeIsolated("span", text));
     if (share !== "") made.append(bar(share));
-    if (below) made.append(isolated("span", below, "file"));
+    if (below) made.append(makeIsolated("span", below, "file"));
     return made;
   };
 
@@ -180,9 +180,9 @@
     if (open && !entry.more) {
       entry.more = make("tr", "", "more");
       entry.more.id = "more-" + entry.index;
-      const whole = entry.more.insertCell();
-      whole.colSpan = columns.length;
-      whole.append(detail(entry));
+      const detailCell = entry.more.insertCell();
+      detailCell.colSpan = columns.length;
+      detailCell.append(detail(entry));
       entry.button.setAttribute("aria-controls", entry.more.id);
     }
     if (open) entry.row.after(entry.more);
@@ -191,7 +191,7 @@
     entry.button.setAttribute("aria-expanded", String(open));
   };
 
-  const line = (entry) => {
+  const makeRow = (entry) => {
     const row = make("tr");
     row.dataset.row = entry.index;
     row.append(...entry.cells.map(cell));
@@ -199,7 +199,7 @@
     head.scope = "row";
     const name = head.firstChild;
     name.className = "name";
-    entry.button = pressable("unfold", name);
+    entry.button = makeButton("unfold", name);
     entry.button.addEventListener("click", () => {
       current = entry;
       unfold(entry, !entry.open);
@@ -210,37 +210,37 @@
     return row;
   };
 
-  const whole = make("table", "", "list");
-  const top = whole.createTHead().insertRow();
-  const body = whole.createTBody();
-  const heads = columns.map(([title, kind, group, narrow], column) => {
-    const head = make("th", "", classes(kind, narrow, group).join(" "));
+  const listTable = make("table", "", "list");
+  const headRow = listTable.createTHead().insertRow();
+  const body = listTable.createTBody();
+  const heads = columns.map(([title, kind, group, visibleFrom], column) => {
+    const head = make("th", "", classes(kind, visibleFrom, group).join(" "));
     head.scope = "col";
     head.setAttribute("aria-sort", "none");
-    const button = pressable("", title);
+    const button = makeButton("", title);
     button.addEventListener("click", () => sort(column));
     head.append(button);
     return head;
   });
-  top.append(...heads);
+  headRow.append(...heads);
 
   const draw = (count = size) => {
     for (const entry of entries) entry.row = null;
-    const shown = fitting.slice(first, first + count);
-    body.replaceChildren(...shown.map(line));
+    const shown = matches.slice(firstShown, firstShown + count);
+    body.replaceChildren(...shown.map(makeRow));
     for (const entry of shown) unfold(entry, entry.open);
-    const last = Math.ceil(fitting.length / size);
+    const last = Math.ceil(matches.length / size);
     document.querySelector(".pager").hidden = last < 2;
-    at("place").textContent = nouns[1][0].toUpperCase() + nouns[1].slice(1) + " " + (first + 1)
-      + " to " + (first + shown.length) + " of " + fitting.length;
-    at("back").disabled = first === 0;
-    at("on").disabled = first + size >= fitting.length;
+    byId("place").textContent = nouns[1][0].toUpperCase() + nouns[1].slice(1) + " " + (firstShown + 1)
+      + " to " + (firstShown + shown.length) + " of " + matches.length;
+    byId("back").disabled = firstShown === 0;
+    byId("on").disabled = firstShown + size >= matches.length;
     fit();
   };
 
   const fit = () => {
     frame.classList.remove("wide");
-    const wide = whole.scrollWidth > frame.clientWidth;
+    const wide = listTable.scrollWidth > frame.clientWidth;
     frame.classList.toggle("wide", wide);
     // a scrolling region must be reachable with the keyboard
     frame.tabIndex = wide ? 0 : -1;
@@ -264,43 +264,43 @@
   };
 
   const filter = () => {
-    const searched = fold(at("text").value).split(/\s+/).filter(Boolean);
+    const searched = fold(byId("text").value).split(/\s+/).filter(Boolean);
     const tags = selects.map((select) => select.value).filter(Boolean);
-    fitting = order.filter((entry) => tags.every((tag) => entry.tags.has(tag))
+    matches = order.filter((entry) => tags.every((tag) => entry.tags.has(tag))
       && searched.every((word) => entry.searchText.includes(word)));
-    first = 0;
+    firstShown = 0;
     document.querySelector(".count").textContent =
-      "Showing " + fitting.length + " of " + entries.length;
-    document.querySelector(".none").hidden = fitting.length > 0;
-    at("all").hidden = fitting.length === entries.length;
+      "Showing " + matches.length + " of " + entries.length;
+    document.querySelector(".none").hidden = matches.length > 0;
+    byId("all").hidden = matches.length === entries.length;
     draw();
   };
 
   const clear = () => {
-    at("text").value = "";
+    byId("text").value = "";
     for (const select of selects) select.value = "";
     filter();
   };
 
   const groups = () => {
-    for (const box of shownGroups) whole.classList.toggle("with-" + box.dataset.group, box.checked);
+    for (const box of shownGroups) listTable.classList.toggle("with-" + box.dataset.group, box.checked);
     fit();
   };
 
-  const turn = (to) => {
-    first = to;
+  const goTo = (to) => {
+    firstShown = to;
     draw();
     frame.scrollIntoView({ block: "start" });
   };
 
   const show = (entry) => {
-    const place = fitting.indexOf(entry);
+    const place = matches.indexOf(entry);
     if (current && current !== entry) unfold(current, false);
     current = entry;
     entry.open = true;
     const start = place - place % size;
-    if (start !== first) {
-      first = start;
+    if (start !== firstShown) {
+      firstShown = start;
       draw();
     } else unfold(entry, true);
     entry.button.focus({ preventScroll: true });
@@ -308,14 +308,14 @@
   };
 
   const step = (by) => {
-    const place = fitting.indexOf(current);
-    const next = fitting[place < 0 ? (by > 0 ? first : first - 1) : place + by];
+    const place = matches.indexOf(current);
+    const next = matches[place < 0 ? (by > 0 ? firstShown : firstShown - 1) : place + by];
     if (next) show(next);
   };
 
   const KEYS = {
     j: () => step(1), n: () => step(1), k: () => step(-1), p: () => step(-1),
-    "/": () => at("text").focus(),
+    "/": () => byId("text").focus(),
     Escape: () => {
       if (current) unfold(current, false);
       if (current && current.row) current.button.focus();
@@ -329,19 +329,19 @@
     KEYS[event.key]();
   });
   document.querySelector(".controls").addEventListener("submit", (event) => event.preventDefault());
-  window.addEventListener("beforeunload", (event) => unsaved && event.preventDefault());
-  at("text").addEventListener("input", filter);
-  at("all").addEventListener("click", clear);
-  at("save").addEventListener("click", () => {
+  window.addEventListener("beforeunload", (event) => hasUnsavedInput && event.preventDefault());
+  byId("text").addEventListener("input", filter);
+  byId("all").addEventListener("click", clear);
+  byId("save").addEventListener("click", () => {
     const link = make("a");
     link.href = URL.createObjectURL(new Blob([tableOfBoxes()], { type: "text/csv" }));
     link.download = "overrides.csv";
     link.click();
-    unsaved = false;
+    hasUnsavedInput = false;
     URL.revokeObjectURL(link.href);
   });
-  at("back").addEventListener("click", () => turn(Math.max(first - size, 0)));
-  at("on").addEventListener("click", () => turn(first + size));
+  byId("back").addEventListener("click", () => goTo(Math.max(firstShown - size, 0)));
+  byId("on").addEventListener("click", () => goTo(firstShown + size));
   for (const select of selects) select.addEventListener("change", filter);
   for (const box of shownGroups) {
     box.checked = false;
@@ -349,14 +349,14 @@
   }
   window.addEventListener("resize", fit);
   window.addEventListener("beforeprint", () => {
-    first = 0;
-    draw(fitting.length);
+    firstShown = 0;
+    draw(matches.length);
   });
   window.addEventListener("afterprint", () => draw());
   document.documentElement.classList.add("live");
   document.querySelector(".controls").hidden = false;
   document.querySelector(".keys").hidden = false;
-  frame.prepend(whole);
+  frame.prepend(listTable);
   filter();
   groups();
 })();

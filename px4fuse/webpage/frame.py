@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from px4fuse.webpage.safe import clean_values, inert_json, part, policy_hash, template
+from px4fuse.webpage.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 
-MAX_PAGE_ROWS = 100  # rows drawn at a time
-MAX_PLAIN_ROWS = 300  # rows shown without scripts
+MAX_PAGE_ROWS = 100  # rows on one page of the table
+MAX_PLAIN_ROWS = 300  # rows shown if scripts are disabled
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Column:
     kind : {"text", "line", "number", "rank"}
         Sort order; "line" is text without line breaks, "rank" is text sorted by a number.
     group : str
-        Group whose check box shows the column; "" for always.
+        Group whose check box shows the column; "": the column is always shown.
     visible_from : {"always", "tablet", "desk"}
-        Smallest screen on which it is visible.
+        Smallest screen on which the column is visible.
     """
 
     title: str
@@ -70,7 +70,7 @@ def number_cell(value: float | None, text: str | None = None, below: str = "") -
     return Cell(f"{value:.4g}" if text is None else text, value, below)
 
 
-Part = list[Any]
+Section = list[Any]
 
 
 @dataclass(frozen=True)
@@ -83,57 +83,57 @@ class Row:
         One per column; the first one names the row and unfolds it.
     tags : tuple of str
         Values that the filters select.
-    details, side_parts : tuple of Part
+    details, side_sections : tuple of Section
         Left and right column of the unfolded row, made by :func:`list_part` and the other
-        functions below; empty parts are omitted.
+        functions below; empty sections are omitted.
     """
 
     cells: tuple[Cell, ...]
     tags: tuple[str, ...] = ()
-    details: tuple[Part, ...] = ()
-    side_parts: tuple[Part, ...] = ()
+    details: tuple[Section, ...] = ()
+    side_sections: tuple[Section, ...] = ()
 
 
-# ------------------------------------------------------------------ parts of an unfolded row
+# ------------------------------------------------------------------ sections of an unfolded row
 
 
-def list_part(title: str, texts: Sequence[str], warn: bool = False) -> Part:
-    """Return a part with a list of texts, marked as a warning if `warn`."""
-    return ["list", title, texts, warn]
+def list_section(title: str, texts: Sequence[str], is_warning: bool = False) -> Section:
+    """Return a section with a list of texts, marked as a warning if `is_warning`."""
+    return ["list", title, texts, is_warning]
 
 
-def prose_part(title: str, text: str) -> Part:
-    """Return a part with text that keeps its line breaks."""
+def prose_section(title: str, text: str) -> Section:
+    """Return a section with text that keeps its line breaks."""
     return ["prose", title, text]
 
 
-def pairs_part(title: str, rows: Sequence[tuple[str, str]]) -> Part:
-    """Return a part with names and values; rows without a value are omitted."""
+def pairs_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
+    """Return a section with names and values; rows without a value are omitted."""
     return ["pairs", title, [row for row in rows if row[1]]]
 
 
-def table_part(
+def table_section(
     title: str,
     heads: Sequence[str],
     rows: Sequence[Sequence[str]],
-    numeric: Sequence[int] = (),
-) -> Part:
-    """Return a part with a small table; ``numeric`` are the right-aligned columns."""
-    return ["table", title, heads, rows, list(numeric)]
+    numeric_columns: Sequence[int] = (),
+) -> Section:
+    """Return a section with a small table; ``numeric_columns`` are right-aligned."""
+    return ["table", title, heads, rows, list(numeric_columns)]
 
 
-def links_part(title: str, rows: Sequence[tuple[str, str]]) -> Part:
-    """Return a part with link texts and addresses of :func:`px4fuse.webpage.safe.local_link`."""
+def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
+    """Return a section with link texts and addresses of :func:`px4fuse.webpage.safe.local_link`."""
     return ["links", title, [row for row in rows if row[1]]]
 
 
-def boxes_part(
+def boxes_section(
     title: str,
     owner: str,
     rows: Sequence[tuple[str, float, float | None, str]],
     other_rows: Sequence[tuple[str, float | None, str]] = (),
-) -> Part:
-    """Return a part with input boxes for points and comments, which the page exports as CSV.
+) -> Section:
+    """Return a section with input boxes for points and comments, which the page exports as CSV.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def page(
     *,
     title: str,
     subtitle: str,
-    above: str = "",
+    html_above: str = "",
     noun: tuple[str, str],
     columns: Sequence[Column],
     rows: Sequence[Row],
@@ -166,8 +166,8 @@ def page(
 
     Parameters
     ----------
-    above : str
-        HTML above the table, made with a :func:`~px4fuse.webpage.safe.template`.
+    html_above : str
+        HTML above the table, made with :func:`~px4fuse.webpage.safe.load_template`.
     noun : (str, str)
         Name of a row, singular and plural.
     filters : sequence of (label, ((tag, text), ...))
@@ -184,29 +184,32 @@ def page(
     str
         HTML, identical for the same input; write it as UTF-8.
     """
-    style = part("base.css") + part("frame.css")
-    script = part("frame.js")
+    style = read_asset("base.css") + read_asset("frame.css")
+    script = read_asset("frame.js")
     content = {
         "columns": [(c.title, c.kind, c.group, c.visible_from) for c in columns],
         "rows": [
             (
                 [_compact(cell) for cell in row.cells],
                 row.tags,
-                *([part for part in side if part[2]] for side in (row.details, row.side_parts)),
+                *(
+                    [section for section in column if section[2]]
+                    for column in (row.details, row.side_sections)
+                ),
             )
             for row in rows
         ],
         "size": MAX_PAGE_ROWS,
         "nouns": noun,
     }
-    return template("webpage/frame.html").render(
+    return load_template("webpage/frame.html").render(
         style_hash=policy_hash(style),
         script_hash=policy_hash(script),
         style=style,
         script=script,
         title=title,
         subtitle=subtitle,
-        above=above,
+        above=html_above,
         placeholder=placeholder,
         filters=filters,
         groups=groups,
@@ -220,7 +223,7 @@ def page(
 
 
 def _compact(cell: Cell) -> list[Any]:
-    """Return the fields of a cell without empty ones at the end; True means value == text."""
+    """Return the fields of a cell without empty ones at the end; True: the value is the text."""
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     bar = "" if cell.bar is None else round(cell.bar, 3)
     fields = [cell.text, value, cell.below, cell.style_class, bar]

@@ -45,7 +45,7 @@ def clean_values(value: Any, max_length: int = MAX_CHARACTERS) -> Any:
 
 
 def inert_json(value: object) -> str:
-    """Encode as JSON without <, > and & and with ASCII only, so HTML parsers find no markup."""
+    """Encode as JSON in ASCII without <, > and &, so that HTML parsers find no markup."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 
@@ -56,7 +56,7 @@ def policy_hash(text: str) -> str:
 
 
 def local_link(path: str) -> str:
-    r"""Return a relative path as a URL, "" for an absolute one, so data cannot add other links.
+    r"""Return a relative path as a URL, "" for an absolute path, so that data cannot add web links.
 
     >>> local_link("results/a b.json"), local_link("javascript:alert(1)")
     ('results/a%20b.json', 'javascript%3Aalert%281%29')
@@ -69,7 +69,7 @@ def local_link(path: str) -> str:
 
 
 @cache
-def template(name: str) -> Template:
+def load_template(name: str) -> Template:
     """Load a template of the package; it cleans and escapes all inserted text."""
     environment = Environment(
         loader=PackageLoader("px4fuse", ""),
@@ -81,6 +81,6 @@ def template(name: str) -> Template:
     return environment.get_template(name)
 
 
-def part(name: str, package: str = "px4fuse.webpage") -> str:
+def read_asset(name: str, package: str = "px4fuse.webpage") -> str:
     """Read a text file of a package, by default of the files shared by all pages."""
     return files(package).joinpath(name).read_text(encoding="utf-8")

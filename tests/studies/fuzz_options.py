@@ -29,9 +29,9 @@ import one_thread  # noqa: E402, F401 - before NumPy
 
 # isort: split
 import click  # noqa: E402
-from class_tools import in_turn  # noqa: E402
+from class_tools import run_in_turn  # noqa: E402
 from click.testing import CliRunner  # noqa: E402
-from conftest import REPOSITORY, SAMPLES, page_of  # noqa: E402
+from conftest import REPOSITORY, SAMPLES, blank_page  # noqa: E402
 from fuzz_fields import (  # noqa: E402
     DRAWN_SHARE,
     bases,
@@ -238,9 +238,9 @@ def run_once(name: str, rng: random.Random, out: Path) -> tuple[str, str]:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("error")
         for module in (grading, workers):
-            stack.enter_context(mock.patch.object(module, "run_bounded", in_turn))
+            stack.enter_context(mock.patch.object(module, "run_bounded", run_in_turn))
         if rng.random() > DRAWN_SHARE:
-            stack.enter_context(mock.patch.object(pdf, "render", page_of))
+            stack.enter_context(mock.patch.object(pdf, "render", blank_page))
         done = CliRunner().invoke(cli, words)
     failure = done.exception
     if isinstance(failure, Px4FuseError):

@@ -1,4 +1,4 @@
-"""Analysis of a pose graph: tests of its closures, and optimisation with and without robustness."""
+"""Analysis of a pose graph: tests of its closures, least squares and robust optimisation."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -8,12 +8,12 @@ import numpy as np
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.record import Count, Record
-from px4fuse.trajectory.graph.covariance import GateResult, gate
+from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Robust, Solution, solve
 
-MAX_ROBUST_CLOSURES = 1000  # closures; more take minutes
-# names of the solutions
+MAX_ROBUST_CLOSURES = 1000  # robust optimisation with more closures takes minutes
+# labels of the solutions
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
     "gated": "pose graph, gated",
@@ -21,7 +21,7 @@ SOLUTIONS: Mapping[str, str] = {
     "gnc": "pose graph, GNC",
 }
 # robust methods by solution
-ROBUST: Mapping[str, Robust] = {"dcs": "dcs", "gnc": "gnc"}
+ROBUST_METHODS: Mapping[str, Robust] = {"dcs": "dcs", "gnc": "gnc"}
 
 
 class Graph(Record, frozen=True, kw_only=True):
@@ -66,17 +66,17 @@ def analyse_graph(
     graph: PoseGraph,
     progress: Callable[[str], None] = lambda _: None,
     *,
-    robust: bool | None = None,
+    run_robust: bool | None = None,
 ) -> SolvedGraph:
-    """Test the closures of a graph and optimise it, without and with robustness.
+    """Test the closures of a graph and optimise the graph by least squares and robustly.
 
-    Edges between successive vertices are odometry, all others closures.
+    Edges between successive vertices are odometry, all other edges are closures.
 
     Parameters
     ----------
     name : str
         Name of the graph.
-    robust : bool, optional
+    run_robust : bool, optional
         Also run robust optimisation; by default with up to 1000 closures.
 
     Raises
@@ -84,21 +84,21 @@ def analyse_graph(
     TrajectoryError
         The graph is not connected.
     """
-    closures = ~graph.successive
+    is_closure = ~graph.is_successive
     progress(f"optimising: {SOLUTIONS['all']}")
     solutions = {"all": solve(graph)}
     gates: tuple[GateResult, ...] | Unavailable
     try:
-        gates = tuple(gate(graph, np.flatnonzero(closures)))
+        gates = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
     except TrajectoryError as error:
         gates = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
         )
-    count = int(np.count_nonzero(closures))
-    if count > 1 and (count <= MAX_ROBUST_CLOSURES if robust is None else robust):
-        for key, method in ROBUST.items():
-            progress(f"optimising: {SOLUTIONS[key]}")
-            solutions[key] = solve(graph, robust=method, loops=closures)
+    count = int(np.count_nonzero(is_closure))
+    if count > 1 and (count <= MAX_ROBUST_CLOSURES if run_robust is None else run_robust):
+        for solution, method in ROBUST_METHODS.items():
+            progress(f"optimising: {SOLUTIONS[solution]}")
+            solutions[solution] = solve(graph, robust=method, is_closure=is_closure)
     return SolvedGraph(
         name=name,
         dimension=graph.dimension,

@@ -12,8 +12,8 @@ from px4fuse.trajectory.graph import lie, model
 
 # probability that the gate rejects a true closure
 GATE_ALPHA = 0.001
-# smallest eigenvalue of a correlation matrix that exceeds rounding errors
-_SINGULAR = 1e-13
+# smaller eigenvalues of a correlation matrix are rounding errors
+_MIN_EIGENVALUE = 1e-13
 
 
 class GateResult(Record, frozen=True):
@@ -22,7 +22,7 @@ class GateResult(Record, frozen=True):
     Attributes
     ----------
     first, second : int
-        Ends of the closure, as vertex numbers of the file.
+        Vertex numbers (as in the file) that the closure connects.
     d2 : float
         Squared Mahalanobis distance between the closure and the relative pose by odometry.
     degrees_of_freedom : int
@@ -41,14 +41,14 @@ class GateResult(Record, frozen=True):
     accepted: bool
 
 
-def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
+def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
     """Test closures against odometry alone, before the optimisation uses them.
 
     ``d2 = r' (J Sigma J' + Omega^-1)^-1 r``, with r the log of the inverse closure times the
-    relative pose by odometry, J the inverse right Jacobian at r, and Sigma the covariance of the
-    relative pose: the error of each step is transformed to the end by the adjoint (Barfoot 2017,
-    8.96 and the first order of 8.108, with right perturbations). Only directions that the
-    information of the closure observes are used.
+    relative pose by odometry, J the inverse right Jacobian at r, Omega the information of the
+    closure, and Sigma the covariance of the relative pose. For Sigma the error of each step is
+    transformed to the second vertex by the adjoint (Barfoot 2017, 8.96 and the first order of
+    8.108, with right perturbations). Only directions in which the closure has information are used.
 
     Parameters
     ----------
@@ -65,21 +65,21 @@ def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list
     Raises
     ------
     TrajectoryError
-        Odometry does not connect the ends of a closure or has a direction without information, or a
-        closure has no information.
+        Odometry does not connect the vertices of a closure or has a direction without information,
+        or a closure has no information.
     """
-    tested = np.asarray(edge_indices, dtype=np.intp)
-    if not len(tested):
+    tested_edges = np.asarray(edge_indices, dtype=np.intp)
+    if not len(tested_edges):
         return []
-    chain = model.odometry_chain(graph, tested)
-    a, b = graph.first[tested], graph.second[tested]
-    low, high = int(min(a.min(), b.min())), int(max(a.max(), b.max()))
-    chain_edges = chain[low:high]
-    gap = np.flatnonzero(chain_edges < 0)
-    if len(gap):
-        at = low + int(gap[0])
+    chain = model.odometry_chain(graph, tested_edges)
+    first, second = graph.first[tested_edges], graph.second[tested_edges]
+    first_pose, last_pose = int(min(first.min(), second.min())), int(max(first.max(), second.max()))
+    chain_edges = chain[first_pose:last_pose]
+    missing_steps = np.flatnonzero(chain_edges < 0)
+    if len(missing_steps):
+        vertex = first_pose + int(missing_steps[0])
         raise TrajectoryError(
-            f"No odometry edge connects vertices {graph.ids[at]} and {graph.ids[at + 1]}, "
+            f"No odometry edge connects vertices {graph.ids[vertex]} and {graph.ids[vertex + 1]}, "
             "so the closure cannot be tested against odometry.",
             "Add the edge, or test shorter closures.",
         )
@@ -92,40 +92,41 @@ def gate(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )
     chain_covariance = (
-        cumulative_covariance[np.maximum(a, b) - low]
-        - cumulative_covariance[np.minimum(a, b) - low]
+        cumulative_covariance[np.maximum(first, second) - first_pose]
+        - cumulative_covariance[np.minimum(first, second) - first_pose]
     )
-    to_end = lie.adjoint(lie.inverse(poses[b - low]))
+    to_end = lie.adjoint(lie.inverse(poses[second - first_pose]))
     covariance = to_end @ chain_covariance @ to_end.transpose(0, 2, 1)
-    relative = lie.between(poses[a - low], poses[b - low])
-    residual = lie.log(lie.between(graph.measurements[tested], relative))
+    relative = lie.between(poses[first - first_pose], poses[second - first_pose])
+    residual = lie.log(lie.between(graph.measurements[tested_edges], relative))
     jacobian = lie.right_jacobian_inverse(residual)
     covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
-    edge_residuals = zip(tested.tolist(), residual, covariance, strict=True)
+    edge_residuals = zip(tested_edges.tolist(), residual, covariance, strict=True)
     return [_test_edge(graph, edge, r, sigma) for edge, r, sigma in edge_residuals]
 
 
 def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: Array) -> GateResult:
-    ends = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
+    vertices = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
     directions, variance = model.information_eigenvectors(graph.information[edge])
-    freedom = len(variance)
+    degrees_of_freedom = len(variance)
     observed_residual = directions.T @ residual
-    spread = directions.T @ covariance @ directions + np.diag(variance)
-    is_testable = freedom and np.isfinite(spread).all()
+    residual_covariance = directions.T @ covariance @ directions + np.diag(variance)
+    is_testable = degrees_of_freedom and np.isfinite(residual_covariance).all()
     if (
         not is_testable
-        or np.linalg.eigvalsh(model.scale_to_unit_diagonal(spread)[1])[0] <= _SINGULAR
+        or np.linalg.eigvalsh(model.scale_to_unit_diagonal(residual_covariance)[1])[0]
+        <= _MIN_EIGENVALUE
     ):
         raise TrajectoryError(
-            f"The closure from vertex {ends[0]} to {ends[1]} cannot be tested: it has no "
+            f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: it has no "
             "information, or the ratio of odometry and closure covariance exceeds the "
             "numerical precision.",
             "Give the closure's inverse covariance, and odometry information of a "
             "similar magnitude.",
         )
-    d2 = float(observed_residual @ np.linalg.solve(spread, observed_residual))
-    p = float(chdtrc(freedom, d2))
-    return GateResult(*ends, d2, freedom, p, p >= GATE_ALPHA)
+    d2 = float(observed_residual @ np.linalg.solve(residual_covariance, observed_residual))
+    p = float(chdtrc(degrees_of_freedom, d2))
+    return GateResult(*vertices, d2, degrees_of_freedom, p, p >= GATE_ALPHA)
 
 
 def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:

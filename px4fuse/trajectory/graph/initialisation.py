@@ -1,4 +1,4 @@
-"""Initial poses of a pose graph without poses."""
+"""Initial poses of a pose graph from its edges."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from px4fuse.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.system import normal_equations, solve_with
+from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equations
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:
-    """Compute initial poses from the edges; the first pose stays.
+    """Compute initial poses from the edges; the first pose is kept.
 
-    Chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D SLAM, section
-    IV-C): rotations by linear least squares without the rotation constraint, projected to
-    rotations, then translations by linear least squares. If odometry connects all poses, its
-    composed edges are used instead if their cost is lower.
+    The method is chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D
+    SLAM, section IV-C): rotations by linear least squares without the rotation constraint,
+    projected to rotations, then translations by linear least squares. If odometry connects all
+    poses and its composed edges have a lower cost, these are used instead.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     composed_graph = model.compose_odometry(graph)
     try:
         return min(composed_graph, _chordal(graph), key=model.cost)
-    except TrajectoryError:  # only odometry determines the rotations
+    except TrajectoryError:  # the edges determine the rotations only if composed
         return composed_graph
 
 
@@ -70,10 +70,10 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     )
     rotation = _nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
     # residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
-    from_i = rotation[graph.first]
-    axes = from_i @ measured_rotation
+    first_rotation = rotation[graph.first]
+    axes = first_rotation @ measured_rotation
     information = axes @ graph.information[:, :d, :d] @ axes.transpose(0, 2, 1)
-    translation = from_i @ graph.measurements[:, :d, None]
+    translation = first_rotation @ graph.measurements[:, :d, None]
     position = _solve_positions(
         graph, -eye, eye, information, translation, graph.poses[0, :d, None]
     )[..., 0]
@@ -88,15 +88,17 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
 
 def _solve_positions(
     graph: PoseGraph,
-    of_first: Array,
-    of_second: Array,
+    first_coefficient: Array,
+    second_coefficient: Array,
     information: Array,
     value: Array,
     first_pose: Array,
 ) -> Array:
     """Solve the least squares of :func:`normal_equations`, shape (n, d, k)."""
-    solution = solve_with(
-        *normal_equations(graph, of_first, of_second, information, value, first_pose)
+    solution = solve_normal_equations(
+        *normal_equations(
+            graph, first_coefficient, second_coefficient, information, value, first_pose
+        )
     )
     if solution is None:
         raise TrajectoryError("The edges do not determine the initial poses.", "Give VERTEX lines.")

@@ -1,4 +1,4 @@
-"""Poses and tangents in SE(2) and SE(3), over arrays.
+"""Poses and tangents in SE(2) and SE(3), as arrays.
 
 A pose is x, y, heading (last axis 3) or x, y, z, qx, qy, qz, qw (last axis 7), in m and rad. A
 tangent has translation (rho) first, then rotation (phi): 3 or 6 numbers, in the order of g2o's
@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array
 from px4fuse.trajectory.rotation import from_elements, skew
 
-# below this angle series replace quotients that lose precision; five terms are accurate to 1e-14
+# below this angle power series replace quotients that lose precision; five terms are accurate to
+# 1e-14
 SMALL_ANGLE_RAD = 0.3
-_C = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-_C_SLOPE = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
+_COT_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+_COT_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
 
 def wrap(angle: Array) -> Array:
@@ -55,8 +56,10 @@ def compose(a: Array, b: Array) -> Array:
         Quaternions of the result are normalised; headings are not wrapped.
     """
     d = _dimension(a)
-    turn = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
-    return np.concatenate([a[..., :d] + _multiply(rotation_matrix(a), b[..., :d]), turn], axis=-1)
+    rotation = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
+    return np.concatenate(
+        [a[..., :d] + _multiply(rotation_matrix(a), b[..., :d]), rotation], axis=-1
+    )
 
 
 def inverse(pose: Array) -> Array:
@@ -67,10 +70,10 @@ def inverse(pose: Array) -> Array:
 def between(a: Array, b: Array) -> Array:
     """Return the poses b relative to a: the inverse of a, times b."""
     d, inverse_rotation = _dimension(a), np.swapaxes(rotation_matrix(a), -1, -2)
-    turn = (
+    rotation = (
         b[..., 2:] - a[..., 2:] if d == 2 else (_rotation_of(a).inv() * _rotation_of(b)).as_quat()
     )
-    return np.concatenate([_multiply(inverse_rotation, b[..., :d] - a[..., :d]), turn], axis=-1)
+    return np.concatenate([_multiply(inverse_rotation, b[..., :d] - a[..., :d]), rotation], axis=-1)
 
 
 def exp(tangent: Array) -> Array:
@@ -84,8 +87,8 @@ def exp(tangent: Array) -> Array:
     d = _dimension(tangent)
     rho, phi = tangent[..., :d], tangent[..., d:]
     position = np.linalg.solve(_left_jacobian_inverse(phi), rho[..., None])[..., 0]
-    turn = phi if d == 2 else Rotation.from_rotvec(phi).as_quat()
-    return np.concatenate([position, turn], axis=-1)
+    rotation = phi if d == 2 else Rotation.from_rotvec(phi).as_quat()
+    return np.concatenate([position, rotation], axis=-1)
 
 
 def log(pose: Array) -> Array:
@@ -136,8 +139,8 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     commutator = _commutator(tangent)
     commutator_squared = commutator @ commutator
     theta = np.linalg.norm(tangent[..., _dimension(tangent) :], axis=-1)[..., None, None]
-    c, slope = _c(theta), 0.5 * _c_slope(theta)
-    # x / (1 - exp(-x)) with x = ad, reduced by ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    c, slope = _cot_term(theta), 0.5 * _cot_term_slope(theta)
+    # series of x / (1 - exp(-x)) with x = ad, reduced by ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
@@ -197,20 +200,22 @@ def _left_jacobian_inverse(phi: Array) -> Array:
         skew_matrix = skew(phi)
     theta = np.linalg.norm(phi, axis=-1)[..., None, None]
     return (
-        np.eye(skew_matrix.shape[-1]) - 0.5 * skew_matrix + _c(theta) * (skew_matrix @ skew_matrix)
+        np.eye(skew_matrix.shape[-1])
+        - 0.5 * skew_matrix
+        + _cot_term(theta) * (skew_matrix @ skew_matrix)
     )
 
 
-def _c(theta: Array) -> Array:
+def _cot_term(theta: Array) -> Array:
     """Return (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     exact = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
-    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _C), exact)
+    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_SERIES), exact)
 
 
-def _c_slope(theta: Array) -> Array:
+def _cot_term_slope(theta: Array) -> Array:
     """Return the derivative of :func:`_c` by theta, divided by theta."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     g_slope = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     exact = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
-    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _C_SLOPE), exact)
+    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_SLOPE_SERIES), exact)

@@ -13,7 +13,8 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.graph import lie
 
-# eigenvalue of an information matrix, scaled to unit diagonal, above which a direction is observed
+# a direction is observed if its eigenvalue of the information matrix, scaled to unit diagonal, is
+# larger
 MIN_OBSERVED_EIGENVALUE = 1e-9
 FROM_FILE = "the file's vertices"
 FROM_ODOMETRY = "odometry edges composed"
@@ -34,7 +35,8 @@ class PoseGraph:
         x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space; m and rad, in the frame of the
         graph. Quaternions are normalised.
     first, second : ndarray of int, shape (m,)
-        Indices into ``poses``: the pose of ``second`` relative to ``first`` is measured.
+        Indices into ``poses`` of the vertices of each edge. The pose of ``second`` relative to
+        ``first`` is measured.
     measurements : ndarray, shape (m, 3) or (m, 7)
         Relative poses, in the axes of ``first``.
     information : ndarray, shape (m, 3, 3) or (m, 6, 6)
@@ -59,19 +61,19 @@ class PoseGraph:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def select_edges(self, chosen: BoolArray) -> PoseGraph:
-        """Return the graph with the edges of a mask, shape (m,)."""
+    def select_edges(self, is_selected: BoolArray) -> PoseGraph:
+        """Return the graph with the edges that a mask selects, shape (m,)."""
         edges = ("first", "second", "measurements", "information")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in edges})
+        return replace(self, **{name: getattr(self, name)[is_selected] for name in edges})
 
     @property
-    def freedom(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Length of a tangent: 3 in the plane, 6 in space."""
         return 3 if self.dimension == 2 else 6
 
     @property
-    def successive(self) -> BoolArray:
-        """Mask of edges between successive poses, which are odometry by default."""
+    def is_successive(self) -> BoolArray:
+        """Mask of the edges between successive poses, which are odometry by default."""
         return np.asarray(np.abs(self.first - self.second) == 1)
 
 
@@ -136,30 +138,33 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
-    """Return square roots of the diagonals, and the matrices divided by them; zeros stay zero."""
+    """Return the roots of the diagonals, and the matrices scaled to unit diagonal.
+
+    A zero on the diagonal stays zero.
+    """
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
     return scale, matrices * (inverse[..., :, None] * inverse[..., None, :])
 
 
-def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
+def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
     """Raise TrajectoryError if the graph is not connected.
 
     Parameters
     ----------
-    used : ndarray of bool, shape (m,)
+    is_used : ndarray of bool, shape (m,)
         Edges that may connect poses, if they have information.
-    what : str
-        Name of these edges in the message: "the edges".
+    edges_name : str
+        Name of these edges in the message, for example "the edges".
 
     Raises
     ------
     TrajectoryError
-        With the number of parts and a vertex that is not connected.
+        The message contains the number of parts and a vertex that is not connected.
     """
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges.", "Give a file with EDGE lines.")
-    is_informative = used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
+    is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
     ends, n = (graph.first[is_informative], graph.second[is_informative]), len(graph)
     links = sparse.coo_array((np.ones(len(ends[0])), ends), shape=(n, n))
     component_count, component = connected_components(links, directed=False)
@@ -167,29 +172,29 @@ def require_connected(graph: PoseGraph, used: BoolArray, what: str) -> None:
         other_vertex = graph.ids[np.flatnonzero(component != component[0])[0]]
         raise TrajectoryError(
             f"The pose graph has {component_count} disconnected parts: vertex "
-            f"{other_vertex} is not connected to vertex {graph.ids[0]} by {what}.",
+            f"{other_vertex} is not connected to vertex {graph.ids[0]} by {edges_name}.",
             "Add an edge between the parts, or optimise them separately.",
         )
 
 
 def compose_odometry(graph: PoseGraph) -> PoseGraph:
-    """Return the graph with poses composed from its odometry, which must be complete."""
+    """Return the graph with poses composed from odometry, which must connect all poses."""
     steps = odometry_steps(graph, odometry_chain(graph))
     poses = lie.compose(graph.poses[:1], lie.chain(steps))
     return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
 
 
-def odometry_chain(graph: PoseGraph, without: IntArray | None = None) -> IntArray:
-    """Return the edge from each pose to the next, -1 if missing, shape (n - 1,).
+def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
+    """Return the odometry edge from each pose to the next, -1 if missing, shape (n - 1,).
 
     Parameters
     ----------
-    without : ndarray of int, optional
-        Excluded edges. Of several edges between two poses the first is used.
+    excluded_edges : ndarray of int, optional
+        Edges that are not used. Of several edges between two poses the first is used.
     """
-    odometry_edges = np.flatnonzero(graph.successive)
-    if without is not None:
-        odometry_edges = np.setdiff1d(odometry_edges, without)
+    odometry_edges = np.flatnonzero(graph.is_successive)
+    if excluded_edges is not None:
+        odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
     # assign backwards, so that the first of several edges remains
     odometry_edges = odometry_edges[::-1]

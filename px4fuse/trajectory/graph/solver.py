@@ -15,10 +15,10 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph, Residuals
-from px4fuse.trajectory.graph.system import normal_equations, solve_with
+from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equations
 
 Robust = Literal["none", "dcs", "gnc"]
-# function of the squared residuals: weights of the information, and cost of each edge
+# function of the squared residuals of all edges; returns weights of the information, and costs
 Kernel = Callable[[Array], tuple[Array, Array]]
 
 MAX_ITERATIONS = 100
@@ -26,17 +26,17 @@ MAX_ITERATIONS = 100
 _INITIAL_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-5, 10.0, 1e5
 _MIN_FIDELITY = 1e-3
 _TOLERANCE = 1e-10
-_EPSILON = float(np.finfo(float).eps)
-# looser limits for the intermediate stages of graduated non-convexity
+_FLOAT_EPSILON = float(np.finfo(float).eps)
+# wider tolerance and fewer iterations in the intermediate stages of graduated non-convexity
 _STAGE_TOLERANCE, _STAGE_ITERATIONS = 1e-6, 20
 
 DCS_PHI = 1.0  # Agarwal 2013, section IV
 GNC_PROBABILITY = 0.99  # probability that a true closure is not truncated
-DROP_PROBABILITY = 0.999  # as in the gate
+DROP_PROBABILITY = 0.999  # probability that a true closure costs less than a dropped one (gate)
 _GNC_FACTOR = 1.4  # Yang 2020, section V
-_GNC_STAGES = 100
+_MAX_GNC_STAGES = 100
 _MAX_RETRIED_CLOSURES = 20  # dropped closures that are tested again; each needs one minimisation
-_TLS_ROUNDS = 20
+_MAX_TRUNCATION_ROUNDS = 20
 
 
 class GraphSolution(Record, frozen=True, kw_only=True):
@@ -51,7 +51,8 @@ class GraphSolution(Record, frozen=True, kw_only=True):
     iterations : int
         Accepted steps, over all starts and stages.
     converged : bool
-        False if the iterations were exhausted, or no step lowered a cost that was not yet flat.
+        False if the limit of the iterations was reached, or if no step decreased the cost although
+        the last step changed the cost by more than the tolerance.
     dropped : int
         Number of edges with a weight below 0.5.
     """
@@ -82,7 +83,7 @@ class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
 
 
 @dataclass(frozen=True)
-class _Descent:
+class _Minimum:
     """Result of a minimisation."""
 
     state: Residuals
@@ -95,35 +96,35 @@ def solve(
     graph: PoseGraph,
     *,
     robust: Robust = "none",
-    loops: BoolArray | None = None,
+    is_closure: BoolArray | None = None,
 ) -> Solution:
     """Optimise the poses by Levenberg-Marquardt, with the schedule of GTSAM.
 
     The first pose is fixed. Steps, damping (identity, from 1e-5, by factors of 10) and acceptance
-    of steps are those of GTSAM's LevenbergMarquardtOptimizer, so both reach the same minimum from
-    the same start. The tolerances are 1e-10, relative and absolute.
+    of steps are those of GTSAM's LevenbergMarquardtOptimizer, so px4fuse and GTSAM reach the same
+    minimum from the same start. The tolerances are 1e-10, relative and absolute.
 
     ``dcs`` multiplies the information of closures by s², s = min(1, 2 Phi / (Phi + chi²)), Phi = 1
     (Agarwal et al. 2013, Robust map optimization using dynamic covariance scaling, eq. 15). This is
-    an M-estimator with many minima (MacTavish and Barfoot 2015, At all costs). It starts from the
-    solution of ``gnc``: with drifting odometry true closures have a large initial chi², and would
-    be lost from the initial poses or from the least-squares solution. Taking the lowest minimum is
-    not better: with Phi = 1 a dropped closure costs at most 1.5, and a true one with 3 degrees of
-    freedom costs 1.5 on average.
+    an M-estimator with many minima (MacTavish and Barfoot 2015, At all costs). The optimisation
+    starts from the solution of ``gnc``: if odometry drifts, true closures have a large initial
+    chi², and would be dropped if it started from the initial poses or from the least-squares
+    solution. The lowest of several minima is not better: with Phi = 1 a dropped closure costs at
+    most 1.5, and a true closure with 3 degrees of freedom costs 1.5 on average.
 
     ``gnc`` minimises least squares truncated at the 99 % point of chi-square, with the rank of the
     closure's information as degrees of freedom, by graduated non-convexity (Yang et al. 2020, eq.
-    13 and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage). It starts
-    from the least-squares solution and from the initial poses, and takes the result with the lower
-    cost. A dropped closure costs its 99.9 % point, the limit of the gate. Then up to 20 dropped
-    closures are restored one by one if that lowers this cost. Final weights are 0 or 1.
+    13 and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage). It is run
+    from the least-squares solution and from the initial poses; the result with the lower cost is
+    used. A dropped closure costs the 99.9 % point of chi-square, the limit of the gate. Then up to
+    20 dropped closures are restored one by one if that lowers the cost. Final weights are 0 or 1.
 
     Parameters
     ----------
     robust : {"none", "dcs", "gnc"}
-    loops : ndarray of bool, shape (m,), optional
-        Edges that may be false; all others have weight 1. By default the edges that do not join
-        successive poses.
+    is_closure : ndarray of bool, shape (m,), optional
+        Edges that may be false; all other edges have weight 1. By default the edges between poses
+        that are not successive.
 
     Raises
     ------
@@ -132,32 +133,35 @@ def solve(
         drops all edges to some poses.
     """
     model.require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
-    is_doubtful = ~graph.successive if loops is None else loops
+    is_doubtful = ~graph.is_successive if is_closure is None else is_closure
     start = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
             "The pose graph contains a pose or measurement that is not finite or too large.",
-            "Correct it, or remove the edge.",
+            "Correct the number, or remove the edge.",
         )
-    plain_descent = _minimise(graph, start, _least_squares_kernel(np.ones(len(is_doubtful))))
+    plain_minimum = _minimise(graph, start, _least_squares_kernel(np.ones(len(is_doubtful))))
     weights = np.ones(len(is_doubtful))
-    descent = plain_descent
+    minimum = plain_minimum
     if robust != "none" and np.any(is_doubtful):
-        descent, weights = _solve_gnc(graph, start, plain_descent, is_doubtful)
+        minimum, weights = _solve_gnc(graph, start, plain_minimum, is_doubtful)
         if robust == "dcs":
             kernel = _dcs_kernel(is_doubtful)
-            last = _minimise(graph, descent.state, kernel)
-            descent = _Descent(
-                last.state, last.cost, descent.iterations + last.iterations, last.converged
+            dcs_minimum = _minimise(graph, minimum.state, kernel)
+            minimum = _Minimum(
+                dcs_minimum.state,
+                dcs_minimum.cost,
+                minimum.iterations + dcs_minimum.iterations,
+                dcs_minimum.converged,
             )
-            weights = kernel(descent.state.chi2)[0]
+            weights = kernel(minimum.state.chi2)[0]
     return Solution(
-        poses=descent.state.poses,
-        cost=0.5 * float(np.sum(weights * descent.state.chi2)),
+        poses=minimum.state.poses,
+        cost=0.5 * float(np.sum(weights * minimum.state.chi2)),
         cost_initial=cost_initial,
-        iterations=descent.iterations,
-        converged=descent.converged,
+        iterations=minimum.iterations,
+        converged=minimum.converged,
         dropped=int(np.count_nonzero(weights < 0.5)),
         weights=weights,
     )
@@ -169,7 +173,7 @@ def _minimise(
     kernel: Kernel,
     tolerance: float = _TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
-) -> _Descent:
+) -> _Minimum:
     """Minimise the cost from given poses, as GTSAM's LevenbergMarquardtOptimizer."""
     damping, iterations = _INITIAL_DAMPING, 0
     weights, costs = kernel(state.chi2)
@@ -187,86 +191,90 @@ def _minimise(
         )
         while True:
             drop, predicted_drop, is_flat = 0.0, 0.0, False
-            step = solve_with(matrix, gradient, damping)
+            step = solve_normal_equations(matrix, gradient, damping)
             if step is not None:
                 # decrease of the linearised cost
                 predicted_drop = 0.5 * float(np.sum(step * (damping * step + gradient)))
-                tangent = np.concatenate([np.zeros(graph.freedom), step[:, 0]])
+                tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
                 motion = lie.exp(tangent.reshape(len(graph), -1))
                 trial = model.residuals(graph, lie.compose(state.poses, motion))
                 trial_weights, costs = kernel(trial.chi2)
                 drop = cost - float(np.sum(costs))
                 is_flat = abs(drop) < tolerance * cost
-            is_accepted = predicted_drop > _EPSILON * cost and drop > _MIN_FIDELITY * predicted_drop
+            is_accepted = (
+                predicted_drop > _FLOAT_EPSILON * cost and drop > _MIN_FIDELITY * predicted_drop
+            )
             if is_accepted or is_flat or damping >= _MAX_DAMPING:
                 break
             damping *= _DAMPING_FACTOR
         if not is_accepted:
-            return _Descent(state, cost, iterations, is_flat)
+            return _Minimum(state, cost, iterations, is_flat)
         state, weights, cost_before, cost = trial, trial_weights, cost, cost - drop
         iterations += 1
         damping /= _DAMPING_FACTOR
         if drop <= max(tolerance * cost_before, _TOLERANCE):
-            return _Descent(state, cost, iterations, True)
-    return _Descent(state, cost, iterations, cost <= _TOLERANCE)
+            return _Minimum(state, cost, iterations, True)
+    return _Minimum(state, cost, iterations, cost <= _TOLERANCE)
 
 
 def _least_squares_kernel(weights: Array) -> Kernel:
-    return lambda chi2_: (weights, 0.5 * weights * chi2_)
+    return lambda chi2: (weights, 0.5 * weights * chi2)
 
 
 def _dcs_kernel(is_doubtful: BoolArray) -> Kernel:
     """Return the kernel of dynamic covariance scaling for the doubtful edges."""
 
-    def kernel(chi2_: Array) -> tuple[Array, Array]:
-        is_beyond = is_doubtful & (chi2_ > DCS_PHI)
-        scale = np.where(is_beyond, 2.0 * DCS_PHI / (DCS_PHI + chi2_), 1.0)
-        return scale**2, np.where(is_beyond, scale * chi2_ - 0.5 * DCS_PHI, 0.5 * chi2_)
+    def kernel(chi2: Array) -> tuple[Array, Array]:
+        is_beyond = is_doubtful & (chi2 > DCS_PHI)
+        scale = np.where(is_beyond, 2.0 * DCS_PHI / (DCS_PHI + chi2), 1.0)
+        return scale**2, np.where(is_beyond, scale * chi2 - 0.5 * DCS_PHI, 0.5 * chi2)
 
     return kernel
 
 
 def _solve_gnc(
-    graph: PoseGraph, start: Residuals, plain_descent: _Descent, is_doubtful: BoolArray
-) -> tuple[_Descent, Array]:
+    graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
+) -> tuple[_Minimum, Array]:
     """Solve truncated least squares over the doubtful edges, from two starts."""
     _, scaled = model.scale_to_unit_diagonal(graph.information)
-    freedom = np.sum(np.linalg.eigvalsh(scaled) > model.MIN_OBSERVED_EIGENVALUE, axis=1)
+    degrees_of_freedom = np.sum(np.linalg.eigvalsh(scaled) > model.MIN_OBSERVED_EIGENVALUE, axis=1)
     bound = np.full(len(is_doubtful), np.inf)
     drop_cost = np.zeros(len(is_doubtful))
-    is_testable = is_doubtful & (freedom > 0)
-    bound[is_testable] = 2.0 * gammaincinv(freedom[is_testable] / 2.0, GNC_PROBABILITY)
-    drop_cost[is_testable] = 2.0 * gammaincinv(freedom[is_testable] / 2.0, DROP_PROBABILITY)
+    is_testable = is_doubtful & (degrees_of_freedom > 0)
+    bound[is_testable] = 2.0 * gammaincinv(degrees_of_freedom[is_testable] / 2.0, GNC_PROBABILITY)
+    drop_cost[is_testable] = 2.0 * gammaincinv(
+        degrees_of_freedom[is_testable] / 2.0, DROP_PROBABILITY
+    )
 
     def truncated_cost(state: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, state.chi2, drop_cost)))
 
-    iteration_count, solutions = plain_descent.iterations, []
-    for first in (plain_descent.state, start):
-        descent, weights = _descend_graduated(graph, first, bound)
-        iteration_count += descent.iterations
-        solutions.append((truncated_cost(descent.state, weights), descent, weights))
-    lowest, descent, weights = min(solutions, key=lambda solution: solution[0])
+    iteration_count, solutions = plain_minimum.iterations, []
+    for start_state in (plain_minimum.state, start):
+        minimum, weights = _descend_graduated(graph, start_state, bound)
+        iteration_count += minimum.iterations
+        solutions.append((truncated_cost(minimum.state, weights), minimum, weights))
+    lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
     dropped = np.flatnonzero(weights == 0.0)
-    for edge in dropped[np.argsort(descent.state.chi2[dropped])][:_MAX_RETRIED_CLOSURES]:
+    for edge in dropped[np.argsort(minimum.state.chi2[dropped])][:_MAX_RETRIED_CLOSURES]:
         trial_weights = weights.copy()
         trial_weights[edge] = 1.0
-        trial = _minimise(graph, descent.state, _least_squares_kernel(trial_weights))
+        trial = _minimise(graph, minimum.state, _least_squares_kernel(trial_weights))
         iteration_count += trial.iterations
-        if (cost := truncated_cost(trial.state, trial_weights)) < lowest:
-            lowest, descent, weights = cost, trial, trial_weights
+        if (cost := truncated_cost(trial.state, trial_weights)) < lowest_cost:
+            lowest_cost, minimum, weights = cost, trial, trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that gnc did not drop")
-    return _Descent(descent.state, descent.cost, iteration_count, descent.converged), weights
+    return _Minimum(minimum.state, minimum.cost, iteration_count, minimum.converged), weights
 
 
-def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Descent, Array]:
+def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Minimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     state, iteration_count = start, 0
     # edges with an infinite bound are not doubtful
     excess = 2.0 * state.chi2 / bound - 1.0
     if np.max(excess) > 0.0:
         control = 1.0 / float(np.max(excess))
-        for _ in range(_GNC_STAGES):
+        for _ in range(_MAX_GNC_STAGES):
             ratio = np.maximum(state.chi2 / bound, 1e-200)  # lower limit; the weight is 1 there
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
             stage = _minimise(
@@ -277,12 +285,12 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
                 break
             control *= _GNC_FACTOR
     weights = (state.chi2 <= bound).astype(float)
-    for _ in range(_TLS_ROUNDS):
-        descent = _minimise(graph, state, _least_squares_kernel(weights))
-        state, iteration_count = descent.state, iteration_count + descent.iterations
-        # each round lowers the truncated cost, so the loop ends
+    for _ in range(_MAX_TRUNCATION_ROUNDS):
+        minimum = _minimise(graph, state, _least_squares_kernel(weights))
+        state, iteration_count = minimum.state, iteration_count + minimum.iterations
+        # each round decreases the truncated cost, so the loop ends
         new_weights = (state.chi2 <= bound).astype(float)
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Descent(state, descent.cost, iteration_count, descent.converged), weights
+    return _Minimum(state, minimum.cost, iteration_count, minimum.converged), weights

@@ -11,8 +11,8 @@ from scipy.sparse.linalg import splu
 from px4fuse.arrays import Array
 from px4fuse.trajectory.graph.model import PoseGraph
 
-# relax and panel_size of scipy's SuperLU: values above its defaults (10 and 20) write past its work
-# space (found with valgrind on scipy 1.17); relax 1 gives the least fill-in
+# relax and panel_size of scipy's SuperLU: with values above the defaults (10 and 20) SuperLU writes
+# outside its workspace (scipy 1.17, shown by valgrind); relax 1 gives the least fill-in
 _RELAX, _PANEL = 1, 4
 if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
     Matrix = sparse.csc_array[np.float64]
@@ -20,18 +20,18 @@ if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
 
 def normal_equations(
     graph: PoseGraph,
-    of_first: Array,
-    of_second: Array,
+    first_coefficient: Array,
+    second_coefficient: Array,
     information: Array,
     value: Array,
     first_value: Array | float = 0.0,
 ) -> tuple[Matrix, Array]:
-    """Return the normal equations of ``A x_i + B x_j = value`` for all edges; the first x is fixed.
+    """Return the normal equations of ``A x_i + B x_j = value`` over all edges, with x_0 fixed.
 
     Parameters
     ----------
     graph : PoseGraph
-    of_first, of_second, information : ndarray, shape (m, d, d)
+    first_coefficient, second_coefficient, information : ndarray, shape (m, d, d)
         A, B, and the weight of each equation.
     value : ndarray, shape (m, d, k)
     first_value : ndarray, shape (d, k), or 0
@@ -39,11 +39,11 @@ def normal_equations(
     Returns
     -------
     matrix : csc_array, shape ((n - 1) d, (n - 1) d)
-    right : ndarray, shape ((n - 1) d, k)
+    right_side : ndarray, shape ((n - 1) d, k)
     """
     edges, d = np.arange(len(graph.first) + 1), value.shape[1]
     ends = np.column_stack([graph.first, graph.second]).ravel()
-    blocks = np.stack([of_first, of_second], axis=1).reshape(-1, d, d)
+    blocks = np.stack([first_coefficient, second_coefficient], axis=1).reshape(-1, d, d)
     rows = sparse.bsr_array((blocks, ends, 2 * edges), shape=(d * edges[-1], d * len(graph)))
     weights = sparse.bsr_array((information, edges[:-1], edges))
     columns = rows.tocsc()
@@ -55,7 +55,7 @@ def normal_equations(
     return (weighted @ free_columns).tocsc(), weighted @ right_side
 
 
-def solve_with(matrix: Matrix, right: Array, damping: float = 0.0) -> Array | None:
+def solve_normal_equations(matrix: Matrix, right_side: Array, damping: float = 0.0) -> Array | None:
     """Solve normal equations with damping on the diagonal; None if singular."""
     try:
         factors = splu(
@@ -69,5 +69,5 @@ def solve_with(matrix: Matrix, right: Array, damping: float = 0.0) -> Array | No
         )
     except RuntimeError:  # exactly singular
         return None
-    solution: Array = factors.solve(right)
+    solution: Array = factors.solve(right_side)
     return solution if np.all(np.isfinite(solution)) else None

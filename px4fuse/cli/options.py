@@ -1,0 +1,431 @@
+"""Option types of the command line, and options that several commands share.
+
+Numbers are typed without their unit; for a number with a unit the error shows the right number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import click
+from click.core import ParameterSource
+
+from px4fuse.cli.outputs import OPEN_KEY
+from px4fuse.errors import SettingsError
+from px4fuse.filter.settings import DT_RANGE_S, SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M
+from px4fuse.input_files import add_input
+from px4fuse.reading import max_log_bytes, read_text
+from px4fuse.request import (
+    AUTO,
+    DT_S,
+    OPTION_NAMES,
+    SIGMA_A_M_S2,
+    AxisName,
+    ComparisonRequest,
+    PositionFile,
+    SourceKind,
+)
+from px4fuse.units import NAMES, convert_to_unit
+
+if TYPE_CHECKING:
+    from px4fuse.results.model import Student
+
+
+def parse_columns(text: str) -> tuple[str, ...]:
+    """Parse comma-separated names or numbers of columns."""
+    return tuple(text.split(","))
+
+
+Option = Callable[[Callable[..., None]], Callable[..., None]]
+Choice = partial(click.Choice, case_sensitive=False)
+
+
+def _combine_options(*options: Option) -> Option:
+    """Combine options into one decorator; --help lists them in this order."""
+
+    def add(command: Callable[..., None]) -> Callable[..., None]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
+class NonEmptyPath(click.Path):
+    """Path of a file or folder; an empty name is rejected, as it would mean the current folder."""
+
+    def __init__(self, path_type: type[Path | str] = Path) -> None:
+        super().__init__(path_type=path_type)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert the typed text to a path."""
+        if value == "":
+            self.fail("the name is empty.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+class InputPath(NonEmptyPath):
+    """File or folder to read, which no output may overwrite.
+
+    A log may be followed by the name of a track: ``LOG:vio``.
+    """
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert the typed text to a path and register it as an input."""
+        path = super().convert(value, param, ctx)
+        file, colon, _ = str(path).rpartition(":")
+        add_input(Path(file) if colon and not Path(path).exists() else Path(path))
+        return path
+
+
+class TypedQuantity(click.ParamType["float | str"]):
+    """Number in a fixed unit.
+
+    Parameters
+    ----------
+    unit : str
+        One of :data:`px4fuse.units.NAMES`.
+    example : float
+        Number in the error message if the typed text is not a number.
+    auto : bool
+        Accept ``auto`` in addition.
+    """
+
+    name = "number"
+
+    def __init__(self, unit: str, example: float = 0.1, *, auto: bool = False) -> None:
+        self.unit, self.example, self.auto = unit, example, auto
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """Return the unit, which --help shows for the value."""
+        unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
+        return f"{unit}|auto" if self.auto else unit
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
+        """Convert the typed text to a number, or to "auto"."""
+        if self.auto and value == AUTO:
+            return str(value)
+        unit = f" in {NAMES[self.unit]}" if self.unit else ""
+        try:
+            number = float(value)
+        except ValueError:
+            converted = convert_to_unit(value, self.unit)
+            example_text = f"{self.example if converted is None else converted:.12g}"
+            self.fail(
+                f"{value!r} is not a number{unit}. Give for example {example_text}"
+                f"{', or auto' if self.auto else ''}.",
+                param,
+                ctx,
+            )
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
+
+
+def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
+    if megabytes is not None:
+        token = max_log_bytes.set(megabytes * 1_000_000)
+        ctx.call_on_close(lambda: max_log_bytes.reset(token))
+
+
+# The limit depends on the computer and does not change results, so no request contains it
+max_size_option = click.option(
+    "--max-size",
+    type=click.IntRange(1),
+    metavar="MB",
+    expose_value=False,
+    callback=_set_max_size,
+    help=f"Maximum size of a log.  [default: {max_log_bytes.get() // 1_000_000}]",
+)
+
+
+def _json_option(more_text: str = "") -> Option:
+    """Declare --json."""
+    return click.option(
+        "--json",
+        "json_path",
+        type=NonEmptyPath(),
+        metavar="FILE",
+        help=f"Write the results as JSON; - prints them to standard output.{more_text}",
+    )
+
+
+#: Option --json of commands without a report
+json_option = _json_option()
+
+
+def output_option(metavar: str, text: str, **details: Any) -> Option:
+    """Declare -o for a file or folder; ``details``: further arguments of ``click.option``."""
+    return click.option(
+        "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=text, **details
+    )
+
+
+def report_options(text: str) -> Option:
+    """Declare -o for the PDF report and --json for its results."""
+    json_text = "With --json and without -o, no report is written.  [default: beside the report]"
+    return _combine_options(output_option("FILE.pdf", text), _json_option(f" {json_text}"))
+
+
+def fail_option(severities: tuple[str, ...], text: str) -> Option:
+    """Declare --fail-on for a command that ends with exit code 1 on a finding."""
+    return click.option("--fail-on", type=Choice(severities), help=text)
+
+
+def _open_flag(*names: str) -> Option:
+    """Declare a flag to open the output; :func:`~px4fuse.cli.outputs.write_and_print` opens it."""
+    return click.option(
+        *names,
+        is_flag=True,
+        expose_value=False,
+        callback=lambda ctx, _, value: ctx.meta.update({OPEN_KEY: value}),
+        help="Open the written file in its default program.",
+    )
+
+
+#: --open of commands that write a report or a page
+open_option = _open_flag("--open", "--show", "opened")
+#: --show of px4fuse loop, whose --open means an open loop
+show_option = _open_flag("--show", "shown")
+#: Student, notes and answers
+person_options = _combine_options(
+    click.option("--student", metavar="NAME", help="Student name, printed on the report."),
+    click.option("--id", "student_id", metavar="ID", help="Student id, printed on the report."),
+    click.option(
+        "--notes",
+        type=InputPath(),
+        metavar="FILE.md",
+        help="Your own text in Markdown, printed in the report.",
+    ),
+    click.option(
+        "--answers",
+        type=InputPath(),
+        metavar="FILE.toml",
+        help="Completed form from px4fuse answers.",
+    ),
+)
+system_option = click.option(
+    "--system",
+    type=click.IntRange(0, 255),
+    metavar="ID",
+    help="MAVLink system id of the vehicle.  [default: the id with the most messages]",
+)
+_clock_option = click.option(
+    "--clock-offset",
+    "clock_offset_s",
+    type=TypedQuantity("s", auto=True),
+    help="Seconds to add to the timestamps of the position source; auto estimates them.  "
+    "[default: 0; auto with --position]",
+)
+#: Recordings of one flight, for commands that read it as logged
+recording_options = _combine_options(
+    click.option(
+        "--mavlink",
+        type=InputPath(str),
+        metavar="FILE.tlog",
+        help="MAVLink recording of the same flight; adds the data that are missing in LOG.",
+    ),
+    system_option,
+)
+#: Position file; its parameters begin with ``position``
+position_options = _combine_options(
+    click.option(
+        "--position",
+        type=InputPath(str),
+        metavar="FILE.csv",
+        help="Position file of the positioning system (CSV): time, x, y, z. Replaces the position "
+        "in LOG.",
+    ),
+    click.option(
+        "--position-frame",
+        type=Choice(("ned", "enu", "nwu")),
+        help="Frame of x, y, z in the position file.  [default: from the column names, else the "
+        "frame that fits EKF2 best]",
+    ),
+    click.option(
+        "--position-yaw",
+        type=TypedQuantity("°", 30.0, auto=True),
+        help="Rotate the position file by this yaw, clockwise seen from above; auto estimates yaw "
+        "and origin.  [default: 0]",
+    ),
+    click.option(
+        "--position-columns",
+        type=parse_columns,
+        metavar="TIME,X,Y,Z[,SIGMA]",
+        help="Names or numbers of the columns of the position file.  [default: recognised by name]",
+    ),
+    click.option(
+        "--position-time-unit",
+        type=Choice(("s", "ms", "us", "ns")),
+        help="Unit of the time column in the position file.  [default: detected]",
+    ),
+    click.option(
+        "--position-unit",
+        type=Choice(("m", "cm", "mm")),
+        help="Unit of x, y, z in the position file.  [default: detected]",
+    ),
+)
+#: Settings and segment, for commands that run KF
+filter_options = _combine_options(
+    click.option(
+        "--sigma-a",
+        "sigma_a_m_s2",
+        type=TypedQuantity("m/s²", SIGMA_A_M_S2),
+        default=SIGMA_A_M_S2,
+        help="KF process noise SIGMA_A (acceleration, 1 σ over DT), {:g} to {:g}.".format(
+            *SIGMA_A_RANGE_M_S2
+        ),
+    ),
+    click.option(
+        "--sigma-z",
+        "sigma_z_m",
+        type=TypedQuantity("m"),
+        help="KF measurement noise SIGMA_Z (position, 1 σ), {:g} to {:g}.  [default: 0.1; for GNSS "
+        "the R that EKF2 uses]".format(*SIGMA_Z_RANGE_M),
+    ),
+    click.option(
+        "--dt",
+        "dt_s",
+        type=TypedQuantity("s"),
+        default=DT_S,
+        help="KF prediction step DT, {:g} to {:g}.".format(*DT_RANGE_S),
+    ),
+    click.option(
+        "--input",
+        type=Choice(("imu", "zero")),
+        help="KF input: acceleration from the IMU, or zero (constant velocity).  [default: imu if "
+        "logged]",
+    ),
+    click.option(
+        "--axis",
+        "axes",
+        type=Choice(get_args(AxisName)),
+        multiple=True,
+        help="Axis to analyse; repeatable.  [default: all axes with a position; for GNSS the "
+        "horizontal axes]",
+    ),
+    click.option(
+        "--heading",
+        "heading_deg",
+        type=TypedQuantity("°", 30.0),
+        help="Heading of the aisle axis, clockwise from north.  [default: main direction of the "
+        "track]",
+    ),
+    click.option(
+        "--start",
+        "start_s",
+        type=TypedQuantity("s", 20.0),
+        help="Start of the analysis, in seconds after the first data.  [default: take-off]",
+    ),
+    click.option(
+        "--end",
+        "end_s",
+        type=TypedQuantity("s", 60.0),
+        help="End of the analysis, in seconds after the first data.  [default: landing]",
+    ),
+    click.option(
+        "--position-source",
+        metavar="NAME",
+        help="Position source to use, for example vehicle_gps_position; px4fuse info lists them.  "
+        "[default: the most direct one logged]",
+    ),
+    click.option(
+        "--source-kind",
+        type=Choice(get_args(SourceKind)),
+        help="Kind of the position source. VIO drifts; motion capture in the same messages does "
+        "not.  [default: vio if the source sends a changing orientation]",
+    ),
+    click.option(
+        "--height",
+        type=Choice(("gnss", "barometer")),
+        help="Height source of --axis down on a GNSS flight.  [default: the one that EKF2 fused, "
+        "GNSS first]",
+    ),
+)
+#: Recordings of one flight, position file and clock offset
+flight_options = _combine_options(
+    recording_options, position_options, _clock_option, max_size_option
+)
+#: Settings, segment and recordings, for commands that run KF on one flight
+analysis_options = _combine_options(filter_options, flight_options)
+#: Settings that apply to many logs, so without the files of one flight
+settings_options = _combine_options(filter_options, system_option, _clock_option, max_size_option)
+
+
+def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRequest:
+    """Make a request from the values of :func:`flight_options` or :func:`analysis_options`.
+
+    Raises
+    ------
+    SettingsError
+        An option for a position file is given without --position.
+    """
+    return ComparisonRequest(log=str(log), position=_position_file(option_values), **option_values)
+
+
+def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
+    option_names = OPTION_NAMES[PositionFile]
+    fields = {
+        field: option_values.pop(name[2:].replace("-", "_")) for field, name in option_names.items()
+    }
+    if fields["path"] is not None:
+        return PositionFile(**fields)
+    for field, value in fields.items():
+        if value is not None:
+            raise SettingsError(f"{option_names[field]} requires --position.")
+    return None
+
+
+def typed_parameters() -> Iterator[click.Parameter]:
+    """Yield the parameters that the user typed."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
+            yield parameter
+
+
+def read_student(option_values: dict[str, Any]) -> Student:
+    """Remove the values of :func:`person_options` from the option values and read their files.
+
+    Raises
+    ------
+    SettingsError
+        The notes or the answers cannot be read, or the notes cannot be printed.
+    """
+    from msgspec import UNSET
+
+    from px4fuse.answer_form import read_answers
+    from px4fuse.results.model import MAX_NOTES_BYTES, Student
+
+    name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
+    notes_path, answers_path, notes = option_values.pop("notes"), option_values.pop("answers"), ""
+    if notes_path is not None:
+        from px4fuse.report.notes import parse  # slow import
+
+        notes = read_text(notes_path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {notes_path}")
+        parse(notes, f"--notes {notes_path}")  # report errors before the analysis
+    answers = UNSET if answers_path is None else read_answers(answers_path)
+    student = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
+    _warn_missing_fonts(student.name + student.id + student.notes)
+    return student
+
+
+def _warn_missing_fonts(text: str) -> None:
+    """Warn before the analysis if no installed font has a character of the text."""
+    if text.isascii():
+        return
+    from px4fuse.report.fonts import font_advice, missing_characters
+
+    if characters := missing_characters(text):
+        click.echo(f"px4fuse: {font_advice(characters)}", err=True)
+
+
+def replace_unencodable(text: str) -> str:
+    """Replace bytes of a command line that are not valid text."""
+    return text.encode(errors="replace").decode()
