@@ -202,7 +202,7 @@ def changed_parameters(log: Log, rng: random.Random) -> str:
     )
     if value is None:
         log.parameters.pop(name, None)
-    elif isinstance(value, str) and not path.endswith("sha256"):
+    elif isinstance(value, str):
         known = RANGES.get(name)
         value = 0.0 if known is None else known.minimum if value == "low" else known.maximum
     if value is not None:
