@@ -252,6 +252,18 @@ def make_cause(
     )
 
 
+def make_plain_cause(finding: Finding) -> Cause:
+    """Make the cause of a finding without re-runs."""
+    return Cause(
+        id=finding.id,
+        severity="error" if finding.severity == "error" else "warning",
+        title=finding.title,
+        why=_reason(finding),
+        spans_s=finding.spans_s,
+        actions=(Action(_target(finding), finding.remedy),) if finding.remedy else (),
+    )
+
+
 def _reason(finding: Finding) -> str:
     """Return the message without its first sentence, which is the title."""
     return finding.message.removeprefix(finding.title).lstrip(". ")

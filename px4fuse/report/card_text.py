@@ -113,6 +113,8 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield from _cause(cause)
     if card.more_causes:
         yield Line(f"and {card.more_causes} more: -v")
+    for label, text in card.facts.items():
+        yield from _labelled(label, text)
     yield from _verdict_axis(card)
     yield from _aid_axis(card.aids)
     for text in (card.reconcile, card.difference):

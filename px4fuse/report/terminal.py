@@ -37,13 +37,12 @@ def summary(
         Print the headline only.
     """
     page = Page()
-    if isinstance(analysis, AidsOnlyAnalysis):
-        log = analysis.flight.log
-        page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-        write_aids_only(page, analysis, results.findings)
+    page.add("headline" if quiet else "card", card=results.card)
+    if not verbose:
         return page
-    page.add("card", card=results.card, headline_only=quiet)
-    if verbose:
+    if isinstance(analysis, AidsOnlyAnalysis):
+        write_aids_only(page, analysis, results.findings)
+    else:
         _write_details(page, analysis, results)
     return page
 
@@ -61,3 +60,10 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     write_aids_of_comparison(page, analysis)
     for group in group_by_root(results.findings):
         write_finding(page, group)
+
+
+def closing(results: Any) -> Page:
+    """Make the lines below the written files: where to read more."""
+    page = Page()
+    page.add("closing", card=results.card)
+    return page
