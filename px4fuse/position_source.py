@@ -9,7 +9,7 @@ from px4fuse.record import Record
 
 PositionKind = Literal["uwb", "vio", "mocap", "gnss", "file"]
 DataPath = Literal[
-    "given file", "as it arrived", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
+    "given file", "as received", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
 ]
 
 
@@ -25,7 +25,7 @@ class Origin(Record, frozen=True):
     aid : Aid or None
         EKF2 aid of this source, with its EKF2 parameters; None if EKF2 never fuses it.
     is_automatic : bool
-        True if it may be selected by default; for GNSS only if EKF2 fused it.
+        True if the source may be selected by default; for GNSS only if EKF2 fused it.
     """
 
     kind: PositionKind
@@ -44,22 +44,22 @@ class Origin(Record, frozen=True):
 
     @property
     def reconstructed(self) -> bool:
-        """True if it was derived from EKF2's logged data instead of logged as received."""
+        """True if the positions are derived from EKF2's logged data, not logged as received."""
         return self.path in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
-        """True if it contains all samples of the sender."""
-        return self.path in ("given file", "as it arrived")
+        """True if the track contains all samples of the sender."""
+        return self.path in ("given file", "as received")
 
     @property
     def is_vision(self) -> bool:
-        """True if EKF2 fuses it as external vision."""
+        """True if EKF2 fuses the source as external vision."""
         return self.aid == EV_POS
 
     @property
     def fused_as_gnss(self) -> bool:
-        """True if EKF2 fuses it as GNSS."""
+        """True if EKF2 fuses the source as GNSS."""
         return self.aid == GNSS_POS
 
     @property
@@ -73,18 +73,18 @@ class Origin(Record, frozen=True):
 
     @property
     def preference(self) -> int:
-        """Index in :data:`ORIGINS`; the smallest is preferred."""
-        places = [(known.aid, known.path) for known in ORIGINS]
-        return places.index((self.aid, self.path))
+        """Index in :data:`ORIGINS`; the source with the smallest index is preferred."""
+        origins = [(known.aid, known.path) for known in ORIGINS]
+        return origins.index((self.aid, self.path))
 
 
 POSITION_FILE = Origin("file", "given file", EV_POS)
-RECEIVED = Origin("uwb", "as it arrived", EV_POS)
-MOTION_CAPTURE = Origin("mocap", "as it arrived", None)
+RECEIVED = Origin("uwb", "as received", EV_POS)
+MOTION_CAPTURE = Origin("mocap", "as received", None)
 ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
 LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
 FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
-GNSS = Origin("gnss", "as it arrived", GNSS_POS, is_automatic=False)
+GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
 # In order of preference. A position file is assumed to be from the system that EKF2 fused
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 
@@ -99,5 +99,5 @@ def find_origin(kind: str, path: str) -> Origin:
 
 
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:
-    """Change the kind "uwb" to "vio" if the orientation of the track changes (``turns``)."""
+    """Change the kind "uwb" to "vio" if the track has a changing orientation (``turns``)."""
     return replace(origin, kind="vio") if origin.kind == "uwb" and turns else origin

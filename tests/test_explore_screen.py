@@ -13,7 +13,7 @@ from browser import Browser
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis, run, run_comparison
-from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
+from px4fuse.comparison.causal_replays import error_above_reported_sigma
 from px4fuse.explore.page import html_text
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
@@ -143,7 +143,7 @@ def test_sentence_error_beyond_sigma_states_reported_sigma(
 ) -> None:
     put(page, offset=0.3)
     shifted = _shifted(explored[1], 0.3)
-    hidden = error_beyond_reported_sigma(shifted.axes["aisle"].filters["kf"])
+    hidden = error_above_reported_sigma(shifted.axes["aisle"].filters["kf"])
     assert hidden is not None
     rmse, sigma = format_metres(hidden.rmse_m), format_metres(hidden.reported_sigma_m)
     assert f"KF has a position RMSE of {rmse}, but reports σ {sigma}." in text(page, "live")

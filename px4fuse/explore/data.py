@@ -12,11 +12,11 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    MAX_UNSUSPICIOUS_NIS,
+    MAX_UNREMARKABLE_NIS,
     MIN_NEES_FINDING,
-    error_beyond_reported_sigma,
+    error_above_reported_sigma,
 )
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
+from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency, nis_band
@@ -28,10 +28,10 @@ from px4fuse.filter.settings import (
     SIGMA_Z_RANGE_M,
     Settings,
 )
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings import Finding, by_root, find, finding_title
+from px4fuse.findings import Finding, find, finding_title, group_by_root
 from px4fuse.findings.cause_grouping import NOISES
 from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, PositionTrack, Unavailable
@@ -86,7 +86,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
                 **_finding_data(finding),
                 "more": [_finding_data(consequence) for consequence in followers],
             }
-            for finding, *followers in by_root(findings)
+            for finding, *followers in group_by_root(findings)
         ],
         "command": _command_data(request, analysis),
         "offset": _offset_data(request, analysis),
@@ -113,7 +113,7 @@ def ranges() -> dict[str, Any]:
         "clock-offset": list(CLOCK_OFFSET_RANGE_S),
         "lesson": _settings_data(Settings()),
         "running": [RUNNING_MEAN_COUNT, *nis_band(RUNNING_MEAN_COUNT)],
-        "hidden": [MIN_NEES_FINDING, MAX_UNSUSPICIOUS_NIS],
+        "hidden": [MIN_NEES_FINDING, MAX_UNREMARKABLE_NIS],
     }
 
 
@@ -180,7 +180,7 @@ def _axis_signals(
     """Return measurements (in and near the segment) and integrated acceleration of an axis."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
-    value = along(raw.samples, Columns.POSITION, axis.direction)
+    value = weighted_sum(raw.samples, Columns.POSITION, axis.direction)
     half_range_s = OFFSET_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
     is_in_reach = (time >= segment.start_s - half_range_s) & (time <= segment.end_s + half_range_s)
     is_in_reach &= np.isfinite(value)
@@ -204,7 +204,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
     """Return the axis description, NIS bands, EKF2 and ground truth of one axis."""
     name = result.axis.name
     return {
-        "called": result.axis.called,
+        "called": result.axis.label,
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
@@ -242,12 +242,12 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
         "summary": _summary(consistency),
         "r": None,
     }
-    if isinstance(consistency.truth, AgainstTruth):
+    if isinstance(consistency.truth, ErrorsAgainstTruth):
         ekf2["summary"] |= {
             "truthP": consistency.truth.position_rmse_m,
             "truthV": consistency.truth.velocity_rmse_m_s,
         }
-    if excess := error_beyond_reported_sigma(consistency):
+    if excess := error_above_reported_sigma(consistency):
         ekf2["summary"]["reportedSigma"] = excess.reported_sigma_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
@@ -321,7 +321,7 @@ def _map_data(analysis: Analysis) -> dict[str, Any]:
 
 def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
     """Pack time, north and east of the source's track, or return the reason why it is missing."""
-    samples = within(comparison.source.samples, comparison.segment)
+    samples = cut_to_segment(comparison.source.samples, comparison.segment)
     track = samples[Columns.POSITION[:2]].dropna()
     if not len(track):
         return "the source has no horizontal position"

@@ -12,9 +12,8 @@ from px4fuse.flight import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
-from px4fuse.report.phrases import flight_line, format_sigma_verdict, write_findings
+from px4fuse.report.phrases import format_sigma_verdict, write_findings
 from px4fuse.request import with_options
-from px4fuse.results.contract import AidsResults
 from px4fuse.text import format_number
 
 TITLE = "Aids of EKF2"
@@ -52,11 +51,10 @@ def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, Aid
     return aid_results
 
 
-def draw_aids_only(analysis: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
+def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
     page = Page(TITLE, LEAD)
-    page.write(flight_line(results.student, analysis.flight.log), colour=style.MUTED_COLOUR)
-    write_aids_only(page, analysis, results.findings)
+    write_aids(page, analysis.aids)
     _draw_aid_panels(page, analysis.flight, analysis.aids)
     yield page
 

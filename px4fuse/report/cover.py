@@ -6,7 +6,7 @@ Texts and numbers are those of the card; ``cover.typ`` places them.
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from px4fuse.analysis import Analysis
+from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import (
     AXIS_ENDS,
     AXIS_TICKS,
@@ -35,7 +35,7 @@ from px4fuse.report.cover_panels import write_panels
 from px4fuse.report.page import Block, Page, to_typst_data
 from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
-from px4fuse.results.contract import ComparisonResults
+from px4fuse.results.contract import AidsResults, ComparisonResults
 
 MAX_NOTES = 3
 # More changed settings are counted in the head; the foot has the command with all of them
@@ -62,6 +62,13 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     yield page
 
 
+def draw_aids_only(_: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
+    """Draw the cover of a flight without a position source; the aids follow on the same page."""
+    page = Page()
+    add_card(page, results.card)
+    yield page
+
+
 def add_card(page: Page, card: Card) -> Block:
     """Add the texts of a card to a page; its panels belong into ``blocks`` of the result."""
     identity = card.identity
@@ -82,6 +89,7 @@ def add_card(page: Page, card: Card) -> Block:
         effect=card.effect_text,
         do_this=card.do_this,
         **_axis(card),
+        facts=list(card.facts.items()),
         reconcile=card.reconcile,
         causes_title="Cause and fix" if len(card.causes) == 1 else "Causes and fixes",
         causes_legend=_causes_legend(card.causes),

@@ -14,7 +14,7 @@ from px4fuse.card.model import Card, FilterName
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
 from px4fuse.comparison.model import FILTERS, AxisComparison
-from px4fuse.filter.signals import AISLE, within
+from px4fuse.filter.signals import AISLE, cut_to_segment
 from px4fuse.flight import Ekf2, Truth
 from px4fuse.report import style
 from px4fuse.report.card_text import FILTER_NAMES
@@ -431,7 +431,7 @@ def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
     segment, flight = analysis.segment, analysis.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
-        inside = within(frame, segment)
+        inside = cut_to_segment(frame, segment)
         return inside["north_m"].to_numpy(), inside["east_m"].to_numpy()
 
     tracks = {"positions": cut(analysis.source.samples)}

@@ -44,7 +44,12 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
         notes.draw,
         provenance.draw,
     ),
-    contract.AidsResults: (aids.draw_aids_only, notes.draw, provenance.draw_aids),
+    contract.AidsResults: (
+        cover.draw_aids_only,
+        aids.draw_aids_only,
+        notes.draw,
+        provenance.draw_aids,
+    ),
     contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
     contract.EvaluationResults: (evaluation.draw,),
 }

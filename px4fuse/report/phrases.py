@@ -10,14 +10,14 @@ from px4fuse.comparison.model import (
     Comparison,
     Difference,
     FilterSummary,
-    UnjudgedFilter,
+    UntestedFilter,
 )
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings import Finding, by_root, finding_title
+from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight import Alignment, Truth, Unavailable
-from px4fuse.log import ClockMap, LogInfo
+from px4fuse.log import ClockMap
 from px4fuse.report.page import styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student
@@ -63,7 +63,7 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     return f"{verdict}, σ {format_factor(factor)}× {SIGMA_VERDICTS[verdict]}"
 
 
-def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UnjudgedFilter]:
+def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
     """Return KF and EKF2 of an axis by their display names; KF only if EKF2 is not logged."""
     filters = {"KF": result.filters["kf"]}
     if not isinstance(result.ekf2_state, Unavailable):
@@ -76,7 +76,7 @@ VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 def verdict_rows(
     axes: Iterable[AxisComparison],
-    extra_cells: Callable[[AxisComparison, str, FilterSummary | UnjudgedFilter], Sequence[str]],
+    extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
 ) -> list[list[Cell]]:
     """Return a table row per axis and filter: the cells of VERDICT_HEAD, then the extra cells."""
     rows: list[list[Cell]] = []
@@ -116,7 +116,7 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     has_truth = isinstance(analysis.flight.truth, Truth)
 
     def rms_cells(
-        result: AxisComparison, name: str, consistency: FilterSummary | UnjudgedFilter
+        result: AxisComparison, name: str, consistency: FilterSummary | UntestedFilter
     ) -> list[str]:
         difference = result.difference if name == "KF" else None
         cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
@@ -271,12 +271,6 @@ def tuning_advice(
     return advice
 
 
-def flight_line(student: Student, log: LogInfo) -> str:
-    """Format student, log, duration, firmware and hardware on one line."""
-    flight_facts = (log.name, f"{log.duration_s:.1f} s", f"{log.firmware}, {log.hardware}")
-    return " · ".join(filter(None, (student_line(student, ", "), *flight_facts)))
-
-
 def student_line(student: Student, separator: str) -> str:
     """Join the student's name and id; either may be empty."""
     return separator.join(filter(None, (student.name, student.id)))
@@ -286,7 +280,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
     """Write all findings, each with its consequences."""
     if not findings:
         page.write("None.")
-    for findings_of_cause in by_root(findings):
+    for findings_of_cause in group_by_root(findings):
         write_finding(page, findings_of_cause)
 
 

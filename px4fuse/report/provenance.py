@@ -22,9 +22,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the provenance of a comparison."""
     flight, source = analysis.flight, analysis.source
     alignment = source.alignment
-    findings = Page(ALL_FINDINGS)
-    write_findings(findings, results.findings)
-    yield findings
+    yield _findings_page(results)
     page = Page("Appendix: provenance")
     clocks = map(format_clock_map, flight.clocks)
     _write_section(page, "Clocks, mapped to the autopilot's boot clock", plain_texts=clocks)
@@ -45,12 +43,19 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
 
 def draw_aids(analysis: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
     """Draw the provenance of a flight without a position source."""
+    yield _findings_page(results)
     flight, page = analysis.flight, Page("Provenance")
     _write_section(page, "Automatic choices", plain_texts=flight.log.notes or ["none"])
     _write_missing(page, (analysis.missing_data, *flight.missing))
     _write_versions(page, results)
     _write_log(page, flight)
     yield page
+
+
+def _findings_page(results: ComparisonResults | AidsResults) -> Page:
+    page = Page(ALL_FINDINGS)
+    write_findings(page, results.findings)
+    return page
 
 
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:

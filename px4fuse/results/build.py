@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
-from px4fuse.card.build import build_card
+from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
@@ -68,14 +68,18 @@ def results(
 def outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """Return the results of ``px4fuse compare``; without a position source, of EKF2's aids only."""
+    """Return the results of ``px4fuse compare``: the comparison, or EKF2's aids only."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
+    findings = find_aids(outcome.aids)
     return within_bounds(
         contract.AidsResults(
             **_common_fields(contract.AIDS, request, outcome.flight),
             aids=dict(outcome.aids),
-            findings=find_aids(outcome.aids),
+            card=build_aids_card(
+                outcome, findings, request.without_paths(), (student.name, student.id)
+            ),
+            findings=findings,
             missing=(outcome.missing_data, *outcome.flight.missing),
             student=student,
         )
@@ -104,7 +108,7 @@ def whatif_results(
     request: WhatIfRequest, counterfactual: WhatIfAnalysis
 ) -> contract.WhatIfResults:
     """Return the results of ``px4fuse whatif``."""
-    whatif_result, first = counterfactual.whatif, counterfactual.first
+    whatif_result, sweep_start = counterfactual.whatif, counterfactual.first
     return within_bounds(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF, request, counterfactual.flight),
@@ -113,8 +117,8 @@ def whatif_results(
             asked=counterfactual.asked,
             logged=whatif_result.logged,
             replayed=whatif_result.replayed,
-            whatif=whatif_result.whatif[0] if first else None,
-            sweep=whatif_result.whatif[first:],
+            whatif=whatif_result.whatif[0] if sweep_start else None,
+            sweep=whatif_result.whatif[sweep_start:],
             notes=whatif_result.notes,
         )
     )
@@ -161,7 +165,7 @@ def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
 
 
 def log_record(flight: Flight) -> Log:
-    """Return the record of a flight's log, with joined files and clocks."""
+    """Describe a flight's log, with joined files and clocks."""
     return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 
@@ -186,7 +190,7 @@ def _flight_fields(
     """Return the fields that all results of a comparison have, with source and settings."""
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
     origin, parameters = track.origin, comparison.flight.log.parameters
-    placed_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
+    file_offset_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
     source = PositionSource(
         **track.description_fields(),
         ekf2_parameters={} if origin.aid is None else origin.aid.logged_parameters(parameters),
@@ -205,7 +209,7 @@ def _flight_fields(
         missing=tuple(part for part in comparison.missing if part.source),
     )
     setting_values: dict[str, Any] = asdict(settings) | {
-        "clock_offset_s": settings.clock_offset_s + placed_s
+        "clock_offset_s": settings.clock_offset_s + file_offset_s
     }
     return _common_fields(name, request, comparison.flight, command) | {
         "source": source,
