@@ -60,6 +60,10 @@ ASCII = {
     "ν": "nu",
     "…": "...",
 }
+AIDS_HEADING = (
+    "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than needed. For "
+    "barometer, magnetometer and gravity that is usual and not a fault."
+)
 CONSOLE = "Console: MAVLink Console of QGroundControl."
 
 
@@ -227,19 +231,24 @@ def _headline(card: Card) -> Iterator[Line]:
 
 def _cause(cause: Cause) -> Iterator[Line]:
     yield from _labelled("cause", cause.why)
-    yield from _labelled("when", _format_spans(cause))
-    rows = [
-        ("EITHER " if not place else "OR ", action)
-        for place, alternative in enumerate(cause.alternatives)
-        for action in alternative
-    ]
-    rows += [("", action) for action in cause.actions]
-    labels = [f"{head}{_target(action)}" for head, action in rows]
+    yield from _labelled("when", format_spans(cause))
+    rows = marked_actions(cause)
+    labels = [f"{mark}{_target(action)}" for mark, action in rows]
     width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, rows, strict=True):
         yield from _action(label, width, action)
     yield from _rerun_table(cause.reruns)
     yield from _wrapped(cause.after, "  ", "  ")
+
+
+def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
+    """Return the actions of a cause, alternatives first with "EITHER " and "OR "."""
+    alternatives = [
+        ("OR " if place else "EITHER ", action)
+        for place, alternative in enumerate(cause.alternatives)
+        for action in alternative
+    ]
+    return alternatives + [("", action) for action in cause.actions]
 
 
 def _target(action: Action) -> str:
@@ -262,27 +271,37 @@ def _action(label: str, width: int, action: Action) -> Iterator[Line]:
 
 
 def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
-    if not reruns:
-        return
-    columns: list[tuple[str, list[str]]] = [
-        ("re-run of this log", [rerun.label for rerun in reruns]),
-        (
-            "position RMSE",
-            [_change(rerun.position_rmse_m, format_metres, " m") for rerun in reruns],
-        ),
-        ("● innovation ÷ √S", [_change(rerun.source_ratio, format_ratio) for rerun in reruns]),
-        ("◆ error ÷ σ", [_change(rerun.truth_ratio, format_ratio) for rerun in reruns]),
-        ("rejected", [_change(rerun.rejected_fraction, _percent, " %") for rerun in reruns]),
-        ("improves", [rerun.improves for rerun in reruns]),
-    ]
-    columns = [(head, cells) for head, cells in columns if any(cells)]
-    widths = [max(map(len, (head, *cells))) for head, cells in columns]
-    for row in zip(*([head, *cells] for head, cells in columns), strict=True):
+    columns = rerun_columns(reruns)
+    widths = [max(map(len, column)) for column in columns]
+    for row in zip(*columns, strict=True):
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
         yield Line(f"  {'  '.join(cells)}".rstrip())
-    starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
-    if starts:
-        yield Line(f"  EKF2 (replay): predicted from this log, from {min(starts):.0f} s on.")
+    if start := prediction_start(reruns):
+        yield Line(f"  {start}")
+
+
+def rerun_columns(reruns: Sequence[Rerun]) -> list[list[str]]:
+    """Return the columns of the table of re-runs, each with its head; none of them is empty."""
+    if not reruns:
+        return []
+    columns = [
+        ["re-run of this log", *(rerun.label for rerun in reruns)],
+        [
+            "position RMSE",
+            *(_change(rerun.position_rmse_m, format_metres, " m") for rerun in reruns),
+        ],
+        ["● innovation ÷ √S", *(_change(rerun.source_ratio, format_ratio) for rerun in reruns)],
+        ["◆ error ÷ σ", *(_change(rerun.truth_ratio, format_ratio) for rerun in reruns)],
+        ["rejected", *(_change(rerun.rejected_fraction, _percent, " %") for rerun in reruns)],
+        ["improves", *(rerun.improves for rerun in reruns)],
+    ]
+    return [column for column in columns if any(column[1:])]
+
+
+def prediction_start(reruns: Sequence[Rerun]) -> str:
+    """Return the sentence on the start of EKF2's replays; "" without one."""
+    starts = [rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None]
+    return f"EKF2 (replay): predicted from this log, from {min(starts):.0f} s on." if starts else ""
 
 
 def _change(
@@ -339,12 +358,7 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
     if not aids:
         return
     yield Line("")
-    yield from _wrapped(
-        "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than "
-        "needed. For barometer, magnetometer and gravity that is usual and not a fault.",
-        "",
-        "  ",
-    )
+    yield from _wrapped(AIDS_HEADING, "", "  ")
     indent = 31
     yield Line(f"{'':{indent}}{_ticks()}")
     previous = ""
@@ -356,7 +370,8 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
         yield Line(f"{head:{indent}}{axis_text(row.ratio, 'source')}")
 
 
-def _format_spans(cause: Cause) -> str:
+def format_spans(cause: Cause) -> str:
+    """Format first and last time of a cause; "" for the whole flight."""
     if not cause.spans_s:
         return ""
     first, last = cause.spans_s[0][0], cause.spans_s[-1][1]

@@ -134,7 +134,6 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
             "into its band. Otherwise: explained share of the logarithm of the quantity (for "
             "distances: of the mean square). A share of 50 % or more counts as the cause."
         ),
-        size=7.5,
         colour=MUTED_COLOUR,
     )
 
