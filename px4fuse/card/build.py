@@ -27,7 +27,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, by_root
 from px4fuse.flight import Ekf2, Unavailable
-from px4fuse.request import OPTIONS, ComparisonRequest, command_line
+from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 from px4fuse.results.model import NO_STUDENT, Student
 
 MAX_NOTES = 3
@@ -372,7 +372,7 @@ def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
 def _changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
     defaults = Settings()
     return tuple(
-        f"{OPTIONS[name].name} {value:g} (default {getattr(defaults, name):g})"
+        f"{COMPARISON_OPTIONS[name]} {value:g} (default {getattr(defaults, name):g})"
         for name in ("sigma_a_m_s2", "sigma_z_m", "dt_s")
         if (value := getattr(request, name)) is not None and value != getattr(defaults, name)
     )

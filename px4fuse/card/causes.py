@@ -26,7 +26,7 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings.model import Finding
 from px4fuse.flight import Unavailable
-from px4fuse.request import OPTIONS, ComparisonRequest, command_line
+from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
 # Kinds of change that re-run a finding, by its id
 RERUN_KINDS: Mapping[str, frozenset[str]] = {
@@ -261,7 +261,7 @@ def _actions(
     elif general is not None and not _is_setting(finding):
         actions.append(general)
     for (owner, kind), trial in by_kind.items():
-        if owner == "kf" and trial.change.keys() <= OPTIONS.keys():
+        if owner == "kf" and trial.change.keys() <= COMPARISON_OPTIONS.keys():
             actions.append(run_again(request, trial.change))
         elif (
             owner == "ekf2"
@@ -357,7 +357,7 @@ def _label(trial: Trial, trials: Sequence[Trial]) -> str:
         return f"{name} without the {trial.change[OUTLIERS]:.0f}"
     if trial.filter == "kf":
         options = " ".join(
-            f"{OPTIONS[name].name} {value:g}"
+            f"{COMPARISON_OPTIONS[name]} {value:g}"
             for name, value in trial.change.items()
             if name in (SIGMA_A, SIGMA_Z)
         )
