@@ -2,9 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from importlib import metadata
+
+from msgspec.structs import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.causes import FILTER_NAMES, RankedCause, is_default, make_cause, rank_causes
+from px4fuse.card.causes import FILTER_NAMES, RankedCause, make_cause, rank_causes
 from px4fuse.card.model import (
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
@@ -20,7 +23,7 @@ from px4fuse.card.model import (
 )
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, FilterSummary
+from px4fuse.comparison.model import AgainstTruth, AxisComparison
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
@@ -28,7 +31,6 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, by_root
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
-from px4fuse.results.model import NO_STUDENT, Student
 
 MAX_NOTES = 3
 MAX_ACTIONS = 3
@@ -46,7 +48,7 @@ def build_card(
     analysis: Analysis,
     findings: Sequence[Finding],
     request: ComparisonRequest,
-    student: Student = NO_STUDENT,
+    student: tuple[str, str] = ("", ""),
 ) -> Card:
     """Return the diagnosis card of a comparison.
 
@@ -57,7 +59,8 @@ def build_card(
         Most severe first, consequences behind their cause.
     request : ComparisonRequest
         Makes the commands; without paths, they are for the folder of the log.
-    student : Student
+    student : (str, str)
+        Name and id.
     """
     result = analysis.main
     roots = [group[0] for group in by_root(findings)]
@@ -234,8 +237,6 @@ def _sentence(action: Action) -> str:
 
 def _mark_explained(verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> tuple[Verdict, ...]:
     """Mark verdicts that are not consistent, but for which nothing has to be changed."""
-    from msgspec.structs import replace
-
     unchanged = {
         action.target
         for cause in causes
@@ -332,9 +333,8 @@ def _notes(roots: Sequence[Finding]) -> tuple[Note, ...]:
     return tuple(Note(one.id, f"{one.title}.", one.remedy) for one in notes[:MAX_NOTES])
 
 
-def _identity(analysis: Analysis, request: ComparisonRequest, student: Student) -> Identity:
+def _identity(analysis: Analysis, request: ComparisonRequest, student: tuple[str, str]) -> Identity:
     log, source, segment = analysis.flight.log, analysis.source, analysis.segment
-    from importlib import metadata
 
     return Identity(
         file=log.name,
@@ -347,8 +347,8 @@ def _identity(analysis: Analysis, request: ComparisonRequest, student: Student) 
         parameters=_changed_parameters(analysis),
         segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
         command=command_line(request.without_paths()),
-        student=student.name,
-        student_id=student.id,
+        student=student[0],
+        student_id=student[1],
         version=f"px4fuse {metadata.version('px4fuse')}",
     )
 
@@ -362,8 +362,14 @@ def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
         ("sigma_z_m", "SIGMA_Z", "m"),
         ("dt_s", "DT", "s"),
     ):
-        origin = "default" if is_default(chosen, name) else "set by option"
-        if name == "sigma_z_m" and request.sigma_z_m is None and not is_default(chosen, name):
+        origin = (
+            "default" if (getattr(chosen, name) == getattr(Settings(), name)) else "set by option"
+        )
+        if (
+            name == "sigma_z_m"
+            and request.sigma_z_m is None
+            and not (getattr(chosen, name) == getattr(Settings(), name))
+        ):
             origin = f"from {aid_of(analysis).noise}"
         texts.append(f"{label} {getattr(chosen, name):g} {unit} ({origin})")
     return ", ".join(texts)
@@ -395,8 +401,3 @@ def _changed_parameters(analysis: Analysis) -> tuple[str, ...]:
         unit = f" {parameter.unit}" if parameter.unit else ""
         texts.append(f"{name} {value:.4g}{unit} (PX4 default {parameter.default:g})")
     return tuple(texts)
-
-
-def has_summary(result: AxisComparison, owner: FilterName) -> bool:
-    """Return True if a filter has a consistency result along an axis."""
-    return isinstance(result.filters[owner], FilterSummary)

@@ -8,10 +8,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from msgspec import structs
+
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import BANDS, Action, Cause, FilterName, Improvement, Rerun, Target, Verdict
-from px4fuse.card.numbers import format_metres
-from px4fuse.card.verdicts import word_of
+from px4fuse.card.model import Action, Cause, FilterName, Improvement, Rerun, Target, Verdict
 from px4fuse.comparison.causal_replays import (
     CLOCK,
     OUTLIERS,
@@ -21,10 +21,9 @@ from px4fuse.comparison.causal_replays import (
     Trial,
     distance_from_one,
 )
-from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import PARAMETERS
-from px4fuse.filter.settings import Settings
-from px4fuse.findings.model import Finding
+from px4fuse.filter.consistency import Reference, classify_ratio
+from px4fuse.findings.model import CATALOGUE, Finding
 from px4fuse.flight import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
@@ -65,6 +64,10 @@ VERDICT_FINDINGS = frozenset(
     }
 )
 SETTING_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
+# Endings of the parameters that PX4 reads at its start only (reboot_required in its metadata)
+REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
+# Rejected fraction from which a re-run table lists it
+MIN_SHOWN_REJECTION = 0.005
 # A re-run that changes ratios and error by less has no effect
 MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
 # Reduction of the position RMSE from which a re-run improves the position
@@ -146,9 +149,12 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
     return tuple(best.values())
 
 
-def ratios(outcome: Outcome) -> dict[str, float]:
+def ratios(outcome: Outcome) -> dict[Reference, float]:
     """Return the ratios of actual to reported σ, against source and ground truth."""
-    means = {"source": outcome.nis_mean, "truth": outcome.nees_mean}
+    means: dict[Reference, float | None] = {
+        "source": outcome.nis_mean,
+        "truth": outcome.nees_mean,
+    }
     return {against: math.sqrt(mean) for against, mean in means.items() if mean}
 
 
@@ -156,21 +162,21 @@ def _reduction(trial: Trial) -> float:
     return distance_from_one(trial.before) - distance_from_one(trial.after)
 
 
-def _pairs(trial: Trial) -> list[tuple[str, float, float]]:
+def _pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
     before, after = ratios(trial.before), ratios(trial.after)
     return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
 
 
 def _enters_band(trial: Trial) -> bool:
     return any(
-        word_of(before, name) != "consistent" and word_of(after, name) == "consistent"
+        classify_ratio(before, name) != "consistent" and classify_ratio(after, name) == "consistent"
         for name, before, after in _pairs(trial)
     )
 
 
 def _halves(trial: Trial) -> bool:
     return any(
-        word_of(before, name) != "consistent"
+        classify_ratio(before, name) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
         for name, before, after in _pairs(trial)
     )
@@ -198,13 +204,20 @@ def improvement(trial: Trial) -> Improvement:
         before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
     )
     changes = [
-        (abs(math.log(was)), abs(math.log(becomes)), word_of(was, name), word_of(becomes, name))
+        (
+            abs(math.log(was)),
+            abs(math.log(becomes)),
+            classify_ratio(was, name),
+            classify_ratio(becomes, name),
+        )
         for name, was, becomes in _pairs(trial)
     ]
     is_sigma_better = any(
         word != "consistent" and (word_after == "consistent" or becomes <= 0.5 * was)
         for was, becomes, word, word_after in changes
-    ) and all(becomes <= was or word_after == "consistent" for was, becomes, _, word_after in changes)
+    ) and all(
+        becomes <= was or word_after == "consistent" for was, becomes, _, word_after in changes
+    )
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"
     return "σ only" if is_sigma_better else "nothing"
@@ -288,17 +301,12 @@ def _no_change(owner: FilterName, name: str, verdicts: Sequence[Verdict]) -> str
 
 
 def _target(finding: Finding) -> Target:
-    from px4fuse.findings.model import CATALOGUE
-
     return TARGETS[CATALOGUE[finding.id].group]
 
 
 def run_again(request: ComparisonRequest, change: Mapping[str, float]) -> Action:
     """Return the command that runs KF again with changed settings."""
-    import msgspec
-
-    changed = msgspec.structs.replace(request, **change)
-    return Action("KF", commands=(command_line(changed),), where="shell")
+    return Action("KF", commands=(command_line(structs.replace(request, **change)),), where="shell")
 
 
 def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
@@ -320,34 +328,24 @@ def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
     )
 
 
-# Endings of the parameters that PX4 reads at its start only (reboot_required in its metadata)
-REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-
-
 def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
     before, after = ratios(trial.before), ratios(trial.after)
-
-    def pair(name: str) -> tuple[float, float] | None:
-        return (before[name], after[name]) if name in before and name in after else None
-
-    rmse = trial.before.position_rmse_m, trial.after.position_rmse_m
-    rejected = trial.before.rejected_fraction, trial.after.rejected_fraction
+    rejected = _both(trial.before.rejected_fraction, trial.after.rejected_fraction)
     return Rerun(
         label=_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
-        position_rmse_m=None if None in rmse else rmse,  # type: ignore[arg-type]
-        source_ratio=pair("source"),
-        truth_ratio=pair("truth"),
-        rejected_fraction=None
-        if None in rejected or max(rejected) < MIN_SHOWN_REJECTION  # type: ignore[type-var]
-        else rejected,  # type: ignore[arg-type]
+        position_rmse_m=_both(trial.before.position_rmse_m, trial.after.position_rmse_m),
+        source_ratio=_both(before.get("source"), after.get("source")),
+        truth_ratio=_both(before.get("truth"), after.get("truth")),
+        rejected_fraction=rejected if rejected and max(rejected) >= MIN_SHOWN_REJECTION else None,
         improves=improvement(trial),
     )
 
 
-# Rejected fraction from which a re-run table lists it
-MIN_SHOWN_REJECTION = 0.005
+def _both(before: float | None, after: float | None) -> tuple[float, float] | None:
+    """Return two numbers as a pair, or None if one is missing."""
+    return None if before is None or after is None else (before, after)
 
 
 def _label(trial: Trial, trials: Sequence[Trial]) -> str:
@@ -379,15 +377,3 @@ def _closing_sentence(
             "position (ms)."
         )
     return ""
-
-
-def format_parameter(analysis: Analysis, axis: str) -> str:
-    """Format EKF2's measurement noise of the source: "EKF2_EVP_NOISE 0.1 m"."""
-    name = aid_of(analysis, axis).noise
-    value = analysis.flight.log.parameters.get(name)
-    return "" if value is None else f"{name} {format_metres(value)} m"
-
-
-def is_default(settings: Settings, name: str) -> bool:
-    """Return True if a setting of KF has its default."""
-    return bool(getattr(settings, name) == getattr(Settings(), name))

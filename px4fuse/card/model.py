@@ -5,17 +5,17 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.record import Count, NotNegative, Positive, Record, Share, Span
 
 FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
-Reference = Literal["source", "truth"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
 Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2"]
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 
 # Bands of a consistent ratio: against the source, and against ground truth
-BANDS: Mapping[Reference, tuple[float, float]] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
+BANDS = CONSISTENT_RATIOS
 # Ends of the logarithmic axis of all ratios; a ratio beyond is drawn as a triangle at the end
 AXIS_ENDS = (0.1, 10.0)
 # Ticks of that axis with their labels

@@ -8,10 +8,15 @@ each reference.
 import numpy as np
 
 from px4fuse.arrays import Array
-from px4fuse.card.model import BANDS, FilterName, Reference, Verdict, VerdictWord
+from px4fuse.card.model import FilterName, Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
 from px4fuse.comparison.model import AxisComparison, FilterSummary
-from px4fuse.filter.consistency import MIN_INNOVATIONS
+from px4fuse.filter.consistency import (
+    MIN_INNOVATIONS,
+    Reference,
+    classify_ratio,
+    ratio_interval,
+)
 from px4fuse.flight import Unavailable
 
 # Errors are correlated over seconds, so the bootstrap draws blocks of this length (s)
@@ -30,16 +35,6 @@ def verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
     )
 
 
-def word_of(
-    ratio: float, against: Reference, interval: tuple[float, float] | None = None
-) -> VerdictWord:
-    """Return the verdict on a ratio: consistent inside its band, or if its interval contains 1."""
-    low, high = BANDS[against]
-    if low <= ratio <= high or (interval is not None and interval[0] <= 1.0 <= interval[1]):
-        return "consistent"
-    return "overconfident" if ratio > 1.0 else "underconfident"
-
-
 def _against_source(result: AxisComparison, owner: FilterName) -> Verdict:
     statement = result.filters[owner]
     if not isinstance(statement, FilterSummary):
@@ -47,16 +42,14 @@ def _against_source(result: AxisComparison, owner: FilterName) -> Verdict:
     if statement.count < MIN_INNOVATIONS:
         few = f"{statement.count} innovations, at least {MIN_INNOVATIONS} are needed"
         return Verdict(filter=owner, against="source", word="not evaluated", reason=few)
-    # the mean NIS of a consistent filter is in the band, so its 95 % interval is mean over band
-    low, high = statement.nis_band
-    ratio = statement.nis_mean**0.5
-    interval = (statement.nis_mean / high) ** 0.5, (statement.nis_mean / low) ** 0.5
+    ratio = statement.sigma_ratio
+    interval = ratio_interval(statement.nis_mean, statement.nis_band)
     return Verdict(
         filter=owner,
         against="source",
         ratio=ratio,
         interval=interval,
-        word=word_of(ratio, "source", interval),
+        word=statement.verdict,
         samples=statement.count,
     )
 
@@ -76,7 +69,7 @@ def _against_truth(result: AxisComparison, owner: FilterName) -> Verdict:
         against="truth",
         ratio=ratio,
         interval=interval,
-        word=word_of(ratio, "truth", interval),
+        word=classify_ratio(ratio, "truth", interval),
         samples=len(normalised),
     )
 

@@ -40,7 +40,7 @@ from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
 from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
-from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, nis_band
+from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.hypotheses import BiasScaleJumpFit
@@ -374,13 +374,8 @@ def _difference_reduction(
 
 
 def is_inconsistent(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[FilterSummary]:
-    """Return True if the mean NIS is outside its band and σ is wrong by at least 25 %."""
-    if isinstance(statement, Unavailable):
-        return False
-    return (
-        statement.verdict != "consistent"
-        and statement.sigma_error_factor >= MIN_FINDING_SIGMA_FACTOR
-    )
+    """Return True if the filter was tested and is not consistent."""
+    return not isinstance(statement, Unavailable) and statement.verdict != "consistent"
 
 
 def _find_discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Statistic]:

@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import AIDS, Aid
-from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, assess, classify_mean_nis, nis_band
+from px4fuse.filter.consistency import assess, classify_mean_nis, nis_band
 from px4fuse.flight import AidLog, Ekf2, Flight, Unavailable, step_values_at
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 
@@ -347,8 +347,7 @@ def _verdict(axes: dict[str, AidAxis], longest_gap_duration_s: float, fused_s: A
     if any(_is_biased(axis) for axis in axes.values()):
         return "biased"
     nis = _mean_nis(axes)
-    nis_verdict = classify_mean_nis(nis, nis_band(sum(axis.samples for axis in axes.values())))
-    return nis_verdict if max(nis, 1.0 / nis) > MIN_FINDING_SIGMA_FACTOR**2 else "consistent"
+    return classify_mean_nis(nis, nis_band(sum(axis.samples for axis in axes.values())))
 
 
 def _mean_nis(axes: Mapping[str, AidAxis]) -> float:

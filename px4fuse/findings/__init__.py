@@ -15,6 +15,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import (
     aids,
+    ekf2_noise,
     ekf2_not_fusing,
     ekf2_rejecting,
     ekf2_resets,
@@ -49,6 +50,7 @@ __all__ = [
 # Detectors of a comparison; group_by_cause orders their findings
 DETECTORS: tuple[Callable[[Analysis], Found], ...] = (
     aids.detect,
+    ekf2_noise.detect,
     ekf2_not_fusing.detect,
     ekf2_rejecting.detect,
     ekf2_resets.detect,

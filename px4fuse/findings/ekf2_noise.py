@@ -6,18 +6,18 @@ KF takes SIGMA_Z from the same parameter on GNSS, so both filters may have the f
 import math
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.verdicts import word_of
 from px4fuse.comparison.causal_replays import Trial, distance_from_one
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Found, Severity, finding, format_percent
+from px4fuse.flight import Unavailable
 from px4fuse.text import format_factor
 
 # Ratio of the noises from which the finding is an error; below, EKF2 works nearly as well
 MIN_RATIO_ERROR = 2.0
 # Rejected fraction from which the title names it
 MIN_NAMED_REJECTION = 0.05
-SOURCE_NAMES = {"uwb": "UWB", "vio": "VIO", "mocap": "MOCAP", "gnss": "GNSS"}
 
 
 def detect(analysis: Analysis) -> Found:
@@ -31,7 +31,7 @@ def detect(analysis: Analysis) -> Found:
     if not trials:
         return
     best = min(trials, key=lambda trial: distance_from_one(trial.after))
-    assert not hasattr(analysis.ekf2_model, "reason")  # a trial of EKF2 needs its model
+    assert not isinstance(analysis.ekf2_model, Unavailable)  # a trial of EKF2 needs its model
     flown_m, estimate_m = analysis.ekf2_model.inputs.settings[aid.noise], best.change[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
     size = max(ratio, 1.0 / ratio)
@@ -70,5 +70,5 @@ def _corrects_innovations(trial: Trial) -> bool:
     before, after = trial.before.nis_mean, trial.after.nis_mean
     if before is None or after is None:
         return False
-    words = [word_of(math.sqrt(mean), "source") for mean in (before, after)]
+    words = [classify_ratio(math.sqrt(mean), "source") for mean in (before, after)]
     return words[0] != "consistent" and words[1] == "consistent"

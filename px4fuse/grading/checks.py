@@ -19,7 +19,7 @@ from msgspec import Meta
 from px4fuse.answer_form import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.comparison.model import AgainstTruth
-from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, HorizontalNis
+from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.grading.form_points import FormPoints, form_points
@@ -375,7 +375,7 @@ def _error_m(comparison: ComparisonResults) -> float:
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
     """Check that KF is consistent, or that no setting makes it so; zero from ``factor`` in σ."""
 
-    factor: Factor = MIN_FINDING_SIGMA_FACTOR
+    factor: Factor = 2.0
 
     def score(self, evidence: Evidence) -> Scored:
         """Score the NIS verdict on north and east together."""

@@ -13,7 +13,6 @@ import msgspec
 
 from px4fuse.answer_form import MISTAKES, Answers, QuantityAnswer, StudentMistake
 from px4fuse.assignment.truth import FormTruth, TrueMistake
-from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR
 from px4fuse.record import table
 
 FALSE_CLAIM_POINTS, MAX_FALSE_CLAIMS = 10.0, 3
@@ -261,14 +260,7 @@ def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
     """Return the mean share for both verdicts and the behaviour of EKF2."""
     shares = [_ekf2_behaviour_share(answers, truth)]
     for answer, known in ((answers.verdict_kf, truth.kf), (answers.verdict_ekf2, truth.ekf2)):
-        is_right = answer and answer == known.verdict
-        # "consistent" is half right for a small factor
-        is_nearly_right = (
-            known.factor is not None
-            and known.factor < MIN_FINDING_SIGMA_FACTOR
-            and answer == "consistent"
-        )
-        shares.append(1.0 if is_right else 0.5 if is_nearly_right else 0.0)
+        shares.append(1.0 if answer and answer == known.verdict else 0.0)
     return sum(shares) / len(shares)
 
 

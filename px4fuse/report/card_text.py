@@ -14,11 +14,11 @@ from px4fuse.card.model import (
     AidRow,
     Card,
     Cause,
-    Reference,
     Rerun,
     Verdict,
 )
 from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
+from px4fuse.filter.consistency import Reference
 
 WIDTH = 100
 AXIS_WIDTH = 37

@@ -12,7 +12,7 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UnjudgedFilter,
 )
-from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR, Consistency
+from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding
@@ -148,17 +148,6 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         notes.append(
             "The source may drift. The verdicts compare each filter with the source, "
             "not with the true position. Check the error with ground truth or a loop."
-        )
-    small_deviations = [
-        f"{filter_name} {axis} ({format_factor(consistency.sigma_error_factor)}×)"
-        for axis, filter_name, consistency in consistencies
-        if consistency.verdict != "consistent"
-        and consistency.sigma_error_factor < MIN_FINDING_SIGMA_FACTOR
-    ]
-    if small_deviations:
-        notes.append(
-            f"Inconsistent, but no finding, because σ is less than {MIN_FINDING_SIGMA_FACTOR:g}× "
-            f"too small or too large: {', '.join(small_deviations)}."
         )
     correlated = [
         f"{filter_name} {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"

@@ -7,11 +7,11 @@ from typing import Any
 import msgspec
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
+from px4fuse.card.build import build_card
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find, find_aids, find_loop
-from px4fuse.findings.summary import summarise
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.record import to_serializable
@@ -38,6 +38,7 @@ _COPIED_FIELDS = (
     "heading",
     "ekf2_replay",
     "difference_steps",
+    "trials",
     "causes",
     "loop",
     "notes",
@@ -55,7 +56,9 @@ def results(
             **_flight_fields(contract.COMPARISON, request, analysis),
             **{name: to_serializable(getattr(analysis, name)) for name in _COPIED_FIELDS},
             aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-            summary=summarise(analysis, findings),
+            card=build_card(
+                analysis, findings, request.without_paths(), (student.name, student.id)
+            ),
             findings=findings,
             student=student,
         )

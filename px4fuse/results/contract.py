@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.comparison.causal_replays import Intervention
+from px4fuse.card.model import Card
+from px4fuse.comparison.causal_replays import Intervention, Trial
 from px4fuse.comparison.model import AxisResult, FilterName
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
@@ -189,13 +190,15 @@ class ComparisonResults(_FlightResults, frozen=True):
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceSteps
         Differences between EKF2 and KF, by filter step.
+    trials : tuple of Trial
+        Re-runs along the main axis, with all statistics before and after.
     causes : tuple of Intervention
         Re-runs with one change each, and how much of an inconsistency each change explains.
     aids : mapping of PX4's name to AidResult
         Sensors that EKF2 fused, each with statistics of its innovations; empty without innovations.
     loop : LoopResult
-    summary : tuple of str
-        Summary of the flight in up to three sentences.
+    card : Card
+        Diagnosis at a glance: what cover, terminal, web page and batch table show.
     findings : tuple of Finding
         Most severe first; of the same severity, missing data before noises.
     notes : tuple of str
@@ -213,10 +216,11 @@ class ComparisonResults(_FlightResults, frozen=True):
     heading: OrUnavailable[HeadingError]
     ekf2_replay: OrUnavailable[Replayed]
     difference_steps: dict[str, OrUnavailable[DifferenceSteps]]
+    trials: tuple[Trial, ...]
     causes: tuple[Intervention, ...]
     aids: dict[str, AidResult]
     loop: OrUnavailable[LoopResult]
-    summary: tuple[str, ...]
+    card: Card
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
