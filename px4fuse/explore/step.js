@@ -122,6 +122,7 @@ const Step = (() => {
 
     function draw() {
       const { run } = result;
+      if (isSeen("step")) chosen.step ??= 0; // opens at the first update
       if (moment === null && chosen.step !== null) {
         const requested = Math.min(chosen.step, (run?.updates.nu.length ?? 1) - 1);
         moment = listNow().findIndex((one) => one.u === requested && one.updated);

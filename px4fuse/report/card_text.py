@@ -155,14 +155,14 @@ def _headline(card: Card) -> Iterator[Line]:
 
 def _cause(cause: Cause) -> Iterator[Line]:
     yield from _labelled("cause", cause.why)
-    yield from _labelled("when", _format_spans(cause))
+    yield from _labelled("when", format_spans(cause))
     rows = [
         ("EITHER " if not place else "OR ", action)
         for place, alternative in enumerate(cause.alternatives)
         for action in alternative
     ]
     rows += [("", action) for action in cause.actions]
-    labels = [f"{head}{_target(action)}" for head, action in rows]
+    labels = [f"{head}{format_target(action)}" for head, action in rows]
     width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, rows, strict=True):
         yield from _action(label, width, action)
@@ -170,7 +170,8 @@ def _cause(cause: Cause) -> Iterator[Line]:
     yield from _wrapped(cause.after, "  ", "  ")
 
 
-def _target(action: Action) -> str:
+def format_target(action: Action) -> str:
+    """Format the target of an action with the place where its commands are typed."""
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
@@ -190,9 +191,18 @@ def _action(label: str, width: int, action: Action) -> Iterator[Line]:
 
 
 def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
-    if not reruns:
-        return
-    columns: list[tuple[str, list[str]]] = [
+    columns = rerun_columns(reruns)
+    widths = [max(map(len, column)) for column in columns]
+    for row in zip(*columns, strict=True):
+        cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
+        yield Line(f"  {'  '.join(cells)}".rstrip())
+    if start := rerun_start(reruns):
+        yield Line(f"  {start}")
+
+
+def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
+    """Return the columns of the table of re-runs, each with its heading first; empty ones are absent."""
+    columns = (
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
             "position RMSE",
@@ -202,15 +212,14 @@ def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
         ("◆ error ÷ σ", [_change(rerun.truth_ratio, format_ratio) for rerun in reruns]),
         ("rejected", [_change(rerun.rejected_fraction, _percent, " %") for rerun in reruns]),
         ("improves", [rerun.improves for rerun in reruns]),
-    ]
-    columns = [(head, cells) for head, cells in columns if any(cells)]
-    widths = [max(map(len, (head, *cells))) for head, cells in columns]
-    for row in zip(*([head, *cells] for head, cells in columns), strict=True):
-        cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
-        yield Line(f"  {'  '.join(cells)}".rstrip())
+    )
+    return [(head, *cells) for head, cells in columns if any(cells)]
+
+
+def rerun_start(reruns: Sequence[Rerun]) -> str:
+    """Return the sentence with the start of predicted re-runs, or ""."""
     starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
-    if starts:
-        yield Line(f"  EKF2 (replay): predicted from this log, from {min(starts):.0f} s on.")
+    return f"EKF2 (replay): predicted from this log, from {min(starts):.0f} s on." if starts else ""
 
 
 def _change(
@@ -282,7 +291,8 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
         yield Line(f"{head:{indent}}{axis_text(row.ratio, 'source')}")
 
 
-def _format_spans(cause: Cause) -> str:
+def format_spans(cause: Cause) -> str:
+    """Format the time from the first to the last span of a cause, "" for the whole flight."""
     if not cause.spans_s:
         return ""
     first, last = cause.spans_s[0][0], cause.spans_s[-1][1]

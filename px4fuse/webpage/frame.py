@@ -184,7 +184,7 @@ def page(
     str
         HTML, identical for the same input; write it as UTF-8.
     """
-    style = read_asset("base.css") + read_asset("frame.css")
+    style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = read_asset("frame.js")
     content = {
         "columns": [(c.title, c.kind, c.group, c.visible_from) for c in columns],
