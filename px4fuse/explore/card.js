@@ -31,8 +31,9 @@ const Card = (() => {
     /* Call after the card or the axis has changed */
     function showAxis(axis, main) {
       const shown = document.querySelector("#card figure");
-      if (!figures.has("card")) figures.set("card", shown.hasChildNodes() ? shown : figures.get(main));
-      shown.replaceWith(axis === main ? figures.get("card") : figures.get(axis));
+      // the figure of the card itself also states which verdicts are explained
+      if (shown.hasChildNodes() && shown.dataset.axis === undefined) figures.set(main, shown);
+      shown.replaceWith(figures.get(axis));
     }
     /* Move the marks of KF; the analysed ratios stay as hollow marks */
     function move(now, axis, isChanged) {

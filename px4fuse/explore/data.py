@@ -19,7 +19,7 @@ from px4fuse.comparison.preparation import choose_source
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import COARSE_SCALE, Packer
-from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency, nis_band
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import (
     CLOCK_OFFSET_RANGE_S,

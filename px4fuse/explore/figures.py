@@ -15,8 +15,8 @@ from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.estimates import Tuning
 from px4fuse.card.model import BANDS
+from px4fuse.comparison.estimates import Tuning
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.record import Record, table
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MEASUREMENT_COLOUR, TRUTH_COLOUR
@@ -188,7 +188,13 @@ def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ek
     fig.y_range = Range1d(start=-NORMAL_RANGE, end=NORMAL_RANGE)
     fig.add_layout(BoxAnnotation(bottom=-NORMAL_BAND, top=NORMAL_BAND, **CONSISTENT_BAND))
     kf_dots = fig.scatter(
-        "t", "x", source=sources["updates"], size=4, fill_color=KF_COLOUR, line_color=None, name="kf"
+        "t",
+        "x",
+        source=sources["updates"],
+        size=4,
+        fill_color=KF_COLOUR,
+        line_color=None,
+        name="kf",
     )
     _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
     _draw_arrows(fig, sources["beyond"], KF_COLOUR, "kf")

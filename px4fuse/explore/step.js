@@ -171,8 +171,8 @@ const Step = (() => {
         [band.left, band.right] = [z - 2 * settings.sigmaZ, z + 2 * settings.sigmaZ];
         line.location = z;
       }
-      // constant scale over the run, so that changes of the ellipse are visible
-      const reach = reachOf(run);
+      // constant scale over the run, so that changes of the ellipse are visible; larger at the start
+      const reach = reachOf(run).map((typical, i) => Math.max(typical, 2.2 * Math.sqrt(now[2 + 2 * i])));
       [plot.x_range.start, plot.x_range.end] = [now[0] - reach[0], now[0] + reach[0]];
       [plot.y_range.start, plot.y_range.end] = [now[1] - reach[1], now[1] + reach[1]];
     }

@@ -126,7 +126,8 @@ const Tour = (() => {
       set(values);
       if (step !== undefined) stepper.go(step);
       $("tour-title").focus({ preventScroll: true });
-      document.querySelector(".stage").scrollIntoView({ block: "nearest" });
+      // on a phone the sheet covers the lower half
+      if (matchMedia("(max-width: 60rem)").matches) document.querySelector(".stage").scrollIntoView();
     }
     function end() {
       box.hidden = true;

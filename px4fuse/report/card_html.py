@@ -5,16 +5,17 @@ attributes, which the security policy of the pages forbids.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 from markupsafe import Markup
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import AXIS_TICKS, BANDS, Action, Card, Cause, Reference, Rerun, Verdict
+from px4fuse.card.model import AXIS_TICKS, BANDS, Action, Card, Cause, Rerun, Verdict
 from px4fuse.card.numbers import axis_fraction, format_ratio
 from px4fuse.card.verdicts import verdicts
 from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import Reference
 from px4fuse.findings import find
 from px4fuse.report.card_text import (
     FILTER_NAMES,
@@ -79,7 +80,9 @@ def card_html(
         figure=axis_html(card.verdicts, card.effect.axis)
         if card.verdicts and card.effect is not None
         else "",
-        more=_summary(card),
+        more=" and ".join(
+            text for text, parts in (("Causes", card.causes), ("Notes", card.notes)) if parts
+        ),
         first_actions=[row for row in _rows(card.causes[0]) if _is_prominent(row)]
         if card.causes
         else [],
@@ -164,16 +167,8 @@ def is_loud(verdict: Verdict) -> bool:
 
 
 def _value(verdict: Verdict) -> str:
-    return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}"
-
-
-def _summary(card: Card) -> str:
-    parts = [
-        text
-        for text, is_present in (("Causes", card.causes), ("notes", card.notes))
-        if is_present
-    ]
-    return " and ".join(parts or ["Explanation"]).capitalize()
+    explained = ", explained" if verdict.is_explained else ""
+    return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}{explained}"
 
 
 def _rows(cause: Cause) -> list[tuple[str, Action]]:

@@ -201,7 +201,7 @@ def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the columns of the table of re-runs, each with its heading first; empty ones are absent."""
+    """Return the columns of the table of re-runs, headings first; empty columns are absent."""
     columns = (
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
